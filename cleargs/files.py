@@ -1,0 +1,66 @@
+"""Files that are either whole or not there: written beside their place, flushed to disk, renamed into it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cleargs.errors import StoreError
+
+PARTIAL_SUFFIX = ".partial"
+"""Ending of a file that is being written; whoever finds one may delete it."""
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes ``path`` when the block ends without an error.
+
+    The temporary file keeps the extension of ``path`` (image writers choose their format by it). A writer
+    that dies leaves ``path`` as it was. Raises StoreError when the disk is full or not writable.
+    """
+    temporary = path.with_name(f".{os.getpid()}{PARTIAL_SUFFIX}.{path.name}")
+    try:
+        yield temporary
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise disk_error(error, path) from error
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def is_partial(path: Path) -> bool:
+    """Whether ``path`` is a leftover of a writer that died."""
+    return path.name.startswith(".") and PARTIAL_SUFFIX in path.name
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write ``data`` to ``path`` atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as indented JSON with sorted keys, atomically."""
+    write_bytes(path, (json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n").encode())
+
+
+def disk_error(error: OSError, path: Path) -> StoreError:
+    """The StoreError that says what to do about a failed write of ``path``."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return StoreError(
+            f"no space left on the disk of {path.parent}", hint="free some space, or choose another --store"
+        )
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return StoreError(
+            f"cannot write to {path.parent}: {error.strerror}", hint="choose a folder that you may write to"
+        )
+    return StoreError(f"cannot write {path}: {error.strerror or error}", hint="check the disk and its permissions")

@@ -1,0 +1,79 @@
+"""What a stage is: the contract between the runner and the modules in ``stages/``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+from pydantic import BaseModel
+
+from cleargs.progress import Reporter
+
+C = TypeVar("C", bound=BaseModel, covariant=True)
+
+
+@dataclass(frozen=True)
+class StageContext(Generic[C]):
+    """All that a stage may know about its surroundings."""
+
+    config: C
+    """The stage's own section of the run's configuration."""
+    source: Path
+    """The capture as the user gave it; only ``ingest`` reads it."""
+    inputs: Mapping[str, Path]
+    """Finished folder of each upstream stage, by name."""
+    externals: Mapping[str, Path]
+    """What the stage's ``externals`` returned: files whose content is part of the key."""
+    out: Path
+    """Outputs go here. What a killed try of the same key left is still here; files appear atomically."""
+    checkpoints: Path
+    """In-stage state. Never published, deleted when the stage is done."""
+    seed: int
+    device: Literal["cpu", "cuda"]
+    threads: int
+    reporter: Reporter
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """How a stage ended."""
+
+    missing: tuple[str, ...] = ()
+    """What could not be made, one line each; not empty means that the stage is done only in part."""
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    """Figures for ``manifest.json`` and ``cleargs show`` (JSON values; outputs hold no clock times)."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a stage is expected to take, said before work starts."""
+
+    minutes: float
+    memory_gb: float
+    disk_gb: float
+
+
+class Stage(Protocol):
+    """A module in ``stages/``. Its top level imports only its config model: heavy imports live in ``run``,
+    so that a run with nothing to do costs no import of torch."""
+
+    VERSION: int
+    """Raised whenever the stage's source changes its results."""
+    CONFIG: type[BaseModel]
+    INPUTS: Mapping[str, tuple[str, ...]]
+    """Upstream stage -> files and folders in it that this stage reads; their digests enter the key."""
+    OUTPUTS: tuple[str, ...]
+    """Files and folders that exist when the stage is done."""
+    LIBRARIES: tuple[str, ...]
+    """Distributions whose version changes results; their versions enter the key."""
+
+    def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
+        """Role -> file or folder outside the store whose content enters the key (the capture, model weights)."""
+
+    def estimate(self, context: StageContext[Any]) -> Estimate:
+        """Rough cost, from the settings and the inputs that already exist."""
+
+    def run(self, context: StageContext[Any]) -> StageResult:
+        """Do the work: read ``context.inputs``, write ``OUTPUTS`` into ``context.out``."""

@@ -1,0 +1,50 @@
+"""How long work tells what it is doing, without knowing who listens (a terminal, a log, nobody)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol
+
+
+class Task(Protocol):
+    """One piece of counted work."""
+
+    def advance(self, steps: int = 1) -> None:
+        """``steps`` more are done."""
+
+    def update(self, *, done: int | None = None, note: str | None = None) -> None:
+        """``done`` in all are done; ``note`` (a few figures, say) is shown beside the bar."""
+
+
+class Reporter(Protocol):
+    """Where progress and remarks go."""
+
+    def task(self, label: str, total: int | None = None) -> AbstractContextManager[Task]:
+        """Open a piece of work of ``total`` steps (None: unknown); it closes with the block."""
+
+    def info(self, text: str) -> None:
+        """A remark worth a line."""
+
+    def warn(self, text: str) -> None:
+        """Something the user should look at, although the work goes on."""
+
+
+class SilentTask:
+    """A task nobody watches."""
+
+    def advance(self, steps: int = 1) -> None: ...
+
+    def update(self, *, done: int | None = None, note: str | None = None) -> None: ...
+
+
+class SilentReporter:
+    """A reporter nobody listens to (libraries and tests)."""
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        yield SilentTask()
+
+    def info(self, text: str) -> None: ...
+
+    def warn(self, text: str) -> None: ...

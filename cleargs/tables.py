@@ -1,0 +1,40 @@
+"""Parquet tables with a documented schema: one row an item, units and meaning in the field metadata."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cleargs.errors import StoreError
+from cleargs.files import atomic_path
+
+
+def column(name: str, kind: pa.DataType, meaning: str, *, nullable: bool = False) -> pa.Field:
+    """A field whose ``meaning`` (with its unit and range) travels in the file."""
+    return pa.field(name, kind, nullable=nullable, metadata={"meaning": meaning})
+
+
+def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
+    """Write ``table`` with exactly ``schema`` to ``path``: zstd, atomically, the same bytes for equal rows.
+
+    Raises ValueError (pyarrow's ArrowInvalid included) when a column is missing or does not fit its type.
+    """
+    table = table.select(schema.names).cast(schema)
+    with atomic_path(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd", store_schema=True)
+
+
+def read_table(path: Path, schema: pa.Schema) -> pa.Table:
+    """Read a table written by `write_table`; columns of ``schema`` in its order.
+
+    Raises StoreError when the file is missing, damaged, or lacks a column.
+    """
+    try:
+        return pq.read_table(path, columns=schema.names).cast(schema)
+    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
+        raise StoreError(
+            f"cannot read the table {path.name}: {str(error).splitlines()[0]}",
+            hint="delete the stage's folder, or run its stage again with --force",
+        ) from error
