@@ -1,0 +1,1 @@
+"""Synthetic handheld captures with known truth: a procedural room, a handheld path, camera degradations."""

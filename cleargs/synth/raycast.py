@@ -1,0 +1,286 @@
+"""A small ray caster for the room, in Numba.
+
+It shares nothing with the splatting core, so that the truth it makes cannot share that core's errors. Every
+image is the mean of passes; a pass casts one jittered ray a pixel with its own camera pose a row and its own
+point on the lens. Anti-aliasing, motion blur, rolling shutter and defocus are therefore one mechanism.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from cleargs.synth.room import BOX, SPHERE, Room
+from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
+
+Array = NDArray[np.float64]
+
+MISS = 1e30
+AMBIENT = 0.42
+LAMP = 1.9
+
+
+@dataclass(frozen=True)
+class Passes:
+    """How the rays of each pass start."""
+
+    poses: NDArray[np.float64]  # [S, H, 3, 4] camera to world (OpenCV axes), of each row in each pass
+    jitter: NDArray[np.float64]  # [S, 2] offset inside the pixel, in [0, 1)
+    lens: NDArray[np.float64]  # [S, 2] point on the lens, metres; zero for a pinhole
+    focus: float
+    """Distance in focus, metres."""
+
+
+@njit(cache=True, inline="always")
+def _dot(a: Array, b: Array) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
+    """Distance to a box of half sides ``half`` at the origin, from outside or from inside."""
+    near, far, near_axis, far_axis = -MISS, MISS, 0, 0
+    for axis in range(3):
+        speed = ray[axis] if abs(ray[axis]) > 1e-12 else 1e-12
+        first = (-half[axis] - origin[axis]) / speed
+        last = (half[axis] - origin[axis]) / speed
+        if first > last:
+            first, last = last, first
+        if first > near:
+            near, near_axis = first, axis
+        if last < far:
+            far, far_axis = last, axis
+    if near > far or far < 1e-6:
+        return MISS
+    inside = near < 1e-6
+    axis = far_axis if inside else near_axis
+    normal[:] = 0.0
+    normal[axis] = -1.0 if ray[axis] > 0 else 1.0
+    return far if inside else near
+
+
+@njit(cache=True)
+def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> float:
+    half = _dot(origin, ray)
+    root = half * half - _dot(origin, origin) + radius * radius
+    if root < 0:
+        return MISS
+    distance = -half - math.sqrt(root)
+    if distance < 1e-6:
+        return MISS
+    for axis in range(3):
+        normal[axis] = (origin[axis] + distance * ray[axis]) / radius
+    return distance
+
+
+@njit(cache=True)
+def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, normal: Array) -> float:
+    """An open cylinder about the y axis."""
+    a = ray[0] * ray[0] + ray[2] * ray[2]
+    b = origin[0] * ray[0] + origin[2] * ray[2]
+    root = b * b - a * (origin[0] * origin[0] + origin[2] * origin[2] - radius * radius)
+    if a < 1e-12 or root < 0:
+        return MISS
+    distance = (-b - math.sqrt(root)) / a
+    if distance < 1e-6 or abs(origin[1] + distance * ray[1]) > half_length:
+        return MISS
+    normal[0] = (origin[0] + distance * ray[0]) / radius
+    normal[1] = 0.0
+    normal[2] = (origin[2] + distance * ray[2]) / radius
+    return distance
+
+
+@njit(cache=True)
+def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv: Array) -> None:
+    """Metres along the surface; each face of a box sees another part of its texture."""
+    if kind == BOX:
+        axis = 0
+        for candidate in range(1, 3):
+            if abs(normal[candidate]) > abs(normal[axis]):
+                axis = candidate
+        face = axis * 2 + (1 if normal[axis] > 0 else 0)
+        uv[0] = point[2] if axis == 0 else point[0]
+        uv[1] = point[2] if axis == 1 else -point[1]
+        uv[0] += 0.37 * face
+        uv[1] += 0.61 * face
+    elif kind == SPHERE:
+        uv[0] = math.atan2(point[2], point[0]) * size[0]
+        uv[1] = math.asin(min(1.0, max(-1.0, point[1] / size[0]))) * size[0]
+    else:
+        uv[0] = math.atan2(point[2], point[0]) * size[0]
+        uv[1] = point[1]
+
+
+@njit(cache=True)
+def _sample(
+    texels: NDArray[np.float32],
+    offsets: NDArray[np.int64],
+    start: int,
+    uv: Array,
+    footprint: float,
+    colour: Array,
+) -> None:
+    """Trilinear lookup; ``footprint`` is the size of a pixel on the surface, in metres."""
+    level = min(max(math.log2(max(footprint * TEXELS_PER_METRE, 1e-6)), 0.0), LEVELS - 1.001)
+    colour[:] = 0.0
+    for step in range(2):
+        mip = int(level) + step
+        share = (level - int(level)) if step else 1 - (level - int(level))
+        side = SIZE >> mip
+        x = uv[0] * TEXELS_PER_METRE / (1 << mip) - 0.5
+        y = uv[1] * TEXELS_PER_METRE / (1 << mip) - 0.5
+        column, row = math.floor(x), math.floor(y)
+        for corner in range(4):
+            right, down = corner & 1, corner >> 1
+            weight = share * ((x - column) if right else 1 - (x - column))
+            weight *= (y - row) if down else 1 - (y - row)
+            texel = int(row + down) % side * side + int(column + right) % side
+            for channel in range(3):
+                colour[channel] += weight * texels[start + offsets[mip] + texel, channel]
+
+
+@njit(cache=True)
+def _shadow(point: Array, light: Array, primitives: NDArray[np.void], own: int) -> float:
+    """Share of the lamp that the bounding spheres leave, soft at their rims (0 dark, 1 lit)."""
+    lit = 1.0
+    to_light = light - point
+    reach = math.sqrt(_dot(to_light, to_light))
+    to_light /= reach
+    for number in range(1, primitives.shape[0]):
+        radius = primitives[number]["bound"]
+        if radius == 0.0 or number == own:
+            continue
+        offset = primitives[number]["centre"] - point
+        along = _dot(offset, to_light)
+        if along <= 0.0 or along >= reach:
+            continue
+        distance = math.sqrt(max(_dot(offset, offset) - along * along, 0.0))
+        penumbra = 0.15 * along + 0.02
+        cover = min(max((radius + penumbra - distance) / (2 * penumbra), 0.0), 1.0)
+        lit *= 1 - 0.8 * cover * cover * (3 - 2 * cover)
+    return lit
+
+
+@njit(cache=True)
+def _trace(
+    origin: Array,
+    ray: Array,
+    pixel_angle: float,
+    primitives: NDArray[np.void],
+    texels: NDArray[np.float32],
+    offsets: NDArray[np.int64],
+    stride: int,
+    light: Array,
+    colour: Array,
+) -> float:
+    """Radiance along one ray into ``colour``; returns the distance."""
+    best, hit = MISS, -1
+    normal, best_normal = np.zeros(3), np.zeros(3)
+    local_point, local_ray = np.zeros(3), np.zeros(3)
+    for number in range(primitives.shape[0]):
+        item = primitives[number]
+        offset = origin - item["centre"]
+        for axis in range(3):
+            local_point[axis] = _dot(item["rotation"][axis], offset)
+            local_ray[axis] = _dot(item["rotation"][axis], ray)
+        if item["kind"] == BOX:
+            distance = _hit_box(local_point, local_ray, item["size"], normal)
+        elif item["kind"] == SPHERE:
+            distance = _hit_sphere(local_point, local_ray, item["size"][0], normal)
+        else:
+            distance = _hit_rod(local_point, local_ray, item["size"][0], item["size"][1], normal)
+        if distance < best:
+            best, hit = distance, number
+            best_normal[:] = normal
+    if hit < 0:
+        colour[:] = 0.0
+        return best
+    item = primitives[hit]
+    point = origin + best * ray
+    offset = point - item["centre"]
+    world_normal = np.zeros(3)
+    for axis in range(3):
+        local_point[axis] = _dot(item["rotation"][axis], offset)
+        for k in range(3):
+            world_normal[k] += best_normal[axis] * item["rotation"][axis][k]
+    facing = max(abs(_dot(world_normal, ray)), 0.05)
+    uv = np.zeros(2)
+    _texture_coordinates(item["kind"], local_point, best_normal, item["size"], uv)
+    _sample(texels, offsets, item["texture"] * stride, uv, best * pixel_angle / facing, colour)
+
+    to_light = light - point
+    reach = math.sqrt(_dot(to_light, to_light))
+    to_light /= reach
+    lit = _shadow(point, light, primitives, hit)
+    diffuse = max(_dot(world_normal, to_light), 0.0) * lit * LAMP / (1 + 0.25 * reach * reach)
+    corner = 1.0  # ambient light fades towards the room's edges
+    for axis in range(3):
+        gap = primitives[0]["size"][axis] - abs(point[axis] - primitives[0]["centre"][axis])
+        corner *= 1 - 0.35 * math.exp(-max(gap, 0.0) / 0.25)
+    half_vector = to_light - ray
+    half_vector /= math.sqrt(_dot(half_vector, half_vector))
+    highlight = item["gloss"] * lit * max(_dot(world_normal, half_vector), 0.0) ** 40
+    for channel in range(3):
+        colour[channel] = colour[channel] * (AMBIENT * corner + diffuse) + 0.6 * highlight
+    return best
+
+
+@njit(cache=True, parallel=True)
+def _render(
+    poses: Array,
+    jitter: Array,
+    lens: Array,
+    focus: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    primitives: NDArray[np.void],
+    texels: NDArray[np.float32],
+    offsets: NDArray[np.int64],
+    stride: int,
+    light: Array,
+    image: Array,
+    depth: Array,
+) -> None:
+    passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
+    for row in prange(height):
+        origin, ray, colour, camera_ray = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        for column in range(width):
+            for number in range(passes):
+                pose = poses[number, row]
+                camera_ray[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
+                camera_ray[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
+                camera_ray[2] = focus
+                norm = math.sqrt(_dot(camera_ray, camera_ray))
+                for axis in range(3):
+                    ray[axis] = _dot(pose[axis], camera_ray) / norm
+                    origin[axis] = (
+                        pose[axis, 3] + pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
+                    )
+                distance = _trace(
+                    origin, ray, 1 / fx, primitives, texels, offsets, stride, light, colour
+                )
+                depth[row, column] += distance * focus / norm / passes
+                for channel in range(3):
+                    image[row, column, channel] += colour[channel] / passes
+
+
+def cast(
+    room: Room, passes: Passes, intrinsics: tuple[float, float, float, float], width: int, height: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Image [H, W, 3] in linear light (1 is sensor white) and mean depth [H, W] in metres along the axis.
+
+    ``intrinsics`` are fx, fy, cx, cy in pixels, pixel centres at + 0.5.
+    """
+    image, depth = np.zeros((height, width, 3)), np.zeros((height, width))
+    textures = room.textures
+    _render(
+        passes.poses, passes.jitter, passes.lens, passes.focus, *intrinsics, room.primitives,
+        textures.texels, textures.level_offsets, textures.stride, room.light, image, depth,
+    )  # fmt: skip
+    return image, depth

@@ -1,0 +1,109 @@
+"""A procedural room: textured walls and floor, posters, boxes for furniture, spheres and thin rods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.synth.textures import TextureSet, make_textures
+
+BOX, SPHERE, ROD = 0, 1, 2
+
+PRIMITIVE = np.dtype(
+    [
+        ("kind", np.int64),
+        ("centre", np.float64, (3,)),
+        ("rotation", np.float64, (3, 3)),  # rows: the primitive's own axes in the world
+        ("size", np.float64, (3,)),  # half sides; radius first for a sphere; radius, half length for a rod
+        ("texture", np.int64),
+        ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
+        ("bound", np.float64),  # radius of the bounding sphere that casts the soft shadow, 0 for none
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Room:
+    """A world the ray caster can draw: metres, y up, the floor at y = 0."""
+
+    primitives: NDArray[np.void]  # [P] of PRIMITIVE; the first is the room itself, seen from inside
+    textures: TextureSet
+    light: NDArray[np.float64]  # [3] position of the lamp
+    focus: NDArray[np.float64]  # [3] what a visitor looks at
+
+
+WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
+SURFACES, PRINTS = 8, 6
+
+
+def _primitive(
+    kind: int,
+    centre: tuple[float, float, float],
+    size: tuple[float, float, float],
+    texture: int,
+    *,
+    yaw: float = 0.0,
+    tilt: float = 0.0,
+    gloss: float = 0.0,
+    shadow: bool = True,
+) -> NDArray[np.void]:
+    cy, sy, ct, st = np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt)
+    turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
+    bound = {BOX: float(np.cbrt(np.prod(size))), SPHERE: size[0], ROD: 0.0}[kind] if shadow else 0.0
+    return np.array((kind, centre, turn.T, size, texture, gloss, bound), PRIMITIVE)
+
+
+def make_room(seed: int) -> Room:
+    """The room of ``seed``: the same layout idea, other furniture, textures and light."""
+    rng = np.random.default_rng([seed, 11])
+    textures = make_textures(rng, SURFACES, PRINTS)
+
+    def material() -> int:
+        return int(rng.integers(SURFACES))
+
+    items = [_primitive(BOX, (0, HEIGHT / 2, 0), (WIDTH / 2, HEIGHT / 2, DEPTH / 2), 0, shadow=False)]
+
+    for number in range(5):  # posters on the back wall and on both side walls
+        poster = SURFACES + number % PRINTS
+        half = (rng.uniform(0.3, 0.55), rng.uniform(0.3, 0.5), 0.015)
+        if number < 3:
+            x = (number - 1) * 1.55 + rng.uniform(-0.15, 0.15)
+            centre = (x, rng.uniform(1.35, 1.75), -DEPTH / 2 + 0.015)
+            items.append(_primitive(BOX, centre, half, poster, gloss=0.25, shadow=False))
+        else:
+            side = 1.0 if number == 3 else -1.0
+            centre = (side * (WIDTH / 2 - 0.015), rng.uniform(1.2, 1.6), rng.uniform(-1.3, -0.3))
+            items.append(_primitive(BOX, centre, half, poster, yaw=np.pi / 2, shadow=False))
+
+    table = (rng.uniform(-0.2, 0.2), 0.72, rng.uniform(-0.75, -0.55))
+    items.append(_primitive(BOX, table, (0.75, 0.03, 0.42), material(), gloss=0.2))
+    for dx in (-0.68, 0.68):  # its legs
+        for dz in (-0.36, 0.36):
+            leg = (table[0] + dx, 0.345, table[2] + dz)
+            items.append(_primitive(ROD, leg, (0.025, 0.345, 0), material()))
+    for _ in range(4):  # boxes and balls on the table
+        half = tuple(rng.uniform(0.06, 0.14, 3))
+        centre = (table[0] + rng.uniform(-0.6, 0.6), 0.75 + half[1], table[2] + rng.uniform(-0.28, 0.28))
+        texture = SURFACES + int(rng.integers(PRINTS))
+        items.append(_primitive(BOX, centre, half, texture, yaw=rng.uniform(0, np.pi)))
+    for _ in range(2):
+        radius = rng.uniform(0.07, 0.12)
+        centre = (table[0] + rng.uniform(-0.55, 0.55), 0.75 + radius, table[2] + rng.uniform(-0.25, 0.3))
+        items.append(_primitive(SPHERE, centre, (radius, 0, 0), material(), gloss=0.8))
+    for side in (-1.0, 1.0):  # a cupboard and a shelf beside it
+        half = (rng.uniform(0.25, 0.4), rng.uniform(0.45, 0.8), rng.uniform(0.2, 0.3))
+        centre = (side * rng.uniform(1.5, 1.9), half[1], -DEPTH / 2 + half[2] + rng.uniform(0.02, 0.4))
+        items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(-0.3, 0.3)))
+    for _ in range(3):  # crates on the floor
+        half = tuple(rng.uniform(0.12, 0.25, 3))
+        centre = (rng.uniform(-1.6, 1.6), half[1], rng.uniform(0.0, 0.6))
+        items.append(_primitive(BOX, centre, half, material(), yaw=rng.uniform(0, np.pi)))
+    for _ in range(4):  # thin rods leaning about
+        centre = (rng.uniform(-1.8, 1.8), rng.uniform(0.7, 0.9), rng.uniform(-1.8, -0.9))
+        size = (rng.uniform(0.008, 0.02), rng.uniform(0.6, 0.8), 0.0)
+        items.append(_primitive(ROD, centre, size, material(), yaw=rng.uniform(0, 6), tilt=rng.uniform(0, 0.3)))
+
+    light = np.array([rng.uniform(-1.2, 1.2), HEIGHT - 0.3, rng.uniform(0.2, 1.2)])
+    return Room(np.array(items, PRIMITIVE), textures, light, np.array([table[0], 0.95, table[2] - 0.3]))
