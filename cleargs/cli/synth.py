@@ -29,7 +29,9 @@ Example:
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--protocol", default="mixed", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
-@click.option("--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames.")
+@click.option(
+    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
+)
 @click.option("--size", default="480x270", show_default=True, callback=_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another room and walk.")
 def synth(out: Path, protocol: str, frames: int, size: tuple[int, int], seed: int) -> None:

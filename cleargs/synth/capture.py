@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import atomic_path, write_json
-from cleargs.media.colour import linear_to_srgb
+from cleargs.media.colour import srgb_from_linear
 from cleargs.progress import Reporter
 from cleargs.synth.path import HandheldPath, exposure_poses, look_at, make_path
 from cleargs.synth.protocols import REFERENCE_WIDTH, Degradation, degradations
@@ -57,23 +57,28 @@ class Lens:
 def _low_discrepancy(count: int) -> NDArray[np.float64]:
     """[count, 2] points that cover the unit square evenly (Roberts' R2 sequence)."""
     steps = np.array([0.7548776662466927, 0.5698402909980532])
-    return (0.5 + np.arange(count)[:, None] * steps) % 1.0
+    return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0, np.float64)
 
 
 def _disc(count: int, radius: float) -> NDArray[np.float64]:
     """[count, 2] points of a sunflower spiral on a disc."""
     number = np.arange(count) + 0.5
     angle = number * math.pi * (3 - math.sqrt(5))
-    return radius * np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    disc = np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return np.asarray(radius * disc, np.float64)
 
 
-def _sharp(room: Room, lens: Lens, pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sharp(
+    room: Room, lens: Lens, pose: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     poses = np.broadcast_to(pose, (SHARP_PASSES, lens.height, 3, 4)).copy()
     passes = Passes(poses, _low_discrepancy(SHARP_PASSES), np.zeros((SHARP_PASSES, 2)), 1.0)
     return cast(room, passes, lens.intrinsics, lens.width, lens.height)
 
 
-def _blur_length(lens: Lens, depth: NDArray[np.float64], poses: NDArray[np.float64], middle: NDArray[np.float64]) -> float:
+def _blur_length(
+    lens: Lens, depth: NDArray[np.float64], poses: NDArray[np.float64], middle: NDArray[np.float64]
+) -> float:
     """Mean length in pixels of the paths that the middle view's points take over ``poses`` [S, 3, 4]."""
     fx, fy, cx, cy = lens.intrinsics
     rows, columns = np.mgrid[0.5 : lens.height : 8, 0.5 : lens.width : 8]
@@ -117,7 +122,7 @@ def _record(image: NDArray[np.float64], noise: float, rng: np.random.Generator) 
     mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: carries the stated deviation into linear light
     shot = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
     noisy = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shot
-    return np.rint(linear_to_srgb(np.clip(noisy, 0, 1).astype(np.float32)) * 255).astype(np.uint8)
+    return np.asarray(np.rint(srgb_from_linear(np.clip(noisy, 0, 1)) * 255), np.uint8)
 
 
 def _write_image(path: Path, image: NDArray[np.uint8]) -> None:

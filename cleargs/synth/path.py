@@ -61,7 +61,7 @@ def make_path(focus: NDArray[np.float64], frames: int, seed: int) -> HandheldPat
     """A path on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
     rng = np.random.default_rng([seed, 12])
     arc = np.radians(min(4.0 * frames, 150.0))
-    frequencies = np.exp(rng.uniform(*np.log(TREMOR_HZ), (3, 12)))
+    frequencies = np.geomspace(*TREMOR_HZ, 12) * rng.uniform(0.9, 1.1, (3, 12))
     phases = rng.uniform(0, 2 * np.pi, (3, 12))
     return HandheldPath(focus, float(arc), frames / 4, phases, frequencies, rng.uniform(0, 2 * np.pi, 2))
 

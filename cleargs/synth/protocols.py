@@ -41,7 +41,7 @@ def _blurred(mean: float) -> Callable[[int, np.random.Generator], list[Degradati
 
 
 def _mixed(frames: int, rng: np.random.Generator) -> list[Degradation]:
-    """What phones give: half the frames sharp, of the rest 60 % blurred, 20 % defocused, 20 % badly exposed."""
+    """What phones give: half the frames sharp; of the rest 60 % blurred, 20 % defocused, 20 % misexposed."""
     bad = rng.permutation(np.arange(frames) % 2 == 1) if frames > 32 else np.arange(frames) % 2 == 1
     result = []
     for is_bad in bad:

@@ -37,7 +37,8 @@ class Passes:
 
 @njit(cache=True, inline="always")
 def _dot(a: Array, b: Array) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return total
 
 
 @njit(cache=True)
@@ -58,7 +59,7 @@ def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
         return MISS
     inside = near < 1e-6
     axis = far_axis if inside else near_axis
-    normal[:] = 0.0
+    normal[0], normal[1], normal[2] = 0.0, 0.0, 0.0
     normal[axis] = -1.0 if ray[axis] > 0 else 1.0
     return far if inside else near
 
@@ -69,7 +70,7 @@ def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> floa
     root = half * half - _dot(origin, origin) + radius * radius
     if root < 0:
         return MISS
-    distance = -half - math.sqrt(root)
+    distance: float = -half - math.sqrt(root)
     if distance < 1e-6:
         return MISS
     for axis in range(3):
@@ -85,7 +86,7 @@ def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, norma
     root = b * b - a * (origin[0] * origin[0] + origin[2] * origin[2] - radius * radius)
     if a < 1e-12 or root < 0:
         return MISS
-    distance = (-b - math.sqrt(root)) / a
+    distance: float = (-b - math.sqrt(root)) / a
     if distance < 1e-6 or abs(origin[1] + distance * ray[1]) > half_length:
         return MISS
     normal[0] = (origin[0] + distance * ray[0]) / radius
@@ -126,7 +127,7 @@ def _sample(
 ) -> None:
     """Trilinear lookup; ``footprint`` is the size of a pixel on the surface, in metres."""
     level = min(max(math.log2(max(footprint * TEXELS_PER_METRE, 1e-6)), 0.0), LEVELS - 1.001)
-    colour[:] = 0.0
+    colour[0], colour[1], colour[2] = 0.0, 0.0, 0.0
     for step in range(2):
         mip = int(level) + step
         share = (level - int(level)) if step else 1 - (level - int(level))
@@ -144,25 +145,44 @@ def _sample(
 
 
 @njit(cache=True)
-def _shadow(point: Array, light: Array, primitives: NDArray[np.void], own: int) -> float:
+def _shadow(point: Array, to_light: Array, reach: float, primitives: NDArray[np.void], own: int) -> float:
     """Share of the lamp that the bounding spheres leave, soft at their rims (0 dark, 1 lit)."""
     lit = 1.0
-    to_light = light - point
-    reach = math.sqrt(_dot(to_light, to_light))
-    to_light /= reach
     for number in range(1, primitives.shape[0]):
-        radius = primitives[number]["bound"]
-        if radius == 0.0 or number == own:
+        item = primitives[number]
+        if item["shade"] == 0.0 or number == own:
             continue
-        offset = primitives[number]["centre"] - point
-        along = _dot(offset, to_light)
+        centre = item["centre"]
+        x, y, z = centre[0] - point[0], centre[1] - point[1], centre[2] - point[2]
+        along = x * to_light[0] + y * to_light[1] + z * to_light[2]
         if along <= 0.0 or along >= reach:
             continue
-        distance = math.sqrt(max(_dot(offset, offset) - along * along, 0.0))
+        distance = math.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
         penumbra = 0.15 * along + 0.02
-        cover = min(max((radius + penumbra - distance) / (2 * penumbra), 0.0), 1.0)
+        cover = min(max((item["shade"] + penumbra - distance) / (2 * penumbra), 0.0), 1.0)
         lit *= 1 - 0.8 * cover * cover * (3 - 2 * cover)
     return lit
+
+
+@njit(cache=True)
+def _to_local(item: np.void, vector: Array, shift: bool, local: Array) -> None:
+    """A direction, or with ``shift`` a point, in the primitive's own axes."""
+    centre, rotation = item["centre"], item["rotation"]
+    x = vector[0] - centre[0] if shift else vector[0]
+    y = vector[1] - centre[1] if shift else vector[1]
+    z = vector[2] - centre[2] if shift else vector[2]
+    for axis in range(3):
+        local[axis] = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z
+
+
+@njit(cache=True)
+def _passes_by(item: np.void, origin: Array, ray: Array) -> bool:
+    """Whether the ray misses the sphere around the primitive."""
+    centre = item["centre"]
+    x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
+    along = x * ray[0] + y * ray[1] + z * ray[2]
+    bound: float = item["bound"]
+    return bool(x * x + y * y + z * z - along * along > bound * bound)
 
 
 @njit(cache=True)
@@ -176,17 +196,17 @@ def _trace(
     stride: int,
     light: Array,
     colour: Array,
+    scratch: Array,  # [7, 3], so that a ray allocates nothing
 ) -> float:
     """Radiance along one ray into ``colour``; returns the distance."""
-    best, hit = MISS, -1
-    normal, best_normal = np.zeros(3), np.zeros(3)
-    local_point, local_ray = np.zeros(3), np.zeros(3)
+    best, hit = MISS, 0
+    normal, best_normal, local_point, local_ray = scratch[0], scratch[1], scratch[2], scratch[3]
     for number in range(primitives.shape[0]):
         item = primitives[number]
-        offset = origin - item["centre"]
-        for axis in range(3):
-            local_point[axis] = _dot(item["rotation"][axis], offset)
-            local_ray[axis] = _dot(item["rotation"][axis], ray)
+        if _passes_by(item, origin, ray):
+            continue
+        _to_local(item, origin, True, local_point)
+        _to_local(item, ray, False, local_ray)
         if item["kind"] == BOX:
             distance = _hit_box(local_point, local_ray, item["size"], normal)
         elif item["kind"] == SPHERE:
@@ -195,37 +215,41 @@ def _trace(
             distance = _hit_rod(local_point, local_ray, item["size"][0], item["size"][1], normal)
         if distance < best:
             best, hit = distance, number
-            best_normal[:] = normal
-    if hit < 0:
-        colour[:] = 0.0
-        return best
+            best_normal[0], best_normal[1], best_normal[2] = normal[0], normal[1], normal[2]
     item = primitives[hit]
-    point = origin + best * ray
-    offset = point - item["centre"]
-    world_normal = np.zeros(3)
-    for axis in range(3):
-        local_point[axis] = _dot(item["rotation"][axis], offset)
-        for k in range(3):
-            world_normal[k] += best_normal[axis] * item["rotation"][axis][k]
+    point, world_normal, to_light = scratch[4], scratch[5], scratch[6]
+    reach = 0.0
+    for k in range(3):
+        point[k] = origin[k] + best * ray[k]
+        to_light[k] = light[k] - point[k]
+        reach += to_light[k] * to_light[k]
+        world_normal[k] = 0.0
+        for axis in range(3):
+            world_normal[k] += best_normal[axis] * item["rotation"][axis, k]
+    reach = math.sqrt(reach)
+    for k in range(3):
+        to_light[k] /= reach
+    _to_local(item, point, True, local_point)
     facing = max(abs(_dot(world_normal, ray)), 0.05)
-    uv = np.zeros(2)
-    _texture_coordinates(item["kind"], local_point, best_normal, item["size"], uv)
-    _sample(texels, offsets, item["texture"] * stride, uv, best * pixel_angle / facing, colour)
+    _texture_coordinates(item["kind"], local_point, best_normal, item["size"], local_ray)
+    _sample(texels, offsets, item["texture"] * stride, local_ray, best * pixel_angle / facing, colour)
 
-    to_light = light - point
-    reach = math.sqrt(_dot(to_light, to_light))
-    to_light /= reach
-    lit = _shadow(point, light, primitives, hit)
+    lit = _shadow(point, to_light, reach, primitives, hit)
     diffuse = max(_dot(world_normal, to_light), 0.0) * lit * LAMP / (1 + 0.25 * reach * reach)
     corner = 1.0  # ambient light fades towards the room's edges
     for axis in range(3):
         gap = primitives[0]["size"][axis] - abs(point[axis] - primitives[0]["centre"][axis])
         corner *= 1 - 0.35 * math.exp(-max(gap, 0.0) / 0.25)
-    half_vector = to_light - ray
-    half_vector /= math.sqrt(_dot(half_vector, half_vector))
-    highlight = item["gloss"] * lit * max(_dot(world_normal, half_vector), 0.0) ** 40
+    highlight = 0.0
+    if item["gloss"] > 0:  # Blinn-Phong
+        facing_half, norm = 0.0, 0.0
+        for k in range(3):
+            half = to_light[k] - ray[k]
+            norm += half * half
+            facing_half += world_normal[k] * half
+        highlight = 0.6 * item["gloss"] * lit * max(facing_half / math.sqrt(norm), 0.0) ** 40
     for channel in range(3):
-        colour[channel] = colour[channel] * (AMBIENT * corner + diffuse) + 0.6 * highlight
+        colour[channel] = colour[channel] * (AMBIENT * corner + diffuse) + highlight
     return best
 
 
@@ -249,21 +273,26 @@ def _render(
 ) -> None:
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
     for row in prange(height):
-        origin, ray, colour, camera_ray = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        origin, ray, colour, start, scratch = (
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros((7, 3)),
+        )
         for column in range(width):
             for number in range(passes):
                 pose = poses[number, row]
-                camera_ray[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
-                camera_ray[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
-                camera_ray[2] = focus
-                norm = math.sqrt(_dot(camera_ray, camera_ray))
+                start[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
+                start[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
+                start[2] = focus
+                norm = math.sqrt(_dot(start, start))
                 for axis in range(3):
-                    ray[axis] = _dot(pose[axis], camera_ray) / norm
-                    origin[axis] = (
-                        pose[axis, 3] + pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
-                    )
+                    ray[axis] = _dot(pose[axis], start) / norm
+                    on_lens = pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
+                    origin[axis] = pose[axis, 3] + on_lens
                 distance = _trace(
-                    origin, ray, 1 / fx, primitives, texels, offsets, stride, light, colour
+                    origin, ray, 1 / fx, primitives, texels, offsets, stride, light, colour, scratch
                 )
                 depth[row, column] += distance * focus / norm / passes
                 for channel in range(3):

@@ -19,7 +19,8 @@ PRIMITIVE = np.dtype(
         ("size", np.float64, (3,)),  # half sides; radius first for a sphere; radius, half length for a rod
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
-        ("bound", np.float64),  # radius of the bounding sphere that casts the soft shadow, 0 for none
+        ("bound", np.float64),  # radius of the bounding sphere
+        ("shade", np.float64),  # radius of the sphere that casts its soft shadow, 0 for none
     ]
 )
 
@@ -51,8 +52,9 @@ def _primitive(
 ) -> NDArray[np.void]:
     cy, sy, ct, st = np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt)
     turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
-    bound = {BOX: float(np.cbrt(np.prod(size))), SPHERE: size[0], ROD: 0.0}[kind] if shadow else 0.0
-    return np.array((kind, centre, turn.T, size, texture, gloss, bound), PRIMITIVE)
+    bound = size[0] if kind == SPHERE else float(np.linalg.norm(size))
+    shade = {BOX: float(np.cbrt(np.prod(size))), SPHERE: size[0], ROD: 0.0}[kind] if shadow else 0.0
+    return np.array((kind, centre, turn.T, size, texture, gloss, bound, shade), PRIMITIVE)
 
 
 def make_room(seed: int) -> Room:
@@ -103,7 +105,9 @@ def make_room(seed: int) -> Room:
     for _ in range(4):  # thin rods leaning about
         centre = (rng.uniform(-1.8, 1.8), rng.uniform(0.7, 0.9), rng.uniform(-1.8, -0.9))
         size = (rng.uniform(0.008, 0.02), rng.uniform(0.6, 0.8), 0.0)
-        items.append(_primitive(ROD, centre, size, material(), yaw=rng.uniform(0, 6), tilt=rng.uniform(0, 0.3)))
+        items.append(
+            _primitive(ROD, centre, size, material(), yaw=rng.uniform(0, 6), tilt=rng.uniform(0, 0.3))
+        )
 
     light = np.array([rng.uniform(-1.2, 1.2), HEIGHT - 0.3, rng.uniform(0.2, 1.2)])
     return Room(np.array(items, PRIMITIVE), textures, light, np.array([table[0], 0.95, table[2] - 0.3]))

@@ -1,4 +1,4 @@
-"""Seeded, periodic textures with detail at every scale, so that feature detectors find the room's surfaces."""
+"""Seeded, periodic textures with detail at every scale, so that SIFT finds the room's surfaces."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> NDAr
     radius[0, 0] = np.inf
     spectrum = np.fft.rfft2(rng.standard_normal((SIZE, SIZE))) / radius**slope
     noise = np.fft.irfft2(spectrum, (SIZE, SIZE))
-    return noise / noise.std()
+    return np.asarray(noise / noise.std(), np.float64)
 
 
 def _mix(
