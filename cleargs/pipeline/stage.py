@@ -70,7 +70,7 @@ class Stage(Protocol):
     """Distributions whose version changes results; their versions enter the key."""
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
-        """Role -> file or folder outside the store whose content enters the key (the capture, model weights)."""
+        """Role -> file or folder outside the store whose content enters the key (capture, model weights)."""
 
     def estimate(self, context: StageContext[Any]) -> Estimate:
         """Rough cost, from the settings and the inputs that already exist."""

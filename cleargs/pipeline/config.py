@@ -1,0 +1,245 @@
+"""The configuration of a run: a recipe merged over the defaults, then single settings, checked by each stage.
+
+A document has one table a stage, and beside them ``seed``. What a stage may be told is its CONFIG model.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib.resources import files
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from cleargs.errors import ConfigError
+from cleargs.pipeline.dag import Dag
+
+RECIPES = "cleargs.workflows"
+"""The package that holds the recipes known by name."""
+
+MAX_SEED = 2**63 - 1
+
+KIND_WORDS: Mapping[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+}
+"""How the types of settings are called in an error."""
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    """A checked configuration."""
+
+    seed: int
+    sections: Mapping[str, BaseModel]
+    """Stage -> its settings, defaults filled in."""
+
+    def document(self) -> Document:
+        """The full configuration as TOML holds it (settings that are None are left out)."""
+        tables = {
+            name: model.model_dump(mode="json", exclude_none=True) for name, model in self.sections.items()
+        }
+        return {"seed": self.seed, **tables}
+
+
+def load_config(
+    dag: Dag, recipe: str = "default", overrides: Sequence[str] = (), seed: int | None = None
+) -> Config:
+    """The configuration of ``recipe`` (a name or a TOML file), each ``a.b=value`` of ``overrides`` on top.
+
+    Raises ConfigError: unknown recipe, TOML that cannot be read, unknown setting, value out of range.
+    """
+    document = read_recipe(recipe)
+    for text in overrides:
+        document = merge(document, parse_override(text))
+    if seed is not None:
+        document = merge(document, {"seed": seed})
+    return check_document(dag, document)
+
+
+def read_recipe(recipe: str) -> Document:
+    """The document of a recipe known by name, or of the TOML file at the path ``recipe``."""
+    if recipe.endswith(".toml") or "/" in recipe:
+        return read_toml(Path(recipe))
+    names = recipe_names()
+    if recipe not in names:
+        near = get_close_matches(recipe, names, n=1)
+        raise ConfigError(
+            f"there is no workflow {recipe!r}",
+            hint=f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}, or give a .toml file",
+        )
+    return parse_toml(files(RECIPES).joinpath(f"{recipe}.toml").read_text(encoding="utf-8"), f"{recipe}.toml")
+
+
+def recipe_names() -> list[str]:
+    """Recipes known by name."""
+    names = (entry.name for entry in files(RECIPES).iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def read_toml(path: Path) -> Document:
+    """Read a TOML file. Raises ConfigError when it cannot be read."""
+    try:
+        return parse_toml(path.read_text(encoding="utf-8"), path.name)
+    except (OSError, UnicodeDecodeError) as error:
+        cause = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ConfigError(f"cannot read {path}: {cause}", hint="check the path of the TOML file") from error
+
+
+def parse_toml(text: str, name: str) -> Document:
+    """Parse TOML; ``name`` stands in the error."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(
+            f"{name} is not valid TOML: {error}", hint="see https://toml.io for the syntax"
+        ) from error
+
+
+def parse_override(text: str) -> Document:
+    """``a.b=value`` as a document. The value is TOML; what is no TOML value is taken as a string."""
+    name, equals, value = text.partition("=")
+    parts = [part.strip() for part in name.split(".")]
+    if not equals or not all(parts):
+        raise ConfigError(
+            f"--set {text!r} is not of the form a.b=value", hint="write --set rva.tau_R=0.7, say"
+        )
+    document: Any = _toml_value(value.strip())
+    for part in reversed(parts):
+        document = {part: document}
+    assert isinstance(document, dict)
+    return document
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        document = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return document["value"] if len(document) == 1 else text
+
+
+def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
+    """``base`` with the values of ``top`` in place of its own; tables are merged, lists replaced."""
+    merged = dict(base)
+    for name, value in top.items():
+        below = merged.get(name)
+        merged[name] = merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
+    """Check a document against the stages' models and fill in the defaults. Raises ConfigError."""
+    seed = document.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
+        raise ConfigError(
+            f"seed = {seed!r} cannot be used", hint=f"allowed: a whole number from 0 to {MAX_SEED}"
+        )
+    models = {name: dag.load(name).CONFIG for name in dag.names}
+    for name in document:
+        if name != "seed" and name not in models:
+            raise _unknown(name, "", {"seed": None, **models}, models)
+    sections = {}
+    for name, model in models.items():
+        try:
+            sections[name] = model.model_validate(document.get(name, {}))
+        except ValidationError as error:
+            raise _setting_error(name, model, models, error) from error
+    return Config(seed, sections)
+
+
+# -- errors that teach -------------------------------------------------------------------------------------
+
+
+def _setting_error(
+    section: str, model: type[BaseModel], models: Mapping[str, type[BaseModel]], error: ValidationError
+) -> ConfigError:
+    """The first complaint of pydantic as one line of cause and one of remedy."""
+    first = error.errors(include_url=False)[0]
+    parts = [str(part) for part in first["loc"]]
+    name = ".".join([section, *parts])
+    owner, field = _locate(model, parts)
+    if first["type"] == "extra_forbidden":
+        siblings = owner.model_fields if owner is not None else {}
+        return _unknown(parts[-1], ".".join([section, *parts[:-1]]) + ".", siblings, models)
+    message = first["msg"].removeprefix("Value error, ")
+    if not parts:
+        return ConfigError(f"{section}: {message}", hint=f"change the settings of [{section}]")
+    allowed = _allowed(field) if field is not None else message
+    hint = f"allowed: {allowed}" if allowed else message[:1].lower() + message[1:]
+    return ConfigError(f"{name} = {first['input']!r} cannot be used", hint=hint)
+
+
+def _unknown(
+    name: str, prefix: str, siblings: Iterable[str], models: Mapping[str, type[BaseModel]]
+) -> ConfigError:
+    """The error for a name that is no setting, with the nearest right one: a sibling, or one further away."""
+    siblings = list(siblings)
+    near = [prefix + found for found in get_close_matches(name, siblings, n=1)]
+    if not near:
+        everything = [f"{section}.{field}" for section, model in models.items() for field in _names(model)]
+        by_last = {full.rpartition(".")[2]: full for full in reversed(everything)}
+        near = [by_last[found] for found in get_close_matches(name, by_last, n=1)]
+    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(prefix + known for known in siblings)}"
+    return ConfigError(f"there is no setting {prefix}{name}", hint=hint)
+
+
+def _names(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        inner = _inner_model(field)
+        if inner is None:
+            yield prefix + name
+        else:
+            yield from _names(inner, f"{prefix}{name}.")
+
+
+def _locate(model: type[BaseModel], parts: Sequence[str]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
+    """The model that holds the last of ``parts``, and its field; None where the path leaves the models."""
+    owner: type[BaseModel] | None = model
+    field: FieldInfo | None = None
+    for part in parts:
+        if owner is None:
+            break
+        field = owner.model_fields.get(part)
+        if part != parts[-1]:
+            owner = _inner_model(field) if field is not None else None
+    return owner, field
+
+
+def _inner_model(field: FieldInfo) -> type[BaseModel] | None:
+    for kind in (field.annotation, *get_args(field.annotation)):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return kind
+    return None
+
+
+def _allowed(field: FieldInfo) -> str:
+    """What a field takes, in words: its choices, or its type and range."""
+    kinds: list[Any] = [field.annotation]
+    if get_origin(field.annotation) in (Union, UnionType):
+        kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
+    words = []
+    for kind in kinds:
+        if get_origin(kind) is Literal:
+            words += [str(choice) for choice in get_args(kind)]
+        else:
+            words.append(KIND_WORDS.get(kind, ""))
+    if not all(words):
+        return ""
+    limits = []
+    for attribute, word in (("ge", "at least"), ("gt", "more than"), ("le", "at most"), ("lt", "less than")):
+        for item in field.metadata:
+            if getattr(item, attribute, None) is not None:
+                limits.append(f"{word} {getattr(item, attribute)}")
+    text = " or ".join(words)
+    return f"{text}, {' and '.join(limits)}" if limits else text

@@ -1,0 +1,44 @@
+"""Which stages there are, and where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from typing import cast
+
+from cleargs.errors import InputError
+from cleargs.pipeline.stage import Stage
+
+
+@dataclass(frozen=True)
+class Dag:
+    """Stages in an order in which each comes after all that it reads, and how to load one by name."""
+
+    names: tuple[str, ...]
+    load: Callable[[str], Stage]
+
+    def check(self, name: str) -> str:
+        """``name``, when there is such a stage. Raises InputError with the nearest name otherwise."""
+        if name not in self.names:
+            near = get_close_matches(name, self.names, n=1)
+            raise InputError(
+                f"there is no stage {name!r}",
+                hint=f"did you mean {near[0]}?" if near else f"the stages are {', '.join(self.names)}",
+            )
+        return name
+
+    def until(self, name: str | None) -> tuple[str, ...]:
+        """All stages up to and with ``name``; all of them for None."""
+        return self.names if name is None else self.names[: self.names.index(self.check(name)) + 1]
+
+
+def installed() -> Dag:
+    """The stages of the package ``cleargs.stages``. Each module is loaded when it is first asked for."""
+    return Dag(tuple(import_module("cleargs.stages").STAGES), load_stage)
+
+
+def load_stage(name: str) -> Stage:
+    """The module ``cleargs.stages.<name>``."""
+    return cast(Stage, import_module(f"cleargs.stages.{name}"))

@@ -1,0 +1,157 @@
+"""Content digests of files and folders, and a memo that saves hashing the same file twice."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from cleargs.errors import InputError
+from cleargs.pipeline.keys import canonical_json
+
+RACY_NS = 2_000_000_000
+"""A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of the file's bytes, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def tree_digest(files: Mapping[str, str]) -> str:
+    """One digest for many files: ``files`` maps each relative path (POSIX) to the digest of its content."""
+    return hashlib.sha256(canonical_json(dict(files)).encode()).hexdigest()
+
+
+def files_under(path: Path) -> dict[str, Path]:
+    """Relative POSIX path -> file, for each file in the folder ``path`` that is not hidden."""
+    found = {}
+    for folder, folders, names in os.walk(path, followlinks=True):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            if not name.startswith("."):
+                file = Path(folder, name)
+                found[file.relative_to(path).as_posix()] = file
+    return found
+
+
+class DigestMemo:
+    """Digests by (path, size, mtime_ns, inode), kept in an SQLite file.
+
+    The memo only saves time: where its file is damaged, locked or not writable, digests are computed
+    afresh and nobody is troubled. The file appears with the first flush, if its folder is there by then.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pending: dict[str, tuple[int, int, int, str]] = {}
+        self._database = _open(path) if path.exists() else None
+
+    def __enter__(self) -> DigestMemo:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.flush()
+        if self._database is not None:
+            self._database.close()
+
+    def flush(self) -> None:
+        """Write what was learnt since the last flush."""
+        if self._database is None and self._pending and self._path.parent.is_dir():
+            self._database = _open(self._path)
+        if self._database is None:
+            return
+        rows = [(path, *row) for path, row in self._pending.items()]
+        with suppress(sqlite3.Error), self._database:  # locked or damaged: the next run hashes again
+            self._database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", rows)
+            self._pending.clear()
+
+    def digest(self, path: Path) -> str:
+        """The digest of the file at ``path``: remembered where size, time and inode are unchanged."""
+        name, state = _state(path)
+        known = self._pending.get(name) or self._lookup(name)
+        if known is not None and known[:3] == state:
+            return known[3]
+        digest = file_digest(path)
+        if time.time_ns() - state[1] > RACY_NS:
+            self._pending[name] = (*state, digest)
+        return digest
+
+    def remember(self, path: Path, digest: str) -> None:
+        """Note the digest of a file that nobody will write again."""
+        name, state = _state(path)
+        self._pending[name] = (*state, digest)
+
+    def forget(self, path: Path) -> None:
+        """Drop what is known of ``path``, so that the next `digest` reads the file."""
+        name = str(path.absolute())
+        self._pending.pop(name, None)
+        if self._database is not None:
+            with suppress(sqlite3.Error), self._database:
+                self._database.execute("DELETE FROM digests WHERE path = ?", (name,))
+
+    def digests_of(self, path: Path) -> dict[str, str]:
+        """Relative path -> digest for a folder, or {"": digest} for a file.
+
+        Raises InputError when there is nothing at ``path`` or it cannot be read.
+        """
+        try:
+            if path.is_dir():
+                return {name: self.digest(file) for name, file in files_under(path).items()}
+            return {"": self.digest(path)}
+        except OSError as error:
+            raise InputError(
+                f"cannot read {error.filename or path}: {error.strerror or error}",
+                hint="check the path and its permissions",
+            ) from error
+
+    def _lookup(self, name: str) -> tuple[int, int, int, str] | None:
+        if self._database is None:
+            return None
+        try:
+            row: tuple[int, int, int, str] | None = self._database.execute(
+                "SELECT size, mtime_ns, inode, digest FROM digests WHERE path = ?", (name,)
+            ).fetchone()
+        except sqlite3.Error:
+            return None
+        return row
+
+
+def _state(path: Path) -> tuple[str, tuple[int, int, int]]:
+    status = path.stat()
+    return str(path.absolute()), (status.st_size, status.st_mtime_ns, status.st_ino)
+
+
+def _open(path: Path) -> sqlite3.Connection | None:
+    """Open the memo; a damaged file is replaced by an empty one. None where that cannot be done."""
+    try:
+        return _connect(path)
+    except sqlite3.OperationalError:
+        return None  # locked, or not writable
+    except sqlite3.DatabaseError:
+        with suppress(OSError, sqlite3.Error):
+            path.unlink(missing_ok=True)
+            return _connect(path)
+    return None
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path, timeout=5)
+    try:
+        database.execute(
+            "CREATE TABLE IF NOT EXISTS digests"
+            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, inode INTEGER, digest TEXT)"
+        )
+        database.execute("SELECT path, size, mtime_ns, inode, digest FROM digests LIMIT 1").fetchone()
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database

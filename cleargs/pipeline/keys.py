@@ -1,0 +1,144 @@
+"""The key of a stage: one digest of everything that decides its results, and of nothing else.
+
+Not in a key: paths, host, time, number of threads, log level.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+SCHEMA = 1
+"""Raised when the way keys are made changes: every old result becomes a miss."""
+
+PRECISION = "float32"
+"""Precision of the parameters that the stages train and publish."""
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys and no spaces: equal values give equal text. NaN and infinities are refused."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+
+
+class KeyParts(BaseModel):
+    """What goes into the key of one stage."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stage: str
+    version: int
+    config: dict[str, Any]
+    """The stage's own section, without the fields marked by `key_config` as outside the key."""
+    inputs: dict[str, dict[str, str | None]]
+    """Upstream stage -> declared path -> digest of its content; None where an optional path is absent."""
+    externals: dict[str, str]
+    """Role -> digest of the content of a file or folder outside the store."""
+    seed: int
+    device: Literal["cpu", "cuda"]
+    libraries: dict[str, str]
+    precision: str = PRECISION
+    schema_version: int = SCHEMA
+
+    @property
+    def key(self) -> str:
+        """sha256 of the canonical JSON, hexadecimal."""
+        return hashlib.sha256(canonical_json(self.model_dump(mode="json")).encode()).hexdigest()
+
+
+def key_config(config: BaseModel) -> dict[str, Any]:
+    """The settings that enter the key, as JSON values.
+
+    A field declared with ``Field(..., json_schema_extra={"key": False})`` stays out. That is for settings
+    that only name a file, whose content enters the key through the stage's ``externals``.
+    """
+    kept: dict[str, Any] = {}
+    plain = config.model_dump(mode="json")
+    for name, field in type(config).model_fields.items():
+        extra = field.json_schema_extra
+        if isinstance(extra, dict) and extra.get("key") is False:
+            continue
+        value = getattr(config, name)
+        kept[name] = key_config(value) if isinstance(value, BaseModel) else plain[name]
+    return kept
+
+
+def library_versions(distributions: tuple[str, ...]) -> dict[str, str]:
+    """Installed version of each distribution; "absent" where it is not installed."""
+    versions = {}
+    for name in distributions:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "absent"
+    return versions
+
+
+def differences(
+    old: KeyParts,
+    new: KeyParts,
+    old_files: Mapping[str, Mapping[str, str]],
+    new_files: Mapping[str, Mapping[str, str]],
+) -> list[str]:
+    """What changed between two sets of parts, one readable line each; empty when the keys are equal.
+
+    ``old_files`` and ``new_files`` map "STAGE/PATH" (inputs) or a role (externals) to the digests of the
+    single files behind it, so that a change names the file.
+    """
+    lines = []
+    if old.version != new.version:
+        lines.append(f"stage version: {old.version} -> {new.version}")
+    old_settings, new_settings = dict(_flat(old.config)), dict(_flat(new.config))
+    for name in sorted(old_settings.keys() | new_settings.keys()):
+        before, after = old_settings.get(name, "(none)"), new_settings.get(name, "(none)")
+        if before != after:
+            lines.append(f"setting {new.stage}.{name}: {_show(before)} -> {_show(after)}")
+    for where, before, after in (
+        ("input", _input_digests(old), _input_digests(new)),
+        ("external", old.externals, new.externals),
+    ):
+        for name in sorted(before.keys() | after.keys()):
+            if before.get(name) != after.get(name):
+                changed = _changed_files(old_files.get(name, {}), new_files.get(name, {}))
+                lines.append(f"{where} {name}{changed}")
+    for name in sorted(old.libraries.keys() | new.libraries.keys()):
+        before, after = old.libraries.get(name, "(none)"), new.libraries.get(name, "(none)")
+        if before != after:
+            lines.append(f"library {name}: {before} -> {after}")
+    for name in ("seed", "device", "precision", "schema_version"):
+        if getattr(old, name) != getattr(new, name):
+            lines.append(f"{name.replace('_', ' ')}: {getattr(old, name)} -> {getattr(new, name)}")
+    return lines
+
+
+def _input_digests(parts: KeyParts) -> dict[str, str | None]:
+    return {
+        f"{stage}/{path}": digest for stage, paths in parts.inputs.items() for path, digest in paths.items()
+    }
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _show(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _changed_files(old: Mapping[str, str], new: Mapping[str, str], limit: int = 3) -> str:
+    """The first few changed files as ": a.png changed, b.png added"; " changed" for a single file."""
+    names = sorted(name for name in old.keys() | new.keys() if name and old.get(name) != new.get(name))
+    if not names:
+        return " changed"
+    words = {(True, True): "changed", (True, False): "removed", (False, True): "added"}
+    shown = [f"{name} {words[name in old, name in new]}" for name in names[:limit]]
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ": " + ", ".join(shown) + more

@@ -1,0 +1,160 @@
+"""``manifest.json``: the last file written into a finished stage folder, and what makes it finished."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+import cleargs
+from cleargs.files import is_partial, write_json
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.keys import KeyParts, canonical_json
+
+MANIFEST = "manifest.json"
+
+
+class FileRecord(BaseModel):
+    """One published file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: int
+    digest: str
+
+
+class Manifest(BaseModel):
+    """What a finished stage folder holds and what it was made from. Names no host and no absolute path."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stage: str
+    key: str
+    status: Literal["complete", "partial"]
+    """`partial` when this stage or one before it is done only in part."""
+    missing: tuple[str, ...]
+    """What this stage could not make."""
+    inherited: tuple[str, ...]
+    """What the stages before it could not make, as "STAGE: what"."""
+    parts: KeyParts
+    """All that went into the key."""
+    origins: dict[str, dict[str, str]]
+    """"STAGE/PATH" (inputs) or role (externals) -> digests of the single files behind it."""
+    files: dict[str, FileRecord]
+    """Relative path -> size and digest of every file except this one."""
+    digest: str
+    """Digest of the whole tree."""
+    versions: dict[str, str]
+    started: str
+    """UTC, ISO 8601."""
+    seconds: float
+    device: str
+    summary: dict[str, Any]
+    """The figures that the stage reports."""
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files together."""
+        return sum(record.size for record in self.files.values())
+
+    def under(self, path: str) -> dict[str, str]:
+        """Digests of the file ``path``, or of all files in the folder ``path``; empty without either."""
+        if path in self.files:
+            return {"": self.files[path].digest}
+        prefix = path.rstrip("/") + "/"
+        return {
+            name.removeprefix(prefix): record.digest
+            for name, record in self.files.items()
+            if name.startswith(prefix)
+        }
+
+
+def versions() -> dict[str, str]:
+    """Versions worth noting beside the libraries that enter the key."""
+    return {"cleargs": cleargs.__version__, "python": platform.python_version()}
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write ``manifest`` into ``folder`` atomically, sealed by a digest of its own content."""
+    content = manifest.model_dump(mode="json")
+    write_json(folder / MANIFEST, {**content, "seal": _seal(content)})
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read and check the manifest in ``folder``.
+
+    Raises FileNotFoundError when there is none (the stage is not done), ValueError when it is damaged.
+    """
+    try:
+        content = json.loads((folder / MANIFEST).read_bytes())
+        seal = content.pop("seal")
+        if seal != _seal(content):
+            raise ValueError("the manifest was changed")
+        return Manifest.model_validate(content)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValidationError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError("the manifest is damaged") from error
+
+
+def linked_manifest(run: Path, stage: str) -> Manifest | None:
+    """The manifest that ``RUN/<stage>`` shows now; None when there is none that can be read."""
+    try:
+        return read_manifest(run / stage)
+    except (OSError, ValueError):
+        return None
+
+
+def published_files(folder: Path) -> dict[str, Path]:
+    """Relative POSIX path -> file, for every file that belongs to the outputs in ``folder``."""
+    return {
+        file.relative_to(folder).as_posix(): file
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and not is_partial(file) and file != folder / MANIFEST
+    }
+
+
+def damage(folder: Path, manifest: Manifest, memo: DigestMemo) -> str | None:
+    """Why the files in ``folder`` are not those of ``manifest``, or None when they are.
+
+    Sizes are always read; digests come through ``memo``, and one that differs is computed afresh first.
+    """
+    for name, record in manifest.files.items():
+        file = folder / name
+        try:
+            if file.stat().st_size != record.size:
+                return f"{name} has another size"
+            if memo.digest(file) != record.digest:
+                memo.forget(file)
+                if memo.digest(file) != record.digest:
+                    return f"{name} has other content"
+        except FileNotFoundError:
+            return f"{name} is missing"
+        except OSError as error:
+            return f"{name} cannot be read: {error.strerror or error}"
+    return None
+
+
+def plain_json(value: Any) -> Any:
+    """``value`` as JSON holds it: numpy scalars as numbers, tuples as lists, NaN and infinities as null."""
+    if isinstance(value, Mapping):
+        return {str(name): plain_json(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_json(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy arrays and scalars, torch tensors
+        return plain_json(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    return str(value)
+
+
+def _seal(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(canonical_json(content).encode()).hexdigest()

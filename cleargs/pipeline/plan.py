@@ -1,0 +1,209 @@
+"""What a run would do: for each stage whether its results are there, and if not, what changed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from cleargs.errors import InputError, StoreError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import tree_digest
+from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions
+from cleargs.pipeline.manifest import Manifest, linked_manifest
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.stage import Estimate, StageContext
+from cleargs.pipeline.store import Entry, Store
+from cleargs.progress import Reporter
+
+Origins = dict[str, dict[str, str]]
+
+State = Literal["hit", "partial", "miss", "waits"]
+"""`partial`: there, but its own work is not whole. `waits`: a stage before it must run first; as keys are
+made of content, it may turn out to be a hit."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What one stage would be made from, all of it known."""
+
+    parts: KeyParts
+    origins: Origins
+    externals: Mapping[str, Path]
+    inputs: Mapping[str, Path]
+    """Upstream stage -> its finished folder."""
+    inherited: tuple[str, ...]
+    """What the stages before could not make."""
+
+    @property
+    def key(self) -> str:
+        """The key of the stage's results."""
+        return self.parts.key
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """The state of one stage of a run."""
+
+    stage: str
+    state: State
+    reasons: tuple[str, ...]
+    """Why it is no hit, or what a partial one lacks."""
+    estimate: Estimate | None = None
+    """Cost of the work to do; None where there is none."""
+    key: str | None = None
+    """None while a stage before it must run first."""
+
+
+@dataclass
+class Planner:
+    """Makes recipes and compares them with what the store and the run folder hold. Writes nothing."""
+
+    dag: Dag
+    run: Run
+    store: Store
+    threads: int
+    reporter: Reporter
+
+    def recipe(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+        """What ``name`` is made from, given the manifests of the stages before it.
+
+        Raises InputError when an external (the capture, a model) cannot be read.
+        """
+        stage, config = self.dag.load(name), self.run.config.sections[name]
+        origins: Origins = {}
+        inputs: dict[str, dict[str, str | None]] = {}
+        for upstream, paths in stage.INPUTS.items():
+            inputs[upstream] = {}
+            for path in paths:
+                files = done[upstream].under(path)
+                origins[f"{upstream}/{path}"] = files
+                inputs[upstream][path] = tree_digest(files) if files else None
+        external_files = dict(stage.externals(config, self.run.source))
+        externals = {}
+        for role, place in external_files.items():
+            if self.run.folder.is_relative_to(place):
+                raise InputError(
+                    f"the run folder {self.run.folder} lies inside the input {place}",
+                    hint="choose a folder beside the input with -o",
+                )
+            origins[role] = self.store.memo.digests_of(place)
+            externals[role] = tree_digest(origins[role])
+        parts = KeyParts(
+            stage=name,
+            version=stage.VERSION,
+            config=key_config(config),
+            inputs=inputs,
+            externals=externals,
+            seed=self.run.config.seed,
+            device=self.run.device,
+            libraries=library_versions(stage.LIBRARIES),
+        )
+        folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
+        inherited = tuple(
+            dict.fromkeys(
+                line
+                for upstream in stage.INPUTS
+                for line in (
+                    *done[upstream].inherited,
+                    *(f"{upstream}: {missing}" for missing in done[upstream].missing),
+                )
+            )
+        )
+        return Recipe(parts, origins, external_files, folders, inherited)
+
+    def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
+        """Why the results of ``recipe`` are not there, in lines for a reader."""
+        if entry is not None and entry.damage is not None:
+            return (f"damaged: {entry.damage}",)
+        before = linked_manifest(self.run.folder, recipe.parts.stage)
+        if before is None:
+            return ("not made yet",)
+        changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
+        return tuple(changes) or ("its results were removed from the store",)
+
+    def estimate(self, name: str) -> Estimate:
+        """Rough cost of ``name``, from its settings and what exists of its inputs, older ones included."""
+        stage = self.dag.load(name)
+        inputs = {
+            upstream: (self.run.folder / upstream).resolve()
+            for upstream in stage.INPUTS
+            if linked_manifest(self.run.folder, upstream) is not None
+        }
+        nowhere = self.store.root / "work" / "estimate"
+        config = self.run.config.sections[name]
+        externals = stage.externals(config, self.run.source)
+        return stage.estimate(self.context(name, inputs, externals, nowhere / "out", nowhere / "checkpoints"))
+
+    def context(
+        self,
+        name: str,
+        inputs: Mapping[str, Path],
+        externals: Mapping[str, Path],
+        out: Path,
+        checkpoints: Path,
+    ) -> StageContext[Any]:
+        """All that the stage ``name`` is told."""
+        return StageContext(
+            config=self.run.config.sections[name],
+            source=self.run.source,
+            inputs=inputs,
+            externals=externals,
+            out=out,
+            checkpoints=checkpoints,
+            seed=self.run.config.seed,
+            device=self.run.device,
+            threads=self.threads,
+            reporter=self.reporter,
+        )
+
+    def plan(self, until: str | None = None, force: tuple[str, ...] = ()) -> list[StagePlan]:
+        """The state of each stage up to ``until``."""
+        plans: list[StagePlan] = []
+        done: dict[str, Manifest] = {}
+        for name in self.dag.until(until):
+            waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
+            if waits_for:
+                reason = f"waits for {', '.join(waits_for)}"
+                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
+                continue
+            recipe = self.recipe(name, done)
+            entry = self.store.find(name, recipe.key)
+            usable = entry.usable if entry is not None else None
+            if name in force:
+                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name), recipe.key))
+            elif usable is None:
+                reasons = self.reasons(recipe, entry)
+                plans.append(StagePlan(name, "miss", reasons, self.estimate(name), recipe.key))
+            elif usable.missing:
+                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name), recipe.key))
+            else:
+                done[name] = usable
+                plans.append(StagePlan(name, "hit", (), None, recipe.key))
+        return plans
+
+
+def cost_line(plans: list[StagePlan]) -> str:
+    """One line of expected minutes, memory and disk for each stage with work to do; "" without work."""
+    costs = [(plan.stage, plan.estimate) for plan in plans if plan.estimate is not None]
+    if not costs:
+        return ""
+    words = [
+        f"{stage} {cost.minutes:.1f} min {cost.memory_gb:.1f} GB, disk {cost.disk_gb:.1f} GB"
+        for stage, cost in costs
+    ]
+    return f"expected about {sum(cost.minutes for _, cost in costs):.1f} min: " + "; ".join(words)
+
+
+def check_disk(plans: list[StagePlan], store: Path) -> None:
+    """Raise StoreError when the disk of ``store`` has less free space than the stages to run will fill."""
+    needed = sum(plan.estimate.disk_gb for plan in plans if plan.estimate is not None)
+    place = next(folder for folder in (store, *store.parents) if folder.exists())
+    free = shutil.disk_usage(place).free / 1e9
+    if needed > free:
+        raise StoreError(
+            f"the run needs about {needed:.1f} GB of disk, {free:.1f} GB are free at {place}",
+            hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
+        )

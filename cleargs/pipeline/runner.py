@@ -1,0 +1,227 @@
+"""The runner: brings each stage of a run from its recipe to a finished folder in the store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from cleargs.errors import InputError, StageError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import file_digest, tree_digest
+from cleargs.pipeline.manifest import (
+    FileRecord,
+    Manifest,
+    linked_manifest,
+    plain_json,
+    published_files,
+    versions,
+    write_manifest,
+)
+from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line
+from cleargs.pipeline.run_file import RUN_FILE, Run, read_run_file, write_run_file
+from cleargs.pipeline.stage import StageResult
+from cleargs.pipeline.store import Entry, Store
+from cleargs.progress import Reporter
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one stage."""
+
+    stage: str
+    how: Literal["found", "made"]
+    manifest: Manifest
+    folder: Path
+
+
+class Runner:
+    """Runs stages of one run folder. ``store.in_use()`` is held by each public method while it works."""
+
+    def __init__(self, dag: Dag, run: Run, store: Store, threads: int, reporter: Reporter) -> None:
+        self.dag = dag
+        self.run = run
+        self.store = store
+        self.reporter = reporter
+        self.planner = Planner(dag, run, store, threads, reporter)
+
+    def run_until(
+        self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
+    ) -> list[Outcome]:
+        """Bring every stage up to ``until`` to a finished folder; link each into the run.
+
+        Stops after a stage that is done only in part unless ``allow_partial``: the last outcome then says
+        what is missing. Raises CleargsError where a stage fails; what was finished before it stays.
+        """
+        forced = tuple(self.dag.check(name) for name in force)
+        plans = self.planner.plan(until, forced)
+        check_disk(plans, self.store.root)
+        line = cost_line(plans)
+        if line:
+            self.reporter.info(line)
+        write_run_file(self.run)
+        outcomes: list[Outcome] = []
+        done: dict[str, Manifest] = {}
+        with self.store.in_use():
+            self.store.add_root(self.run.folder)
+            for name in self.dag.until(until):
+                outcome = self._bring(name, done, forced=name in forced)
+                done[name] = outcome.manifest
+                outcomes.append(outcome)
+                if outcome.manifest.status == "partial" and not allow_partial:
+                    break
+        return outcomes
+
+    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> Outcome:
+        """Bring one stage to a finished folder, from finished stages before it.
+
+        Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
+        """
+        done: dict[str, Manifest] = {}
+        with self.store.in_use():
+            self.store.add_root(self.run.folder)
+            for upstream in self.dag.until(name)[:-1]:
+                if upstream in self._all_upstream(name):
+                    done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
+            return self._bring(name, done, forced=force)
+
+    def _all_upstream(self, name: str) -> set[str]:
+        direct = set(self.dag.load(name).INPUTS)
+        return direct.union(*(self._all_upstream(upstream) for upstream in direct))
+
+    def _finished(
+        self, upstream: str, done: Mapping[str, Manifest], name: str, *, allow_partial: bool
+    ) -> Manifest:
+        entry = self._find(upstream, self.planner.recipe(upstream, done))
+        if entry is None or entry.manifest is None:
+            raise StageError(
+                f"{name} needs {upstream}, which is not done",
+                hint=f"first: cleargs stage {upstream} {self.run.folder}",
+            )
+        if entry.manifest.status == "partial" and not allow_partial:
+            raise StageError(
+                f"{name} needs {upstream}, which is done only in part",
+                hint=f"run it again: cleargs stage {upstream} {self.run.folder}; or give --allow-partial",
+            )
+        return entry.manifest
+
+    def _find(self, name: str, recipe: Recipe) -> Entry | None:
+        """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
+        entry = self.store.find(name, recipe.key)
+        if entry is not None and entry.damage is not None:
+            self.reporter.warn(
+                f"{name}: the stored results are damaged ({entry.damage}); they are made again"
+            )
+            return None
+        return entry
+
+    def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> Outcome:
+        """Find or make the results of ``name``, and show them in the run folder."""
+        recipe = self.planner.recipe(name, done)
+        entry = self.store.find(name, recipe.key)
+        manifest = entry.whole if entry is not None and not forced else None
+        how: Literal["found", "made"] = "found"
+        if manifest is None:
+            reasons = ("forced",) if forced else self._why(recipe, entry)
+            with self.store.lock(recipe.key, self.reporter, name):
+                entry = self._find(name, recipe)
+                manifest = entry.whole if entry is not None and not forced else None
+                if manifest is None:  # else another process made it while we waited
+                    self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
+                    manifest, how = self._make(recipe, entry, forced=forced), "made"
+        manifest = self._with_inherited(manifest, recipe.inherited)
+        self.store.link(self.run.folder, name, recipe.key)
+        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
+
+    def _why(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
+        if entry is not None and entry.usable is not None:
+            return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
+        return self.planner.reasons(recipe, entry)
+
+    def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool) -> Manifest:
+        """Let the stage do its work and publish it. The key's lock is held."""
+        name = recipe.parts.stage
+        stage = self.dag.load(name)
+        work = self.store.open_work(recipe.key, fresh=forced, entry=entry)
+        context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
+        started, clock = datetime.now(UTC), time.monotonic()
+        result = stage.run(context)
+        seconds = time.monotonic() - clock
+        if not result.missing:
+            absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
+            if absent:
+                raise StageError(
+                    f"{name} ended without its outputs {', '.join(absent)}",
+                    hint=f"this is a fault of the stage; please report it with {self.run.folder / RUN_FILE}",
+                )
+        manifest = self._manifest(recipe, result, work.out, started, seconds)
+        published = self.store.publish(work, manifest)
+        if forced and entry is not None and entry.manifest is not None:
+            if entry.manifest.digest == manifest.digest:
+                self.reporter.info(f"{name}: made again, with the same digests")
+            else:
+                self.reporter.warn(f"{name}: made again, with other digests than before")
+        return published
+
+    def _manifest(
+        self, recipe: Recipe, result: StageResult, out: Path, started: datetime, seconds: float
+    ) -> Manifest:
+        files = {
+            name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
+            for name, file in published_files(out).items()
+        }
+        return Manifest(
+            stage=recipe.parts.stage,
+            key=recipe.key,
+            status="partial" if result.missing or recipe.inherited else "complete",
+            missing=result.missing,
+            inherited=recipe.inherited,
+            parts=recipe.parts,
+            origins=recipe.origins,
+            files=files,
+            digest=tree_digest({name: record.digest for name, record in files.items()}),
+            versions=versions(),
+            started=started.isoformat(timespec="seconds"),
+            seconds=round(seconds, 3),
+            device=self.run.device,
+            summary=plain_json(result.summary),
+        )
+
+    def _with_inherited(self, manifest: Manifest, inherited: tuple[str, ...]) -> Manifest:
+        """``manifest`` saying what is missing upstream *now*.
+
+        Equal content may come from a whole upstream later. Only the manifest is written anew (atomically);
+        the outputs stay as they are.
+        """
+        if manifest.inherited == inherited:
+            return manifest
+        status: Literal["complete", "partial"] = "partial" if manifest.missing or inherited else "complete"
+        changed = manifest.model_copy(update={"inherited": inherited, "status": status})
+        write_manifest(self.store.folder(manifest.stage, manifest.key), changed)
+        return changed
+
+
+def check_same_input(run: Run, dag: Dag, store: Store) -> None:
+    """Raise InputError when ``run.folder`` was made for another capture than ``run.source``.
+
+    A capture that moved is the same when its content is.
+    """
+    if not (run.folder / RUN_FILE).exists():
+        return
+    before = read_run_file(run.folder, dag)
+    if before.source == run.source:
+        return
+    first = dag.names[0]
+    made = linked_manifest(run.folder, first)
+    if made is not None:
+        externals = dag.load(first).externals(run.config.sections[first], run.source)
+        now = {role: tree_digest(store.memo.digests_of(place)) for role, place in externals.items()}
+        if now == dict(made.parts.externals):
+            return
+    raise InputError(
+        f"{run.folder} is a run of {before.source}, not of {run.source}",
+        hint="choose another folder with -o, or delete this one",
+    )

@@ -1,0 +1,297 @@
+"""The store: finished stage folders by content key, unfinished work beside them.
+
+::
+
+    STORE/<stage>/<key>/                  finished: every output and manifest.json; never written again
+    STORE/work/<key>/{out,checkpoints}/   unfinished: survives kill -9, the next try goes on from it
+    STORE/locks/  STORE/roots/  STORE/digests.sqlite
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from cleargs.errors import StoreError
+from cleargs.files import disk_error, is_partial, write_bytes
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.manifest import (
+    MANIFEST,
+    Manifest,
+    damage,
+    published_files,
+    read_manifest,
+    write_manifest,
+)
+from cleargs.progress import Reporter
+
+STORE_FOLDER = ".store"
+"""Where a run keeps its store unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the store holds for one key."""
+
+    folder: Path
+    manifest: Manifest | None
+    damage: str | None = None
+    """Why the folder cannot be used; None when every file is what the manifest says."""
+
+    @property
+    def usable(self) -> Manifest | None:
+        """The manifest, where nothing is damaged."""
+        return self.manifest if self.damage is None else None
+
+    @property
+    def whole(self) -> Manifest | None:
+        """The manifest, where nothing is damaged and the stage left nothing out."""
+        return self.usable if self.usable is not None and not self.usable.missing else None
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where one key is being worked on."""
+
+    folder: Path
+
+    @property
+    def out(self) -> Path:
+        """Outputs so far."""
+        return self.folder / "out"
+
+    @property
+    def checkpoints(self) -> Path:
+        """In-stage state, never published."""
+        return self.folder / "checkpoints"
+
+
+class Store:
+    """A folder of finished results, which runs and processes may share."""
+
+    def __init__(self, root: Path, memo: DigestMemo) -> None:
+        self.root = root
+        self.memo = memo
+
+    # -- reading ---------------------------------------------------------------------------------------
+
+    def folder(self, stage: str, key: str) -> Path:
+        """Where the finished results of ``key`` lie, or would."""
+        return self.root / stage / key
+
+    def find(self, stage: str, key: str) -> Entry | None:
+        """What is stored under ``key``, checked: sizes always, digests through the memo; None for nothing."""
+        folder = self.folder(stage, key)
+        try:
+            manifest = read_manifest(folder)
+        except FileNotFoundError:
+            return Entry(folder, None, "it has no manifest") if folder.is_dir() else None
+        except (ValueError, OSError) as error:
+            return Entry(folder, None, str(error))
+        if manifest.key != key or manifest.stage != stage:
+            return Entry(folder, None, "the manifest belongs to another folder")
+        return Entry(folder, manifest, damage(folder, manifest, self.memo))
+
+    # -- working ---------------------------------------------------------------------------------------
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Held by whoever works in the store, so that nothing is cleared away under its feet."""
+        with file_lock(self.root / "locks" / "store.lock", shared=True):
+            yield
+
+    def lock(self, key: str, reporter: Reporter, stage: str) -> AbstractContextManager[bool]:
+        """Hold the work on ``key``; waits, and says so, while another process has it."""
+        return file_lock(
+            self.root / "locks" / f"{key}.lock",
+            on_wait=lambda: reporter.info(f"{stage}: another run is at work on it; waiting"),
+        )
+
+    def open_work(self, key: str, *, fresh: bool, entry: Entry | None) -> Work:
+        """The work folder of ``key``, ready to go on: leftovers of dead writers removed.
+
+        A forced rebuild (``fresh``) has a folder of its own, which goes on only from an interrupted forced
+        try. What a partial ``entry`` already holds is carried over once.
+        """
+        work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
+        try:
+            if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
+                _link_files(entry.folder, work.out)
+            work.out.mkdir(parents=True, exist_ok=True)
+            work.checkpoints.mkdir(exist_ok=True)
+            (work.out / MANIFEST).unlink(missing_ok=True)
+            for file in [*work.out.rglob("*"), *work.checkpoints.rglob("*")]:
+                if is_partial(file) and not file.is_dir():
+                    file.unlink()
+        except OSError as error:
+            raise disk_error(error, work.folder) from error
+        return work
+
+    def publish(self, work: Work, manifest: Manifest) -> Manifest:
+        """Move the outputs of ``work`` to their final place: all or nothing, and durable.
+
+        Where a whole result with the same content is already there, ours is dropped and that one's manifest
+        returned. A partial, damaged or differing one makes room.
+        """
+        final = self.folder(manifest.stage, manifest.key)
+        try:
+            write_manifest(work.out, manifest)
+            _sync_tree(work.out)
+            final.parent.mkdir(parents=True, exist_ok=True)
+            there = self.find(manifest.stage, manifest.key)
+            if there is not None:
+                if there.whole is not None and there.whole.digest == manifest.digest:
+                    shutil.rmtree(work.folder)
+                    return there.whole
+                self.discard(final)
+            try:
+                work.out.rename(final)
+            except OSError:
+                # Another writer published in this moment (on a file system without locks): it won.
+                winner = self.find(manifest.stage, manifest.key)
+                if winner is None or winner.usable is None:
+                    raise
+                shutil.rmtree(work.folder)
+                return winner.usable
+            _sync(final.parent)
+        except OSError as error:
+            raise disk_error(error, final) from error
+        for name, record in manifest.files.items():
+            self.memo.remember(final / name, record.digest)
+        if not manifest.missing:
+            shutil.rmtree(work.folder, ignore_errors=True)
+        return manifest
+
+    def discard(self, folder: Path) -> None:
+        """Take ``folder`` away in one step, then delete it at leisure."""
+        rubbish = self.root / "work" / f".rubbish-{folder.name}-{os.getpid()}"
+        rubbish.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.rename(rubbish)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise disk_error(error, folder) from error
+        shutil.rmtree(rubbish, ignore_errors=True)
+
+    # -- links from runs -------------------------------------------------------------------------------
+
+    def link(self, run: Path, stage: str, key: str) -> None:
+        """Let ``RUN/<stage>`` show the finished folder: a link replaced by rename, relative inside RUN."""
+        target = self.folder(stage, key)
+        if target.is_relative_to(run):
+            target = target.relative_to(run)
+        link = run / stage
+        if link.is_symlink() and link.readlink() == target:
+            return
+        if link.exists() and not link.is_symlink():
+            raise StoreError(
+                f"{link} is a folder, not a link into the store", hint="move it away, or choose another -o"
+            )
+        temporary = run / f".{stage}.link-{os.getpid()}"
+        try:
+            temporary.unlink(missing_ok=True)
+            temporary.symlink_to(target)
+            temporary.replace(link)
+        except OSError as error:
+            raise disk_error(error, link) from error
+
+    def add_root(self, run: Path) -> None:
+        """Note that ``run`` links into this store, so that `collect` keeps what it shows."""
+        name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
+        note = self.root / "roots" / name
+        if not note.exists():
+            try:
+                note.parent.mkdir(parents=True, exist_ok=True)
+                write_bytes(note, f"{run}\n".encode())
+            except OSError as error:
+                raise disk_error(error, note) from error
+
+    # -- clearing --------------------------------------------------------------------------------------
+
+    def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
+        """Remove the finished folders that no run links to; with ``checkpoints`` unfinished work too.
+
+        Raises StoreError when a run is at work in the store.
+        """
+        with file_lock(self.root / "locks" / "store.lock", wait=False) as alone:
+            if not alone:
+                raise StoreError("a run is at work in this store", hint="try again when it is done")
+            linked = self._linked(stages)
+            found = [
+                Garbage(folder, "finished", _size(folder))
+                for stage in stages
+                for folder in sorted((self.root / stage).glob("*"))
+                if folder.resolve() not in linked
+            ]
+            for folder in sorted((self.root / "work").glob("*")):
+                if folder.name.startswith(".rubbish-"):
+                    found.append(Garbage(folder, "rubbish", _size(folder)))
+                elif checkpoints:
+                    found.append(Garbage(folder, "unfinished", _size(folder)))
+            if not dry_run:
+                for garbage in found:
+                    self.discard(garbage.folder)
+                for lock in (self.root / "locks").glob("*.lock"):
+                    if lock.name != "store.lock":
+                        lock.unlink(missing_ok=True)
+        return found
+
+    def _linked(self, stages: tuple[str, ...]) -> set[Path]:
+        runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
+        for note in (self.root / "roots").glob("*"):
+            with suppress(OSError, UnicodeDecodeError):
+                runs.append(Path(note.read_text(encoding="utf-8").rstrip("\n")))
+        return {(run / stage).resolve() for run in runs for stage in stages if (run / stage).is_symlink()}
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """A folder that nothing needs."""
+
+    folder: Path
+    kind: Literal["finished", "unfinished", "rubbish"]
+    bytes: int
+
+
+def _size(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def _link_files(source: Path, target: Path) -> None:
+    """Bring the files of ``source`` into ``target`` without copying their content where hard links work.
+
+    Stages replace files by rename and never write into one, so that the source stays as it was. The copy
+    is made beside its place, so that a killed one is not taken for whole.
+    """
+    beside = target.with_name(f"{target.name}.carried")
+    shutil.rmtree(beside, ignore_errors=True)
+    for name, file in published_files(source).items():
+        place = beside / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(file, place)
+        except OSError:
+            shutil.copy2(file, place)
+    beside.mkdir(parents=True, exist_ok=True)
+    beside.rename(target)
+
+
+def _sync_tree(folder: Path) -> None:
+    for path in [*folder.rglob("*"), folder]:
+        _sync(path)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

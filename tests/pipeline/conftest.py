@@ -1,0 +1,13 @@
+"""The toy run that the tests start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from toy import Bench, make_bench
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return make_bench(tmp_path)

@@ -1,0 +1,83 @@
+"""Processes that are killed, and processes that meet: real ones, with the toy pipeline as their program."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from toy import Bench
+
+PROGRAM = Path(__file__).with_name("toy.py")
+
+
+def start(bench: Bench, *overrides: str) -> subprocess.Popen[str]:
+    recipe = bench.root / "empty.toml"
+    recipe.touch()
+    command = [sys.executable, PROGRAM, bench.journal, "run", bench.capture, "-o", bench.folder]
+    command += ["--workflow", recipe, *(part for text in overrides for part in ("--set", text))]
+    return subprocess.Popen(
+        [str(part) for part in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(bench: Bench, line: str) -> None:
+    """Until the stages have noted ``line``."""
+    deadline = time.monotonic() + 60
+    while line not in (bench.journal.read_text() if bench.journal.exists() else ""):
+        assert time.monotonic() < deadline, f"never saw {line!r}"
+        time.sleep(0.005)
+
+
+def test_killed_at_any_moment_the_same_command_ends_with_the_same_digests(bench: Bench) -> None:
+    undisturbed = bench.digests()
+    (bench.folder).rename(bench.root / "undisturbed")
+    bench.work_done()
+    chance = random.Random(5)
+    for moment in ("count\n", "count 4.txt", "square 0.txt", "square 3.txt", "total\n", ""):
+        process = start(bench, "square.delay_s=0.02")
+        if moment:
+            wait_for(bench, moment)
+            time.sleep(chance.uniform(0, 0.03))
+        else:
+            time.sleep(chance.uniform(0.2, 0.6))
+        process.kill()
+        process.communicate()
+    process = start(bench, "square.delay_s=0.02")
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    done = bench.work_done()
+    assert done.count("square 0.txt") <= 2, "the checkpoint was used"
+    assert bench.digests() == undisturbed
+    assert bench.work_done() == []
+    assert not [path for path in bench.folder.rglob("*") if ".partial" in path.name]
+
+
+def test_two_runs_at_once_do_each_stage_once(bench: Bench) -> None:
+    first = start(bench, "square.delay_s=0.2")
+    wait_for(bench, "square 0.txt")
+    second = start(bench, "square.delay_s=0.2")
+    for process in (first, second):
+        output, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+    assert "another run is at work on it; waiting" in errors
+    done = bench.work_done()
+    assert [done.count(stage) for stage in ("count", "square", "total")] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_says_so_and_goes_on(bench: Bench, number: signal.Signals) -> None:
+    process = start(bench, "square.delay_s=0.5")
+    wait_for(bench, "square 1.txt")
+    os.kill(process.pid, number)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "the same command goes on" in errors and "Traceback" not in errors
+    bench.work_done()
+    bench.run()
+    assert "square 0.txt" not in bench.work_done()

@@ -1,0 +1,244 @@
+"""What is done again, and what is not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from toy import Bench
+
+from cleargs.errors import InputError, StageError, StoreError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.manifest import read_manifest
+from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.runner import check_same_input
+from cleargs.pipeline.stage import Estimate
+
+
+def stages_run(bench: Bench) -> list[str]:
+    return [line for line in bench.work_done() if " " not in line]
+
+
+def test_run_makes_every_stage_and_links_it(bench: Bench) -> None:
+    outcomes = bench.run()
+    assert [outcome.how for outcome in outcomes] == ["made"] * 3
+    assert (bench.folder / "total" / "total.txt").read_text() == "plain 55.0 0"
+    for name in bench.dag.names:
+        link = bench.folder / name
+        assert link.is_symlink() and not link.readlink().is_absolute()
+        manifest = read_manifest(link)
+        assert manifest.status == "complete" and manifest.parts.stage == name
+    assert read_manifest(bench.folder / "count").summary == {"numbers": 6, "scale": None}
+    assert list((bench.store / "work").iterdir()) == []
+
+
+def test_second_run_does_nothing_and_leaves_files_alone(bench: Bench) -> None:
+    bench.run()
+    before = {file: file.stat().st_mtime_ns for file in bench.store.rglob("*.txt")}
+    run_file = (bench.folder / "run.toml").stat().st_mtime_ns
+    bench.work_done()
+    assert [outcome.how for outcome in bench.run()] == ["found"] * 3
+    assert bench.work_done() == []
+    assert {file: file.stat().st_mtime_ns for file in bench.store.rglob("*.txt")} == before
+    assert (bench.folder / "run.toml").stat().st_mtime_ns == run_file
+
+
+def test_a_setting_concerns_its_stage_and_those_after_it_only(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    bench.run("square.power=3")
+    assert stages_run(bench) == ["square", "total"]
+    bench.run()
+    assert stages_run(bench) == [], "going back to old settings is a hit"
+    assert (bench.folder / "total" / "total.txt").read_text() == "plain 55.0 0"
+
+
+def test_equal_content_upstream_cuts_off(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    bench.run("count.mode=padded")  # changes log.txt, which only `total` reads
+    assert stages_run(bench) == ["count", "total"]
+
+
+def test_threads_and_settings_outside_the_key_keep_the_hit(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    bench.run("square.delay_s=0.001", threads=2)
+    assert bench.work_done() == []
+
+
+def test_seed_concerns_every_stage(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    bench.run(seed=1)
+    assert stages_run(bench) == ["count", "square", "total"]
+
+
+def test_touched_input_is_a_hit_changed_input_is_not(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    os.utime(bench.capture / "3.txt", ns=(1, 1))
+    bench.run()
+    assert bench.work_done() == []
+    (bench.capture / "3.txt").write_text("7")  # the same size
+    bench.run()
+    assert stages_run(bench) == ["count", "square", "total"]
+
+
+def test_external_file_counts_by_content_not_by_path(bench: Bench) -> None:
+    weights = bench.root / "a.bin"
+    weights.write_bytes(b"weights")
+    bench.run(f"count.weights={weights}")
+    bench.work_done()
+    moved = weights.rename(bench.root / "b.bin")
+    bench.run(f"count.weights={moved}")
+    assert bench.work_done() == []
+    moved.write_bytes(b"others!")
+    bench.run(f"count.weights={moved}")
+    assert stages_run(bench) == ["count"], "the stages after it read equal content"
+
+
+def test_moved_workspace_is_a_hit(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    place = bench.root / "elsewhere"
+    place.mkdir()
+    bench.capture.rename(place / "capture")
+    bench.folder.rename(place / "run")
+    moved = replace(bench, root=place)
+    assert [outcome.how for outcome in moved.run()] == ["found"] * 3
+    assert bench.work_done() == []
+    assert (place / "run" / "total" / "total.txt").exists()
+
+
+def test_shared_store_serves_two_runs(bench: Bench, tmp_path: Path) -> None:
+    store = tmp_path / "shared"
+    bench.run(store=store)
+    bench.work_done()
+    shutil.rmtree(bench.folder)
+    assert [outcome.how for outcome in bench.run(store=store)] == ["found"] * 3
+    assert bench.work_done() == []
+    assert (bench.folder / "count").readlink().is_absolute()
+
+
+def test_new_version_of_a_stage_is_a_miss(bench: Bench) -> None:
+    bench.run()
+    bench.work_done()
+    stages = {name: bench.dag.load(name) for name in bench.dag.names}
+    stages["square"] = replace(stages["square"], VERSION=2)  # type: ignore[type-var]  # a dataclass behind a protocol
+    newer = replace(bench, dag=Dag(bench.dag.names, stages.__getitem__))
+    assert newer.plan()["square"].reasons == ("stage version: 1 -> 2",)
+    newer.run()
+    assert stages_run(bench) == ["square"], "total reads equal content"
+
+
+def test_until_and_force(bench: Bench) -> None:
+    assert [outcome.stage for outcome in bench.run(until="square")] == ["count", "square"]
+    assert not (bench.folder / "total").exists()
+    bench.run()
+    bench.work_done()
+    outcomes = bench.run(force=["square"])
+    assert stages_run(bench) == ["square"], "equal results: nothing after it is done again"
+    assert [outcome.how for outcome in outcomes] == ["found", "made", "found"]
+    assert any("same digests" in line for line in bench.remarks.lines)
+    with pytest.raises(InputError, match="no stage 'sqare'") as error:
+        bench.run(until="sqare")
+    assert error.value.hint == "did you mean square?"
+
+
+def test_explain_names_what_changed(bench: Bench) -> None:
+    plans = bench.plan()
+    assert [plan.state for plan in plans.values()] == ["miss", "waits", "waits"]
+    bench.run()
+    assert [plan.state for plan in bench.plan().values()] == ["hit"] * 3
+    assert bench.plan("square.power=3", "total.offset=0.5")["square"].reasons == (
+        "setting square.power: 2 -> 3",
+    )
+    assert bench.plan("count.inner.depth=4")["count"].reasons == ("setting count.inner.depth: 3 -> 4",)
+    assert bench.plan(seed=4)["count"].reasons == ("seed: 0 -> 4",)
+    (bench.capture / "2.txt").write_text("20")
+    (bench.capture / "9.txt").write_text("9")
+    assert bench.plan()["count"].reasons == ("external capture: 2.txt changed, 9.txt added",)
+    bench.run(until="count")
+    assert bench.plan()["square"].reasons == ("input count/numbers: 2.txt changed, 9.txt added",)
+    shutil.rmtree((bench.folder / "count").resolve())
+    assert bench.plan()["count"].reasons == ("not made yet",)
+
+
+def test_planning_writes_nothing(bench: Bench) -> None:
+    bench.plan()
+    assert not bench.folder.exists()
+
+
+def test_failed_stage_leaves_nothing_that_counts_as_done(bench: Bench) -> None:
+    (bench.capture / "2.txt").write_text("no number")
+    with pytest.raises(ValueError):
+        bench.run()
+    assert not (bench.folder / "square").exists() and not (bench.store / "square").exists()
+    (bench.capture / "2.txt").write_text("2")
+    assert bench.run()[-1].manifest.status == "complete"
+
+
+def test_stage_that_forgets_an_output_fails(bench: Bench) -> None:
+    stages = {name: bench.dag.load(name) for name in bench.dag.names}
+    stages["count"].OUTPUTS = ("numbers", "nothing.txt")
+    with pytest.raises(StageError, match=r"without its outputs nothing\.txt"):
+        bench.run()
+
+
+def test_single_stage_needs_those_before_it(bench: Bench) -> None:
+    from cleargs.pipeline.digest import DigestMemo
+    from cleargs.pipeline.runner import Runner
+    from cleargs.pipeline.store import Store
+
+    bench.run(until="count")
+    bench.work_done()
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        run = read_run_file(bench.folder, bench.dag)
+        assert run == bench.settings()
+        runner = Runner(bench.dag, run, Store(run.store, memo), 1, bench.remarks)
+        with pytest.raises(StageError, match="total needs square, which is not done") as error:
+            runner.run_stage("total")
+        assert "cleargs stage square" in error.value.hint
+        runner.run_stage("square")
+        runner.run_stage("total")
+    assert stages_run(bench) == ["square", "total"]
+
+
+def test_full_disk_is_noticed_before_work(bench: Bench) -> None:
+    stages = {name: bench.dag.load(name) for name in bench.dag.names}
+    huge = Estimate(minutes=1, memory_gb=1, disk_gb=1e9)
+    object.__setattr__(stages["total"], "estimate", lambda context: huge)
+    with pytest.raises(StoreError, match="needs about") as error:
+        bench.run()
+    assert "free some space" in error.value.hint
+    assert bench.work_done() == [] and not bench.folder.exists()
+
+
+def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:
+    from cleargs.pipeline.digest import DigestMemo
+    from cleargs.pipeline.store import Store
+
+    bench.run()
+    other = tmp_path / "other"
+    shutil.copytree(bench.capture, other)
+    settings = replace(bench.settings(), source=other)
+    store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
+    check_same_input(settings, bench.dag, store)  # the same content elsewhere is the same capture
+    (other / "0.txt").write_text("100")
+    with pytest.raises(InputError, match="is a run of"):
+        check_same_input(settings, bench.dag, store)
+
+
+def test_run_inside_its_input_is_refused(bench: Bench) -> None:
+    inside = replace(bench.settings(), folder=bench.capture / "run")
+    from cleargs.pipeline.digest import DigestMemo
+    from cleargs.pipeline.plan import Planner
+    from cleargs.pipeline.store import Store
+
+    store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
+    with pytest.raises(InputError, match="lies inside the input"):
+        Planner(bench.dag, inside, store, 1, bench.remarks).plan()

@@ -1,0 +1,135 @@
+"""Recipes, single settings, and errors that name the field, its range and the nearest right name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from toy import Bench, toy_dag
+
+from cleargs.errors import ConfigError
+from cleargs.pipeline.config import (
+    check_document,
+    load_config,
+    merge,
+    parse_override,
+    read_recipe,
+    recipe_names,
+)
+from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.keys import key_config
+from cleargs.pipeline.run_file import read_run_file, write_run_file
+
+
+@pytest.fixture
+def dag(tmp_path: Path) -> Dag:
+    return toy_dag(tmp_path / "journal")
+
+
+@pytest.mark.parametrize(
+    ("text", "document"),
+    [
+        ("a.b=0.7", {"a": {"b": 0.7}}),
+        ("a=3", {"a": 3}),
+        ("a.b=true", {"a": {"b": True}}),
+        ("a.b=every:8", {"a": {"b": "every:8"}}),
+        ("a.b=/tmp/model.onnx", {"a": {"b": "/tmp/model.onnx"}}),
+        ('a.b="3"', {"a": {"b": "3"}}),
+        ("a.b=[1, 2]", {"a": {"b": [1, 2]}}),
+        ("a.b=x=y", {"a": {"b": "x=y"}}),
+        ("a.b=", {"a": {"b": ""}}),
+        ("a.b=1\nc = 2", {"a": {"b": "1\nc = 2"}}),
+    ],
+)
+def test_override_values_are_toml_bare_words_strings(text: str, document: dict[str, object]) -> None:
+    assert parse_override(text) == document
+
+
+@pytest.mark.parametrize("text", ["a.b", "=3", "a..b=1"])
+def test_malformed_override(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"not of the form a\.b=value"):
+        parse_override(text)
+
+
+def test_merge_keeps_what_is_not_named() -> None:
+    base = {"a": {"x": 1, "y": {"z": 2}}, "list": [1, 2]}
+    assert merge(base, {"a": {"y": {"z": 3}}, "list": [4]}) == {"a": {"x": 1, "y": {"z": 3}}, "list": [4]}
+    assert base["a"] == {"x": 1, "y": {"z": 2}}
+
+
+@pytest.mark.parametrize(
+    ("text", "cause", "hint"),
+    [
+        ("square.powr=3", "there is no setting square.powr", "did you mean square.power?"),
+        ("sqare.power=3", "there is no setting sqare", "did you mean square?"),
+        ("power=3", "there is no setting power", "did you mean square.power?"),
+        ("total.power=3", "there is no setting total.power", "did you mean square.power?"),
+        ("count.inner.dept=3", "there is no setting count.inner.dept", "did you mean count.inner.depth?"),
+        (
+            "square.power=9",
+            "square.power = 9 cannot be used",
+            "allowed: a whole number, at least 1 and at most 4",
+        ),
+        ("count.inner.depth=0", "count.inner.depth = 0 cannot be used", "at least 1 and at most 9"),
+        ("total.offset=many", "total.offset = 'many' cannot be used", "a number, at least -1"),
+        ("count.mode=pad", "count.mode = 'pad' cannot be used", "allowed: plain or padded"),
+        ("count=3", "count", "change the settings of [count]"),
+        ("seed=-1", "seed = -1 cannot be used", "a whole number from 0"),
+        ("seed=true", "seed = True cannot be used", "a whole number from 0"),
+    ],
+)
+def test_errors_teach(dag: Dag, text: str, cause: str, hint: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_document(dag, parse_override(text))
+    assert cause in str(error.value)
+    assert hint in error.value.hint
+    assert error.value.exit_code == 2
+
+
+def test_recipe_file_then_overrides_then_seed(dag: Dag, tmp_path: Path) -> None:
+    recipe = tmp_path / "mine.toml"
+    recipe.write_text("seed = 3\n[square]\npower = 3\n[count]\nlimit = 7\n")
+    config = load_config(dag, str(recipe), ["square.power=4"])
+    assert config.seed == 3
+    assert config.document()["square"]["power"] == 4
+    assert config.document()["count"]["limit"] == 7
+    assert load_config(dag, str(recipe), seed=9).seed == 9
+
+
+def test_bad_recipes(dag: Dag, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no workflow 'defalt'") as error:
+        read_recipe("defalt")
+    assert error.value.hint == "did you mean default?"
+    with pytest.raises(ConfigError, match="cannot read"):
+        read_recipe(str(tmp_path / "none.toml"))
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[square\npower = 3")
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        read_recipe(str(wrong))
+    wrong.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot read"):
+        read_recipe(str(wrong))
+
+
+@pytest.mark.parametrize("recipe", ["default", "smoke", "paper"])
+def test_installed_recipes_fit_the_installed_stages(recipe: str) -> None:
+    assert recipe in recipe_names()
+    load_config(installed(), recipe)
+
+
+def test_default_recipe_says_what_the_models_say() -> None:
+    assert load_config(installed(), "default") == check_document(installed(), {})
+
+
+def test_run_file_gives_back_the_run(bench: Bench) -> None:
+    run = bench.settings(["square.power=3", "count.mode=padded"], seed=5)
+    write_run_file(run)
+    assert read_run_file(bench.folder, bench.dag) == run
+    elsewhere = bench.settings(store=bench.root / "shared")
+    write_run_file(elsewhere)
+    assert read_run_file(bench.folder, bench.dag) == elsewhere
+
+
+def test_marked_settings_stay_out_of_the_key(dag: Dag) -> None:
+    config = check_document(dag, {"count": {"weights": "/somewhere"}}).sections["count"]
+    assert key_config(config) == {"limit": 100, "mode": "plain", "inner": {"depth": 3}}

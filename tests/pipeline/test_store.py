@@ -1,0 +1,157 @@
+"""The store: damage is never a hit, publishing is all or nothing, clearing keeps what runs show."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from toy import Bench
+
+from cleargs.errors import StoreError
+from cleargs.pipeline.digest import DigestMemo, file_digest
+from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.manifest import MANIFEST, damage, read_manifest
+from cleargs.pipeline.store import Store
+
+
+def flip(file: Path) -> None:
+    """Other content of the same size."""
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(bytes(data))
+
+
+def edit_manifest(folder: Path) -> None:
+    content = json.loads((folder / MANIFEST).read_text())
+    content["summary"]["numbers"] = 7
+    (folder / MANIFEST).write_text(json.dumps(content))
+
+
+def from_elsewhere(folder: Path) -> None:
+    other = next(folder.parent.glob("square"))
+    shutil.copy(other / MANIFEST, folder / MANIFEST)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "cut manifest": lambda folder: (folder / MANIFEST).write_bytes((folder / MANIFEST).read_bytes()[:-40]),
+    "empty manifest": lambda folder: (folder / MANIFEST).write_bytes(b""),
+    "binary manifest": lambda folder: (folder / MANIFEST).write_bytes(b"\xff\x00" * 50),
+    "manifest is a list": lambda folder: (folder / MANIFEST).write_text("[]"),
+    "edited manifest": edit_manifest,
+    "manifest of another stage": from_elsewhere,
+    "no manifest": lambda folder: (folder / MANIFEST).unlink(),
+    "file gone": lambda folder: (folder / "log.txt").unlink(),
+    "file cut": lambda folder: (folder / "numbers" / "1.txt").write_bytes(b""),
+    "file changed": lambda folder: flip(folder / "numbers" / "1.txt"),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_damage_is_a_miss_with_a_warning(bench: Bench, what: str) -> None:
+    healthy = {outcome.stage: outcome.manifest.digest for outcome in bench.run()}
+    bench.work_done()
+    DAMAGES[what](bench.folder / "count")
+    assert bench.plan()["count"].state == "miss"
+    outcomes = bench.run()
+    assert len(bench.remarks.warnings) == 1 and "damaged" in bench.remarks.warnings[0]
+    assert outcomes[0].how == "made"
+    assert {outcome.stage: outcome.manifest.digest for outcome in outcomes} == healthy
+    assert [outcome.how for outcome in bench.run()] == ["found"] * 3
+
+
+@pytest.mark.parametrize("content", [b"", b"no database", b"SQLite format 3\x00" + b"\x07" * 4096])
+def test_damaged_memo_troubles_nobody(bench: Bench, content: bytes) -> None:
+    bench.run()
+    (bench.store / "digests.sqlite").write_bytes(content)
+    assert [outcome.how for outcome in bench.run()] == ["found"] * 3
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        assert memo._database is not None, "it works again"
+
+
+def test_wrong_memo_does_not_condemn_a_healthy_file(tmp_path: Path, bench: Bench) -> None:
+    bench.run()
+    folder = (bench.folder / "count").resolve()
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        memo.remember(folder / "log.txt", "0" * 64)
+        assert damage(folder, read_manifest(folder), memo) is None
+
+
+def test_memo_is_believed_only_while_the_file_is_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"one")
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        memo.remember(file, "what was noted")
+        assert memo.digest(file) == "what was noted"
+        other = tmp_path / "other"
+        other.write_bytes(b"two")
+        other.replace(file)  # the same size, another inode
+        assert memo.digest(file) == file_digest(file)
+
+
+def test_two_processes_may_use_the_memo_at_once(tmp_path: Path) -> None:
+    files = [tmp_path / f"{number}.txt" for number in range(20)]
+    for file in files:
+        file.write_text(file.name)
+    with DigestMemo(tmp_path / "memo.sqlite") as one, DigestMemo(tmp_path / "memo.sqlite") as two:
+        for file in files:
+            one.remember(file, "one")
+            two.remember(file, "one")
+            one.flush()
+            two.flush()
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        assert {memo.digest(file) for file in files} == {"one"}
+
+
+def test_leftovers_of_dead_writers_are_not_published(bench: Bench) -> None:
+    bench.run(until="count")
+    key = read_manifest(bench.folder / "count").key
+    shutil.rmtree(bench.store / "count")
+    out = bench.store / "work" / key / "out"
+    (out / "numbers").mkdir(parents=True)
+    (out / "numbers" / ".99.partial.1.txt").write_text("half")
+    (out / MANIFEST).write_text("{}")
+    bench.run()
+    assert not list(bench.store.rglob("*.partial.*"))
+
+
+def test_run_folder_with_a_real_folder_in_the_way(bench: Bench) -> None:
+    (bench.folder / "square").mkdir(parents=True)
+    (bench.folder / "square" / "mine.txt").write_text("keep me")
+    with pytest.raises(StoreError, match="not a link"):
+        bench.run()
+    assert (bench.folder / "square" / "mine.txt").exists()
+
+
+def test_unwritable_run_folder(bench: Bench, tmp_path: Path) -> None:
+    bench.folder.parent.mkdir(exist_ok=True)
+    bench.folder.write_text("a file where the run folder should be")
+    with pytest.raises(StoreError):
+        bench.run()
+
+
+def test_collect_keeps_what_runs_show(bench: Bench) -> None:
+    bench.run("square.power=3")
+    bench.run()
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        store = Store(bench.store, memo)
+        (bench.store / "work" / "abc" / "checkpoints").mkdir(parents=True)
+        shown = {(bench.folder / name).resolve() for name in bench.dag.names}
+        assert {item.kind for item in store.collect(bench.dag.names, checkpoints=False, dry_run=True)} == {
+            "finished"
+        }
+        removed = store.collect(bench.dag.names, checkpoints=False, dry_run=False)
+        assert sorted(item.folder.parent.name for item in removed) == ["square", "total"]
+        assert {folder for name in bench.dag.names for folder in (bench.store / name).iterdir()} == shown
+        assert [item.kind for item in store.collect(bench.dag.names, checkpoints=True, dry_run=False)] == [
+            "unfinished"
+        ]
+        with (
+            file_lock(bench.store / "locks" / "store.lock", shared=True),
+            pytest.raises(StoreError, match="at work"),
+        ):
+            store.collect(bench.dag.names, checkpoints=False, dry_run=False)
+    assert [outcome.how for outcome in bench.run()] == ["found"] * 3
+    assert bench.run("square.power=3")[1].how == "made"

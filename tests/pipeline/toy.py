@@ -1,0 +1,263 @@
+"""A pipeline of toy stages: count numbers, square them, add them up. Also a program, so that it can be killed.
+
+``python toy.py JOURNAL ARGUMENTS...`` is ``cleargs ARGUMENTS...`` with these stages. JOURNAL gets one line for
+each piece of work that is really done.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cleargs.errors import StageError
+from cleargs.files import write_bytes
+from cleargs.pipeline.config import check_document, merge, parse_override
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.plan import Planner, StagePlan
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.runner import Outcome, Runner
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.store import Store
+from cleargs.progress import SilentReporter
+
+
+class Inner(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    depth: int = Field(3, ge=1, le=9)
+
+
+class CountConfig(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    limit: int = Field(100, ge=1, le=1000, description="at most so many numbers")
+    mode: Literal["plain", "padded"] = "plain"
+    weights: str = Field("", description="a file", json_schema_extra={"key": False})
+    inner: Inner = Inner()
+
+
+class SquareConfig(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    power: int = Field(2, ge=1, le=4)
+    delay_s: float = Field(0.0, ge=0, le=1, json_schema_extra={"key": False})
+
+
+class TotalConfig(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    offset: float = Field(0.0, ge=-1, le=1)
+
+
+@dataclass
+class Count:
+    """Input files -> numbers/*.txt, numbers.txt. Reads one number from each input file."""
+
+    journal: Path
+    VERSION: int = 1
+    CONFIG: type[BaseModel] = CountConfig
+    INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    OUTPUTS: tuple[str, ...] = ("numbers", "log.txt")
+    LIBRARIES: tuple[str, ...] = ("pydantic",)
+
+    def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
+        weights = {"weights": Path(config.weights)} if config.weights else {}
+        return {"capture": source, **weights}
+
+    def estimate(self, context: StageContext[Any]) -> Estimate:
+        return Estimate(minutes=0.1, memory_gb=0.1, disk_gb=0.001)
+
+    def run(self, context: StageContext[Any]) -> StageResult:
+        note(self.journal, "count")
+        if not context.source.is_dir():
+            raise StageError("the capture is no folder", hint="give a folder")
+        files = sorted(context.source.glob("*.txt"))[: context.config.limit]
+        (context.out / "numbers").mkdir(exist_ok=True)
+        missing = []
+        for file in files:
+            text = file.read_text().strip()
+            if not text:
+                missing.append(f"{file.name} is empty")
+                continue
+            if not (context.out / "numbers" / file.name).exists():
+                note(self.journal, f"count {file.name}")
+                write_bytes(context.out / "numbers" / file.name, text.encode())
+        write_bytes(context.out / "log.txt", f"{context.config.mode}".encode())
+        return StageResult(tuple(missing), {"numbers": len(files), "scale": float("inf")})
+
+
+@dataclass
+class Square:
+    """numbers -> powers/*.txt, one at a time, so that a killed try goes on."""
+
+    journal: Path
+    VERSION: int = 1
+    CONFIG: type[BaseModel] = SquareConfig
+    INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"count": ("numbers", "masks")})
+    OUTPUTS: tuple[str, ...] = ("powers",)
+    LIBRARIES: tuple[str, ...] = ()
+
+    def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
+        return {}
+
+    def estimate(self, context: StageContext[Any]) -> Estimate:
+        return Estimate(minutes=0.2, memory_gb=0.1, disk_gb=0.001)
+
+    def run(self, context: StageContext[Any]) -> StageResult:
+        note(self.journal, "square")
+        (context.out / "powers").mkdir(exist_ok=True)
+        files = sorted((context.inputs["count"] / "numbers").iterdir())
+        total = 0
+        state = context.checkpoints / "state.txt"
+        begin = 0
+        if state.exists():
+            begin, total = map(int, state.read_text().split())
+        with context.reporter.task("square", len(files)) as task:
+            for index, file in enumerate(files[begin:], begin):
+                power = int(file.read_text()) ** context.config.power
+                note(self.journal, f"square {file.name}")
+                write_bytes(context.out / "powers" / file.name, str(power).encode())
+                time.sleep(context.config.delay_s)
+                total += power
+                write_bytes(state, f"{index + 1} {total}".encode())
+                task.advance()
+        write_bytes(context.out / "powers" / "total.txt", str(total).encode())
+        return StageResult(summary={"total": total})
+
+
+@dataclass
+class Total:
+    """powers/total.txt and log.txt -> total.txt."""
+
+    journal: Path
+    VERSION: int = 1
+    CONFIG: type[BaseModel] = TotalConfig
+    INPUTS: Mapping[str, tuple[str, ...]] = field(
+        default_factory=lambda: {"count": ("log.txt",), "square": ("powers/total.txt",)}
+    )
+    OUTPUTS: tuple[str, ...] = ("total.txt",)
+    LIBRARIES: tuple[str, ...] = ()
+
+    def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
+        return {}
+
+    def estimate(self, context: StageContext[Any]) -> Estimate:
+        return Estimate(minutes=0.3, memory_gb=0.1, disk_gb=0.001)
+
+    def run(self, context: StageContext[Any]) -> StageResult:
+        note(self.journal, "total")
+        total = int((context.inputs["square"] / "powers" / "total.txt").read_text())
+        log = (context.inputs["count"] / "log.txt").read_text()
+        write_bytes(
+            context.out / "total.txt", f"{log} {total + context.config.offset} {context.seed}".encode()
+        )
+        return StageResult()
+
+
+def note(journal: Path, line: str) -> None:
+    with journal.open("a") as file:
+        file.write(line + "\n")
+
+
+def toy_dag(journal: Path) -> Dag:
+    stages = {"count": Count(journal), "square": Square(journal), "total": Total(journal)}
+    return Dag(tuple(stages), stages.__getitem__)
+
+
+class Remarks(SilentReporter):
+    """A reporter that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+        self.lines: list[str] = []
+
+    def info(self, text: str) -> None:
+        self.lines.append(text)
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+@dataclass
+class Bench:
+    """Everything of one toy run; each call opens the store anew, as a new process would."""
+
+    root: Path
+    dag: Dag
+    remarks: Remarks
+
+    @property
+    def capture(self) -> Path:
+        return self.root / "capture"
+
+    @property
+    def folder(self) -> Path:
+        return self.root / "run"
+
+    @property
+    def store(self) -> Path:
+        return self.folder / ".store"
+
+    @property
+    def journal(self) -> Path:
+        return self.root / "journal"
+
+    def work_done(self) -> list[str]:
+        """What stages noted since the last call."""
+        lines = self.journal.read_text().splitlines() if self.journal.exists() else []
+        self.journal.unlink(missing_ok=True)
+        return lines
+
+    def settings(self, overrides: Sequence[str] = (), seed: int = 0, store: Path | None = None) -> Run:
+        document = {"seed": seed}
+        for text in overrides:
+            document = merge(document, parse_override(text))
+        config = check_document(self.dag, document)
+        return Run(self.folder, self.capture, config, store or self.store, "cpu")
+
+    def run(
+        self,
+        *overrides: str,
+        until: str | None = None,
+        force: Sequence[str] = (),
+        allow_partial: bool = False,
+        seed: int = 0,
+        threads: int = 1,
+        store: Path | None = None,
+    ) -> list[Outcome]:
+        settings = self.settings(overrides, seed, store)
+        with DigestMemo(settings.store / "digests.sqlite") as memo:
+            runner = Runner(self.dag, settings, Store(settings.store, memo), threads, self.remarks)
+            return runner.run_until(until, force=force, allow_partial=allow_partial)
+
+    def plan(self, *overrides: str, seed: int = 0) -> dict[str, StagePlan]:
+        settings = self.settings(overrides, seed)
+        with DigestMemo(settings.store / "digests.sqlite") as memo:
+            planner = Planner(self.dag, settings, Store(settings.store, memo), 1, self.remarks)
+            return {plan.stage: plan for plan in planner.plan()}
+
+    def digests(self) -> dict[str, str]:
+        """Stage -> digest of its published tree, as another process would find it."""
+        return {outcome.stage: outcome.manifest.digest for outcome in self.run()}
+
+
+def make_bench(root: Path) -> Bench:
+    """A capture of six numbers and nothing else yet."""
+    capture = root / "capture"
+    capture.mkdir()
+    for number in range(6):
+        (capture / f"{number}.txt").write_text(str(number))
+    return Bench(root, toy_dag(root / "journal"), Remarks())
+
+
+if __name__ == "__main__":
+    from cleargs.cli.main import main
+
+    main(sys.argv[2:], toy_dag(Path(sys.argv[1])))
