@@ -1,0 +1,1 @@
+"""Pictures in and out: still images, videos, EXR layers, colour."""

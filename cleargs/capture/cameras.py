@@ -1,0 +1,129 @@
+"""Cameras and poses, in COLMAP's conventions.
+
+Distortion is pycolmap's (all COLMAP models). Only its camera mathematics is called in this process, on
+parameters that were checked: COLMAP's failed checks would end the process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cleargs.errors import InputError
+
+SINGLE_FOCAL = frozenset(
+    {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+)
+"""Models with one focal length: f, cx, cy, ..."""
+
+TWO_FOCALS = frozenset({"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE", "FOV"})
+"""Models with two: fx, fy, cx, cy, ..."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels of an image of ``width`` x ``height``; the centre of the first pixel is 0.5."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.model not in SINGLE_FOCAL | TWO_FOCALS:
+            raise InputError(
+                f"camera model {self.model} is not supported",
+                hint="undistort the images first, or use a perspective or OpenCV fisheye model",
+            )
+        if not np.isfinite(self.params).all() or min(self.width, self.height) < 1:
+            raise InputError(
+                "a camera has parameters that are not finite", hint="correct the camera in the input"
+            )
+        if not self.colmap().verify_params() or min(self.focal) <= 0:
+            raise InputError(
+                f"a {self.model} camera has a wrong number of parameters or a focal length of 0 or less",
+                hint="correct the camera in the input",
+            )
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """fx, fy."""
+        return (self.params[0],) * 2 if self.model in SINGLE_FOCAL else (self.params[0], self.params[1])
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """cx, cy."""
+        start = 1 if self.model in SINGLE_FOCAL else 2
+        return self.params[start], self.params[start + 1]
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        return self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the image needs no undistortion."""
+        return not any(self.distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same picture scaled to another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        sx, sy = width / self.width, height / self.height
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        if self.model not in SINGLE_FOCAL:
+            params = (fx * sx, fy * sy, cx * sx, cy * sy, *self.distortion)
+        else:
+            # Rounding to whole pixels leaves sx and sy a little apart; one focal length stays one.
+            params = (fx * (sx + sy) / 2, cx * sx, cy * sy, *self.distortion)
+        return Camera(self.model, width, height, params)
+
+    def colmap(self) -> pycolmap.Camera:
+        return pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+
+def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
+    return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
+
+
+def guessed_camera(width: int, height: int) -> Camera:
+    """A pinhole of COLMAP's default focal length (1.2 long sides), for frames that have none."""
+    focal = 1.2 * max(width, height)
+    return pinhole(width, height, focal, focal, width / 2, height / 2)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """World to camera: x_camera = rotation x_world + translation; x right, y down, z forward (OpenCV)."""
+
+    rotation: NDArray[np.float64]  # [3, 3]
+    translation: NDArray[np.float64]  # [3]
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Camera centre in the world, [3]."""
+        centre: NDArray[np.float64] = -self.rotation.T @ self.translation
+        return centre
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """w, x, y, z with w >= 0."""
+        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat(canonical=True)
+        return float(w), float(x), float(y), float(z)
+
+    @staticmethod
+    def from_quaternion(wxyz: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
+        w, x, y, z = wxyz
+        return Pose(Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(translation, np.float64))
+
+    @staticmethod
+    def from_opengl(camera_to_world: NDArray[np.float64]) -> Pose:  # [4, 4]
+        """From a camera-to-world matrix with OpenGL axes (x right, y up, z back), as in transforms.json."""
+        rotation = (camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
+        return Pose(rotation, -rotation @ camera_to_world[:3, 3])

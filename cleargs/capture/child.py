@@ -1,0 +1,135 @@
+"""Work in a child process that reports progress, can be killed, and may abort without taking us along.
+
+The child writes JSON objects, one a line, to its standard output: ``{"phase": label, "total": n}`` opens
+a phase, ``{"done": k, "note": text}`` moves it, ``{"error": cause, "hint": remedy}`` ends in failure. Its
+standard error (COLMAP's log) goes to a file. It dies with its parent: it watches its standard input, whose
+other end closes when the parent is gone, however it went.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TextIO
+
+from cleargs.errors import StageError
+from cleargs.progress import Reporter, Task
+
+
+class ChildChannel:
+    """The child's side: how it reports."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    @staticmethod
+    def open() -> ChildChannel:
+        """Take standard output for the reports (whatever a library prints there goes to the log instead), and
+        from now on die when the parent does."""
+        reports = os.fdopen(os.dup(1), "w", buffering=1)
+        os.dup2(2, 1)
+        threading.Thread(target=_die_with_parent, daemon=True).start()
+        return ChildChannel(reports)
+
+    def phase(self, label: str, total: int | None) -> None:
+        self._send({"phase": label, "total": total})
+
+    def done(self, steps: int, note: str | None = None) -> None:
+        self._send({"done": steps, "note": note})
+
+    def error(self, cause: str, hint: str) -> None:
+        self._send({"error": cause, "hint": hint})
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        self._stream.write(json.dumps(message) + "\n")
+
+
+def _die_with_parent() -> None:
+    # Not sys.stdin: its lock, held by this thread, would abort the interpreter's shutdown.
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporter) -> None:
+    """Run ``python -m module job`` to its end, showing its progress.
+
+    Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted.
+    Whatever ends this call early (Ctrl-C above all) kills the child first.
+    """
+    # One BLAS thread: sums in COLMAP's and numpy's linear algebra must not depend on the machine.
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": str(threads),
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+    }
+    with (
+        log.open("w", encoding="utf-8") as errors,
+        subprocess.Popen(
+            [sys.executable, "-m", module, str(job)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=environment,
+            text=True,
+            start_new_session=True,
+        ) as child,
+    ):
+        try:
+            failure = _follow(child, reporter)
+            status = child.wait()
+        except BaseException:
+            os.killpg(child.pid, signal.SIGKILL)
+            raise
+    if failure is not None:
+        raise failure
+    if status != 0:
+        raise StageError(
+            f"COLMAP stopped ({_exit_reason(status)}): {_last_failure(log)}",
+            hint="try other images, another ingest.camera_model or fewer ingest.max_features",
+        )
+
+
+def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | None:
+    """Show the child's reports until it closes its output; the error that it named, if any."""
+    assert child.stdout is not None
+    failure: StageError | None = None
+    with ExitStack() as phases:
+        task: Task | None = None
+        for line in child.stdout:
+            message = json.loads(line)
+            if "phase" in message:
+                phases.close()
+                task = phases.enter_context(reporter.task(message["phase"], message["total"]))
+            elif "error" in message:
+                failure = StageError(message["error"], hint=message["hint"])
+            elif task is not None:
+                task.update(done=message["done"], note=message["note"])
+    return failure
+
+
+def _exit_reason(status: int) -> str:
+    if status >= 0:
+        return f"exit {status}"
+    try:
+        return signal.Signals(-status).name
+    except ValueError:
+        return f"signal {-status}"
+
+
+def _last_failure(log: Path) -> str:
+    """The line that says why: COLMAP's last failed check, else the last line of the log."""
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines()]
+    lines = [line for line in lines if line and not line.startswith(("@", "***"))]
+    checks = [line for line in lines if re.match(r"F\d{8} ", line)]
+    chosen = (checks or lines or ["no reason was given"])[-1]
+    return chosen.split("] ", 1)[-1][:200]

@@ -1,0 +1,73 @@
+"""Settings of the ingest stage."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+
+
+class IngestConfig(BaseModel):
+    """How a capture becomes undistorted frames with poses and sparse points."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fps: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="frames per second to take from a video; unset: max_frames alone decides",
+    )
+    max_frames: int = Field(150, ge=3, description="at most so many frames, evenly in time")
+    max_size: int = Field(960, ge=64, description="long side of the published images, px; never enlarged")
+    holdout: str = Field(
+        "none",
+        description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of each "
+        "of N equal stretches) | names or stems, separated by commas",
+    )
+    poses: Literal["auto", "sfm"] = Field(
+        "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
+    )
+    camera_model: SfmModel = Field(
+        "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"
+    )
+    shared_camera: bool = Field(
+        True, description="SfM: one camera for all frames; false: a camera a frame, sizes may differ"
+    )
+    feature_size: int = Field(
+        960, ge=64, description="long side at which features are found, px; never enlarged, at least max_size"
+    )
+    max_features: int = Field(
+        4096, ge=256, le=65536, description="SIFT features a frame, the largest scales first"
+    )
+    exhaustive_below: int = Field(
+        60,
+        ge=0,
+        description="all pairs are matched below this many frames, else neighbours and loop candidates",
+    )
+    overlap: int = Field(
+        8,
+        ge=1,
+        le=100,
+        description="each frame is matched with so many next ones, and with those 2, 4, 8, ... on",
+    )
+    loop_candidates: int = Field(
+        6, ge=0, le=100, description="distant frames of similar content to match with each frame"
+    )
+    min_registered: float = Field(
+        0.30, ge=0, le=1, description="share of frames that must get a pose, or the stage fails"
+    )
+
+    @field_validator("holdout")
+    @classmethod
+    def _known_holdout(cls, value: str) -> str:
+        if ":" in value and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
+            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
+        if value == "every:1":
+            raise ValueError("every:1 would hold out every frame")
+        if not value.strip(" ,"):
+            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
+        return value

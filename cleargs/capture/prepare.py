@@ -1,0 +1,125 @@
+"""Working images: every chosen frame upright, in sRGB, as PNG, at the size at which COLMAP sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.cameras import Camera
+from cleargs.capture.sources import Capture, SourceFrame
+from cleargs.errors import InputError
+from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.video import decode_frames
+from cleargs.progress import Reporter
+
+
+@dataclass(frozen=True)
+class WorkFrame:
+    """One frame as COLMAP sees it; ``camera`` (of the input, if any) fits the working image."""
+
+    source: SourceFrame
+    image: str
+    """File name below the folder of working images."""
+    width: int
+    height: int
+    masked: bool
+    camera: Camera | None
+
+
+def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
+    """Write ``folder/images/%06d.png`` and, where there are masks, ``folder/masks/%06d.png.png`` (as COLMAP
+    names them).
+
+    Reduced by area averaging in sRGB, never enlarged. Frames that a killed run left whole are not made again.
+    Raises InputError for unreadable images and for images that do not have their camera's proportions.
+    """
+    images, masks = folder / "images", folder / "masks"
+    images.mkdir(parents=True, exist_ok=True)
+    masks.mkdir(parents=True, exist_ok=True)
+    names = [f"{index:06d}.png" for index in range(len(capture.frames))]
+    with reporter.task("reading frames", len(names)) as task:
+        if capture.kind == "video":
+            _decode_video(capture, images, names, long_side, task.advance)
+        else:
+            for frame, name in zip(capture.frames, names, strict=True):
+                if not (images / name).is_file():
+                    write_rgb(images / name, reduced(_upright(frame), long_side))
+                task.advance()
+    return [
+        _work_frame(frame, images / name, masks / f"{name}.png")
+        for frame, name in zip(capture.frames, names, strict=True)
+    ]
+
+
+def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W, 3]
+    """The image with a long side of at most ``long_side`` px, by area averaging."""
+    width, height = reduced_size(image.shape[1], image.shape[0], long_side)
+    if (height, width) == image.shape[:2]:
+        return image
+    smaller: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    return smaller
+
+
+def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """Width and height scaled alike to a long side of at most ``long_side`` px."""
+    scale = min(1.0, long_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _decode_video(
+    capture: Capture, images: Path, names: list[str], long_side: int, advance: Callable[[], None]
+) -> None:
+    todo: dict[int, Path] = {}
+    for frame, name in zip(capture.frames, names, strict=True):
+        assert frame.pts is not None
+        if (images / name).is_file():
+            advance()
+        else:
+            todo[frame.pts] = images / name
+    if todo:
+        for pts, rgb in decode_frames(capture.frames[0].path, todo):
+            write_rgb(todo[pts], reduced(rgb, long_side))
+            advance()
+
+
+def _upright(frame: SourceFrame) -> NDArray[np.uint8]:
+    """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
+    rgb = read_rgb(frame.path)
+    if frame.camera is not None and not _alike(frame.camera.width, frame.camera.height, rgb):
+        stored = read_rgb(frame.path, upright=False)
+        if _alike(frame.camera.width, frame.camera.height, stored):
+            return stored
+    return rgb
+
+
+def _alike(width: int, height: int, image: NDArray[np.uint8]) -> bool:
+    """Whether an image has these proportions, but for rounding to whole pixels."""
+    h, w = image.shape[:2]
+    return abs(w * height - h * width) <= max(width, height) + max(w, h)
+
+
+def _work_frame(frame: SourceFrame, image: Path, mask: Path) -> WorkFrame:
+    rgb = read_rgb(image)
+    height, width = rgb.shape[:2]
+    camera = frame.camera
+    if camera is not None:
+        if not _alike(camera.width, camera.height, rgb):
+            raise InputError(
+                f"{frame.name} does not have the proportions of its camera ({camera.width}x{camera.height})",
+                hint="give the images that the poses were made from, or set ingest.poses=sfm",
+            )
+        camera = camera.resized(width, height)
+    if frame.mask is not None and not mask.is_file():
+        stencil = read_mask(frame.mask)
+        if not _alike(stencil.shape[1], stencil.shape[0], rgb):
+            raise InputError(
+                f"the mask {frame.mask.name} does not have the proportions of {frame.name}",
+                hint="make masks of the size of their images",
+            )
+        write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))
+    return WorkFrame(frame, image.name, width, height, frame.mask is not None, camera)

@@ -1,0 +1,179 @@
+"""Poses and sparse points: SfM where the capture has no poses, triangulation where it has.
+
+COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.child import run_child
+from cleargs.capture.config import IngestConfig
+from cleargs.capture.model import ModelImage, SparseModel, read_model
+from cleargs.capture.prepare import WorkFrame
+from cleargs.capture.world import Similarity, normalise
+from cleargs.errors import InputError, StageError
+from cleargs.files import write_json
+from cleargs.progress import Reporter
+
+WARN_REGISTERED = 0.60
+"""Below this share of frames with a pose the user is warned."""
+
+_ADVICE = (
+    "record more frames (ingest.fps, ingest.max_frames) with slower motion, "
+    "try another ingest.camera_model, or raise ingest.feature_size"
+)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A sparse model in the normalised world; image names are those of the working images."""
+
+    model: SparseModel
+    similarity: Similarity
+
+
+def reconstruct(
+    frames: Sequence[WorkFrame],
+    given: SparseModel | None,
+    folder: Path,
+    config: IngestConfig,
+    seed: int,
+    threads: int,
+    reporter: Reporter,
+) -> Reconstruction:
+    """Poses, cameras and points of the working images in ``folder``.
+
+    Poses of the input are normalised in float64 before COLMAP sees them; ``given`` (the input's own sparse
+    model) saves the triangulation. Raises StageError when too few frames get a pose.
+    """
+    posed = [frame for frame in frames if frame.source.pose is not None]
+    if not posed:
+        model = _run(_sfm_job(frames, config), folder, config, seed, threads, reporter)
+        _check_registered(len(model.images), len(frames), config, reporter)
+        similarity = normalise([image.pose for _, image in sorted(model.images.items())])
+        return Reconstruction(_moved(model, similarity), similarity)
+    _check_registered(len(posed), len(frames), config, reporter)
+    similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
+    if given is not None:
+        return Reconstruction(_moved(_adopted(given, posed), similarity), similarity)
+    poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
+    model = _run(_triangulation_job(posed, poses), folder, config, seed, threads, reporter)
+    if not len(model.point_ids):
+        raise StageError(
+            "no point could be triangulated at the given poses",
+            hint="check that poses, axes (OpenGL camera to world) and images belong together, "
+            "or set ingest.poses=sfm",
+        )
+    return Reconstruction(model, similarity)
+
+
+def _check_registered(registered: int, total: int, config: IngestConfig, reporter: Reporter) -> None:
+    if registered < max(3, config.min_registered * total):
+        raise StageError(f"only {registered} of {total} frames could be placed in space", hint=_ADVICE)
+    if registered < WARN_REGISTERED * total:
+        reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What COLMAP gets: working images, their cameras, and the poses if they are known."""
+
+    names: list[str]
+    cameras: list[Camera]
+    camera_of: list[int]
+    poses: list[list[list[float]]] | None
+    exif_image: str | None
+    masked: bool
+
+
+def _sfm_job(frames: Sequence[WorkFrame], config: IngestConfig) -> _Job:
+    sizes = sorted({(frame.width, frame.height) for frame in frames})
+    if config.shared_camera and len(sizes) > 1:
+        listed = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
+        raise InputError(
+            f"the images have {len(sizes)} sizes ({listed}): they cannot share one camera",
+            hint="keep the images of one camera and orientation, or set ingest.shared_camera=false",
+        )
+    cameras = [_starting_camera(frame, config) for frame in (frames[:1] if config.shared_camera else frames)]
+    path = frames[0].source.path
+    return _Job(
+        names=[frame.image for frame in frames],
+        cameras=cameras,
+        camera_of=[0 if config.shared_camera else index for index in range(len(frames))],
+        poses=None,
+        exif_image=str(path.resolve()) if frames[0].source.pts is None else None,
+        masked=any(frame.masked for frame in frames),
+    )
+
+
+def _starting_camera(frame: WorkFrame, config: IngestConfig) -> Camera:
+    """COLMAP's first guess: focal length 1.2 long sides, no distortion."""
+    focal = 1.2 * max(frame.width, frame.height)
+    guess = pycolmap.Camera.create_from_model_name(1, config.camera_model, focal, frame.width, frame.height)
+    return Camera(
+        config.camera_model, frame.width, frame.height, tuple(float(value) for value in guess.params)
+    )
+
+
+def _triangulation_job(frames: Sequence[WorkFrame], poses: Sequence[Pose]) -> _Job:
+    cameras: list[Camera] = []
+    camera_of: list[int] = []
+    for frame in frames:
+        assert frame.camera is not None
+        if frame.camera not in cameras:
+            cameras.append(frame.camera)
+        camera_of.append(cameras.index(frame.camera))
+    matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses]
+    masked = any(frame.masked for frame in frames)
+    return _Job([frame.image for frame in frames], cameras, camera_of, matrices, None, masked)
+
+
+def _run(
+    job: _Job, folder: Path, config: IngestConfig, seed: int, threads: int, reporter: Reporter
+) -> SparseModel:
+    """Let COLMAP do the job, unless a killed run got as far as the model."""
+    model = folder / "model"
+    if not model.is_dir():
+        settings = {
+            **asdict(job),
+            "folder": str(folder.resolve()),
+            "images": str((folder / "images").resolve()),
+            "masks": str((folder / "masks").resolve()) if job.masked else None,
+            "seed": seed,
+            "threads": threads,
+            "max_features": config.max_features,
+            "exhaustive_below": config.exhaustive_below,
+            "overlap": config.overlap,
+            "loop_candidates": config.loop_candidates,
+        }
+        write_json(folder / "job.json", settings)
+        run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", threads, reporter)
+    return read_model(model)
+
+
+def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
+    images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
+    return replace(model, images=images, xyz=similarity.points(model.xyz))
+
+
+def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:
+    """The input's own model, restricted to ``frames``: working image names, cameras and pixels."""
+    by_name = {image.name: image for image in given.images.values()}
+    cameras: dict[int, Camera] = {}
+    images: dict[int, ModelImage] = {}
+    scale = 1.0
+    for index, frame in enumerate(frames):
+        original = by_name[frame.source.name]
+        assert frame.camera is not None and frame.source.camera is not None
+        ratio = (frame.width / frame.source.camera.width, frame.height / frame.source.camera.height)
+        scale = ratio[0]
+        cameras[original.camera_id] = frame.camera
+        images[index + 1] = replace(original, name=frame.image, xy=original.xy * ratio)
+    return replace(given, cameras=cameras, images=images, error=given.error * scale)

@@ -1,0 +1,211 @@
+"""What a capture consists of: its frames in order, with the cameras and poses that the input brings."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.config import IngestConfig
+from cleargs.capture.layout import find_model
+from cleargs.capture.model import SparseModel, read_model
+from cleargs.capture.transforms import read_transforms
+from cleargs.errors import InputError
+from cleargs.media.image import IMAGE_SUFFIXES
+from cleargs.media.video import Timeline, read_timeline
+
+T = TypeVar("T")
+
+MIN_FRAMES = 3
+"""Two frames have no third to confirm what they see."""
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One frame as the input has it."""
+
+    name: str
+    path: Path
+    """Image file, or the video."""
+    pts: int | None = None
+    """Presentation time stamp, for a frame of a video."""
+    time_s: float | None = None
+    mask: Path | None = None
+    camera: Camera | None = None
+    pose: Pose | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The chosen frames of an input, in trajectory order."""
+
+    kind: Literal["video", "images", "colmap", "transforms"]
+    frames: tuple[SourceFrame, ...]
+    n_available: int
+    """Frames in the input, before choosing."""
+    model: SparseModel | None = None
+    """The sparse model of a COLMAP project, where it has points."""
+    hdr: str | None = None
+    """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
+
+    @property
+    def posed(self) -> bool:
+        return any(frame.pose is not None for frame in self.frames)
+
+
+def open_capture(source: Path, config: IngestConfig) -> Capture:
+    """Find out what ``source`` is and choose its frames. Decodes no frame; changes nothing.
+
+    A folder with transforms.json is taken for that; else one with a sparse model for a COLMAP project; else
+    its images (those in ``images/``, or its own) are taken in natural order. Raises InputError.
+    """
+    if not source.exists():
+        raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
+    if not source.is_dir():
+        return _open_video(source, config)
+    if (source / "transforms.json").is_file():
+        capture = _open_transforms(source, config)
+    elif config.poses == "auto" and (model := find_model(source)) is not None:
+        capture = _open_colmap(source, model, config)
+    else:
+        capture = _open_images(source, config)
+    if len(capture.frames) < MIN_FRAMES:
+        raise InputError(
+            f"{source} has {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
+            hint="give more images, or raise ingest.fps",
+        )
+    return capture
+
+
+def natural_key(text: str) -> list[tuple[int, int, str]]:
+    """Sort key by which ``2.jpg`` comes before ``10.jpg``."""
+    parts = re.split(r"(\d+)", text)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part.lower()) for part in parts]
+
+
+def spread(items: Sequence[T], at_most: int) -> list[T]:
+    """At most so many of ``items``, evenly by position, first and last included."""
+    if len(items) <= at_most:
+        return list(items)
+    return [items[int(index)] for index in np.rint(np.linspace(0, len(items) - 1, at_most))]
+
+
+def _open_video(source: Path, config: IngestConfig) -> Capture:
+    timeline = read_timeline(source)
+    chosen = choose_times(timeline, config.fps, config.max_frames)
+    if len(chosen) < MIN_FRAMES:
+        raise InputError(
+            f"{source.name} gives {len(chosen)} frames; a scene needs at least {MIN_FRAMES}",
+            hint="record longer, or raise ingest.fps or ingest.max_frames",
+        )
+    frames = tuple(
+        SourceFrame(
+            f"{source.stem}_{index:06d}", source, pts=timeline.pts[index], time_s=timeline.seconds(index)
+        )
+        for index in chosen
+    )
+    return Capture("video", frames, len(timeline.pts), hdr=timeline.transfer)
+
+
+def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:
+    """Frame numbers evenly in time (not in number: the frame rate may vary): every 1 / fps seconds if given,
+    and at most so many from first to last."""
+    times = np.array([timeline.seconds(index) for index in range(len(timeline.pts))])
+    span = float(times[-1])
+    chosen = (
+        list(range(len(times)))
+        if fps is None
+        else _nearest(times, np.arange(int(span * fps + 1e-6) + 1) / fps)
+    )
+    return chosen if len(chosen) <= at_most else _nearest(times, np.linspace(0, span, at_most))
+
+
+def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[int]:
+    """Numbers of the frames nearest to the wanted times, each once; ``times`` start at 0 and ascend."""
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(wanted - times[before] <= times[after] - wanted, before, after)
+    return sorted({int(index) for index in nearest})
+
+
+def _open_transforms(source: Path, config: IngestConfig) -> Capture:
+    listed = read_transforms(source / "transforms.json", poses=config.poses == "auto")
+    listed.sort(key=lambda frame: natural_key(frame.name))
+    masks = _masks(source / "masks")
+    frames = tuple(
+        SourceFrame(
+            frame.name,
+            frame.path,
+            mask=frame.mask or _mask_of(masks, frame.path.name),
+            camera=frame.camera,
+            pose=frame.pose,
+        )
+        for frame in spread(listed, config.max_frames)
+    )
+    return Capture("transforms", frames, len(listed))
+
+
+def _open_images(source: Path, config: IngestConfig) -> Capture:
+    folder = source / "images" if (source / "images").is_dir() else source
+    files = _image_files(folder)
+    if not files:
+        raise InputError(
+            f"{source} holds no images, no video and no transforms.json",
+            hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
+        )
+    masks = _masks(source / "masks" if folder != source else source.parent / "masks")
+    frames = tuple(
+        SourceFrame(path.name, path, mask=_mask_of(masks, path.name))
+        for path in spread(files, config.max_frames)
+    )
+    return Capture("images", frames, len(files))
+
+
+def _open_colmap(source: Path, folder: Path, config: IngestConfig) -> Capture:
+    model = read_model(folder)
+    root = source / "images"
+    if not root.is_dir():
+        raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
+    posed = {image.name: image for image in model.images.values()}
+    missing = [name for name in posed if not (root / name).is_file()]
+    if missing:
+        raise InputError(
+            f"the COLMAP model lists images that do not exist, such as {missing[0]} ({len(missing)} in all)",
+            hint="put the images that the model was made from into images/, or set ingest.poses=sfm",
+        )
+    # Images that COLMAP could not register are frames too: they stay in the table, marked.
+    names = sorted(set(posed) | {path.name for path in _image_files(root)}, key=natural_key)
+    masks = _masks(source / "masks")
+    frames = []
+    for name in spread(names, config.max_frames):
+        image = posed.get(name)
+        if image is not None and image.camera_id not in model.cameras:
+            raise InputError(
+                f"the COLMAP model has no camera for {name}", hint="export it again, or set ingest.poses=sfm"
+            )
+        camera = model.cameras[image.camera_id] if image is not None else None
+        pose = image.pose if image is not None else None
+        frames.append(SourceFrame(name, root / name, mask=_mask_of(masks, name), camera=camera, pose=pose))
+    return Capture("colmap", tuple(frames), len(names), model if len(model.point_ids) else None)
+
+
+def _image_files(folder: Path) -> list[Path]:
+    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted(
+        (path for path in files if not path.name.startswith(".")), key=lambda path: natural_key(path.name)
+    )
+
+
+def _masks(folder: Path) -> dict[str, Path]:
+    return {path.stem: path for path in _image_files(folder)} if folder.is_dir() else {}
+
+
+def _mask_of(masks: Mapping[str, Path], name: str) -> Path | None:
+    """The mask of the same stem, or (as COLMAP names them) of the full file name."""
+    return masks.get(Path(name).stem) or masks.get(Path(name).name)

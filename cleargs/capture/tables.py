@@ -1,0 +1,135 @@
+"""The tables of ``ingest``: what every later stage knows of the capture.
+
+World: normalised (origin at the mean camera centre, farthest camera at distance 1, mean camera up along -y).
+Poses are COLMAP's: world to camera, OpenCV axes (x right, y down, z forward), unit quaternions w x y z, pixel
+centres at + 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cleargs.tables import column, read_table
+
+_POSE = "world to camera (COLMAP, OpenCV axes); null when unregistered"
+
+FRAMES = pa.schema(
+    [
+        column("frame_id", pa.int32(), "position in the capture, from 0, without gaps"),
+        column("name", pa.string(), "name in the input: file path, or video name and frame number"),
+        column("image", pa.string(), "undistorted PNG, relative to this folder"),
+        column("time_s", pa.float64(), "presentation time, s; null without a clock", nullable=True),
+        column("width", pa.int32(), "of the undistorted image, px"),
+        column("height", pa.int32(), "of the undistorted image, px"),
+        column("fx", pa.float64(), "focal length, px"),
+        column("fy", pa.float64(), "focal length, px"),
+        column("cx", pa.float64(), "principal point, px; the centre of the first pixel is 0.5"),
+        column("cy", pa.float64(), "principal point, px; the centre of the first pixel is 0.5"),
+        column("qw", pa.float64(), f"rotation, {_POSE}", nullable=True),
+        column("qx", pa.float64(), f"rotation, {_POSE}", nullable=True),
+        column("qy", pa.float64(), f"rotation, {_POSE}", nullable=True),
+        column("qz", pa.float64(), f"rotation, {_POSE}", nullable=True),
+        column("tx", pa.float64(), f"translation, {_POSE}", nullable=True),
+        column("ty", pa.float64(), f"translation, {_POSE}", nullable=True),
+        column("tz", pa.float64(), f"translation, {_POSE}", nullable=True),
+        column("registered", pa.bool_(), "whether the frame has a pose"),
+        column("n_points", pa.int32(), "sparse points that the frame observes"),
+        column("split", pa.string(), "train, or test (held out: has a pose, enters nothing else)"),
+    ]
+)
+
+POINTS = pa.schema(
+    [
+        column("point_id", pa.int64(), "unique in this table"),
+        column("x", pa.float64(), "position in the normalised world"),
+        column("y", pa.float64(), "position in the normalised world"),
+        column("z", pa.float64(), "position in the normalised world"),
+        column("r", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
+        column("g", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
+        column("b", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
+        column("error", pa.float64(), "mean reprojection error, px of the input image"),
+        column("track_length", pa.int32(), "registered frames that observe the point"),
+    ]
+)
+
+OBSERVATIONS = pa.schema(
+    [
+        column("frame_id", pa.int32(), "registered frame i"),
+        column("point_id", pa.int64(), "sparse point that it observes (the paper's P_i), once a pair"),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a prepared capture. Images are pinhole: undistorted, resized, PNG."""
+
+    frame_id: int
+    name: str
+    image: str
+    """Path relative to the ingest folder, ``images/000012.png``."""
+    mask: str | None
+    """Path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None."""
+    time_s: float | None
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    qw: float | None
+    qx: float | None
+    qy: float | None
+    qz: float | None
+    tx: float | None
+    ty: float | None
+    tz: float | None
+    registered: bool
+    n_points: int
+    split: Literal["train", "test"]
+
+
+@dataclass(frozen=True)
+class Points:
+    """The sparse points, by point_id."""
+
+    point_id: NDArray[np.int64]  # [P]
+    xyz: NDArray[np.float64]  # [P, 3]
+    rgb: NDArray[np.uint8]  # [P, 3] sRGB
+    error: NDArray[np.float64]  # [P] px
+    track_length: NDArray[np.int32]  # [P]
+
+
+def load_frames(ingest_dir: Path) -> list[Frame]:
+    """Every frame of a finished ingest folder, unregistered ones too, by frame_id. Raises StoreError."""
+    table = read_table(ingest_dir / "frames.parquet", FRAMES)
+    frames = []
+    for row in table.to_pylist():
+        mask = f"masks/{Path(row['image']).stem}.png"
+        frames.append(Frame(**row, mask=mask if (ingest_dir / mask).is_file() else None))
+    return sorted(frames, key=lambda frame: frame.frame_id)
+
+
+def load_points(ingest_dir: Path) -> Points:
+    """The sparse points of a finished ingest folder. Raises StoreError."""
+    table = read_table(ingest_dir / "points.parquet", POINTS)
+    get = {name: table.column(name).to_numpy() for name in POINTS.names}
+    return Points(
+        point_id=get["point_id"],
+        xyz=np.stack([get["x"], get["y"], get["z"]], axis=1),
+        rgb=np.stack([get["r"], get["g"], get["b"]], axis=1),
+        error=get["error"],
+        track_length=get["track_length"],
+    )
+
+
+def load_observations(ingest_dir: Path) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """The pairs (frame_id [M], point_id [M]) of a finished ingest folder: P_i of each. Raises StoreError."""
+    table = read_table(ingest_dir / "observations.parquet", OBSERVATIONS)
+    return table.column("frame_id").to_numpy(), table.column("point_id").to_numpy()

@@ -1,0 +1,104 @@
+"""From a lens to a pinhole: the published images have no distortion and no empty pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.cameras import Camera, pinhole
+from cleargs.capture.prepare import reduced, reduced_size
+from cleargs.errors import InputError
+
+MAX_TANGENT = 1.75
+"""A pinhole image reaches at most 60 degrees off its axis: fisheye images are cropped there."""
+
+_EDGE_SAMPLES = 256
+
+
+@dataclass(frozen=True)
+class Undistorter:
+    """The way of one camera's images to a pinhole."""
+
+    pinhole: Camera
+    """Camera of the published image."""
+    _lens: Camera
+    _flat: Camera
+    """Pinhole at the lens's own focal length, before the reduction to the published size."""
+    _map: tuple[NDArray[np.float32], NDArray[np.float32]] | None
+    """Where each pixel of the flat image lies in the lens's; None without distortion."""
+
+    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W, 3]
+        """Bicubic into the flat image, then area averaging to the published size; sRGB throughout."""
+        if self._map is not None:
+            rgb = np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        return reduced(rgb, max(self.pinhole.width, self.pinhole.height))
+
+    def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W]
+        """The same way for a mask, nearest pixels throughout."""
+        if self._map is not None:
+            mask = np.asarray(cv2.remap(mask, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
+        size = (self.pinhole.width, self.pinhole.height)
+        return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
+
+    def points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2]
+        """Pixel positions in the lens's image to those in the published one."""
+        rays = self._lens.colmap().cam_from_img(np.ascontiguousarray(xy))
+        moved: NDArray[np.float64] = np.asarray(rays) * self.pinhole.focal + np.array(self.pinhole.centre)
+        return moved
+
+    def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:  # [K, 2]
+        """Which positions lie in the published image."""
+        size = np.array([self.pinhole.width, self.pinhole.height])
+        return np.asarray(((xy >= 0) & (xy < size)).all(axis=1))
+
+
+def undistorter(lens: Camera, max_size: int) -> Undistorter:
+    """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
+
+    The pinhole keeps the lens's focal lengths, so that the image's centre keeps its scale, and shows the
+    largest rectangle around the axis that the lens's image covers wholly (as COLMAP's undistorter does
+    without blank pixels). Raises InputError when distortion leaves no such rectangle.
+    """
+    if lens.is_pinhole:
+        flat = pinhole(lens.width, lens.height, *lens.focal, *lens.centre)
+        return Undistorter(flat.resized(*reduced_size(flat.width, flat.height, max_size)), lens, flat, None)
+    left, top, right, bottom = _covered(lens)
+    fx, fy = lens.focal
+    width, height = int((right - left) * fx), int((bottom - top) * fy)
+    if width < 16 or height < 16:
+        raise InputError(
+            f"the {lens.model} camera's distortion leaves nothing of its images",
+            hint="check k1..k4, p1, p2, or set ingest.poses=sfm to fit the camera anew",
+        )
+    flat = pinhole(width, height, fx, fy, -left * fx, -top * fy)
+    x = (np.arange(width) + 0.5 - flat.centre[0]) / fx
+    y = (np.arange(height) + 0.5 - flat.centre[1]) / fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
+    # OpenCV puts the centre of the first pixel at 0, COLMAP at 0.5.
+    where = lens.colmap().img_from_cam(rays.reshape(-1, 3)).reshape(height, width, 2).astype(np.float32) - 0.5
+    maps = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
+    return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, flat, maps)
+
+
+def _covered(lens: Camera) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
+    t = np.linspace(0, 1, _EDGE_SAMPLES)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    size = np.array([lens.width, lens.height])
+
+    def edge(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = lens.colmap().cam_from_img(np.stack([x, y], axis=1) * size)
+        finite = np.isfinite(rays).all(axis=1)
+        return np.asarray(rays[finite], np.float64)
+
+    left, right = edge(zero, t)[:, 0], edge(one, t)[:, 0]
+    top, bottom = edge(t, zero)[:, 1], edge(t, one)[:, 1]
+    return (
+        float(max(left.max(initial=-MAX_TANGENT), -MAX_TANGENT)),
+        float(max(top.max(initial=-MAX_TANGENT), -MAX_TANGENT)),
+        float(min(right.min(initial=MAX_TANGENT), MAX_TANGENT)),
+        float(min(bottom.min(initial=MAX_TANGENT), MAX_TANGENT)),
+    )

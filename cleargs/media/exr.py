@@ -1,0 +1,114 @@
+"""EXR files of several named RGB layers: scene-linear, Rec.709 primaries, half floats, zip.
+
+Layer ``render`` is the channels ``render.R``, ``render.G``, ``render.B``. OpenEXR stores channels in
+alphabetical order, so they are found by name. Equal layers and attributes give equal bytes: no date is
+stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from OpenImageIO import HALF, ImageInput, ImageOutput, ImageSpec, geterror
+
+from cleargs.errors import StoreError
+from cleargs.files import atomic_path
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+
+Image: TypeAlias = NDArray[np.float32]  # [H, W, 3] sRGB
+Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709
+Attribute: TypeAlias = int | float | str
+
+_CHANNELS = "RGB"
+
+
+@dataclass(frozen=True, eq=False)
+class LayeredImage:
+    """What an EXR holds: layers by name, and the attributes of its writer (floats in single precision)."""
+
+    layers: Mapping[str, Layer]
+    attributes: Mapping[str, Attribute]
+
+
+def to_layer(image: Image) -> Layer:
+    """The stored form of an sRGB image [H, W, 3]."""
+    return linear_from_srgb(image).astype(np.float16)
+
+
+def from_layer(layer: Layer) -> Image:
+    """The sRGB image [H, W, 3] that a stored layer stands for: what whoever reads the file works with."""
+    return srgb_from_linear(layer.astype(np.float32))
+
+
+def write_exr(path: Path, image: LayeredImage) -> None:
+    """Write the layers (all of one size) and attributes to ``path``, atomically.
+
+    Raises StoreError when the disk is full or not writable.
+    """
+    pixels = np.concatenate(list(image.layers.values()), axis=2)
+    height, width, channels = pixels.shape
+    spec = ImageSpec(width, height, channels, HALF)
+    spec.channelnames = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
+    spec.attribute("compression", "zip")
+    spec.attribute("oiio:ColorSpace", "lin_rec709")
+    spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
+    for name, value in image.attributes.items():
+        spec.attribute(name, value)
+    with atomic_path(path) as temporary:
+        output = ImageOutput.create(str(temporary))
+        if output is None:
+            raise _unwritable(path, geterror())
+        if not (output.open(str(temporary), spec) and output.write_image(pixels) and output.close()):
+            raise _unwritable(path, output.geterror())
+
+
+def read_exr(path: Path, prefix: str = "") -> LayeredImage:
+    """Read every RGB layer of ``path``, and the attributes whose name begins with ``prefix``.
+
+    Raises StoreError when the file is missing, damaged, or has a channel outside an RGB layer.
+    """
+    source = ImageInput.open(str(path))
+    if source is None:
+        raise _damaged(path, geterror())
+    try:
+        spec = source.spec()
+        pixels = source.read_image(HALF)
+        if pixels is None:
+            raise _damaged(path, source.geterror())
+    finally:
+        source.close()
+    place = {name: k for k, name in enumerate(spec.channelnames)}
+    names = dict.fromkeys(name.rpartition(".")[0] for name in spec.channelnames)
+    try:
+        layers = {
+            name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
+            for name in names
+        }
+    except KeyError as missing:
+        raise _damaged(path, f"no channel {missing}") from missing
+    attributes: dict[str, Any] = {
+        item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
+    }
+    return LayeredImage(layers, attributes)
+
+
+def _unwritable(path: Path, reason: str) -> StoreError:
+    return StoreError(
+        f"cannot write {path.name}: {_first_line(reason)}",
+        hint="check the free space and the permissions of the run folder",
+    )
+
+
+def _damaged(path: Path, reason: str) -> StoreError:
+    return StoreError(
+        f"cannot read {path.name}: {_first_line(reason)}", hint="delete the file and run its stage again"
+    )
+
+
+def _first_line(reason: str) -> str:
+    return (reason.strip() or "unknown error").splitlines()[0]

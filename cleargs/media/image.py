@@ -1,0 +1,85 @@
+"""Still images as RGB arrays, through OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+from cleargs.files import write_bytes
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+"""File endings (lower case) taken for images."""
+
+
+def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
+    """The image in ``path`` as 8-bit sRGB; alpha is dropped, 16 bits are reduced to 8.
+
+    ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
+    """
+    flags = cv2.IMREAD_COLOR if upright else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = _decode(path, flags)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
+    """The image in ``path`` as float32 sRGB in [0, 1]. Raises InputError like `read_rgb`."""
+    return read_rgb(path).astype(np.float32) / np.float32(255)
+
+
+def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
+    """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`."""
+    grey = _decode(path, cv2.IMREAD_GRAYSCALE)
+    return np.where(grey > 127, np.uint8(255), np.uint8(0))
+
+
+def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
+    """Write an RGB image atomically in the format of its ending. Floats are sRGB, clipped to [0, 1].
+
+    Raises StoreError when the disk is full or not writable.
+    """
+    rgb = image if image.dtype == np.uint8 else to_uint8(image)
+    _encode(path, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8))
+
+
+def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:  # [H, W]
+    """Write a one-channel image atomically. Raises StoreError like `write_rgb`."""
+    _encode(path, mask)
+
+
+def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Floats in [0, 1] (clipped) rounded to 0..255."""
+    return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
+
+
+def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
+    """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise InputError(
+            f"cannot read {path}: {error.strerror or error}",
+            hint="check that the file exists and is readable",
+        ) from error
+    if data.size == 0:
+        raise InputError(f"{path} is empty (zero bytes)", hint="remove the file, or copy it again")
+    try:
+        image = cv2.imdecode(data, flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(
+            f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"
+        )
+    return np.asarray(image, np.uint8)
+
+
+def _encode(path: Path, image: NDArray[np.uint8]) -> None:
+    ok, data = cv2.imencode(path.suffix, image)
+    if not ok:
+        raise ValueError(f"cannot encode {path.suffix}")
+    write_bytes(path, data.tobytes())

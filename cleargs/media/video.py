@@ -1,0 +1,148 @@
+"""Frames of a video as upright 8-bit sRGB, through PyAV.
+
+Presentation times, rotation, matrix, range and transfer are the stream's. Where it is silent: limited
+range, BT.709 from 720 lines on and BT.601 below, as players do. Standard dynamic range is taken for sRGB as
+it stands (a display shows both alike); HLG and PQ go through `cleargs.media.colour.srgb_from_hdr`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.plane import VideoPlane
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+from cleargs.media.colour import rgb_from_yuv, srgb_from_hdr
+from cleargs.media.image import to_uint8
+
+_MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
+_TRANSFERS = {16: "pq", 18: "hlg"}
+_FULL_RANGE = 2
+_HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """When each frame of a video is shown."""
+
+    pts: tuple[int, ...]
+    """Presentation time stamps, ascending."""
+    time_base: float
+    """Seconds per unit of ``pts``."""
+    transfer: str | None
+    """``pq`` or ``hlg`` for HDR, else None."""
+
+    def seconds(self, index: int) -> float:
+        """Presentation time of a frame, from the first one on, s."""
+        return (self.pts[index] - self.pts[0]) * self.time_base
+
+
+def read_timeline(path: Path) -> Timeline:
+    """Read the time stamps of ``path`` without decoding it.
+
+    Raises InputError when it is no video, empty, or breaks off.
+    """
+    with _open(path) as (container, stream):
+        pts: list[int] = []
+        for packet in container.demux(stream):
+            if packet.is_corrupt:
+                raise _broken(path, len(pts), stream)
+            # Discarded packets (before an edit list's start) are decoded but never shown.
+            if packet.pts is not None and packet.size and not packet.is_discard:
+                pts.append(packet.pts)
+        if not pts:
+            raise InputError(f"{path.name} has no frames", hint=_HINT)
+        if stream.frames > len(pts) + 1 and not _edited(stream):
+            raise _broken(path, len(pts), stream)
+        transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
+        assert stream.time_base is not None
+        return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
+
+
+def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
+
+    Raises InputError when a wanted frame cannot be decoded.
+    """
+    wanted = set(pts)
+    last = max(wanted)
+    with _open(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        for frame in container.decode(stream):
+            if frame.pts is None or frame.pts > last:
+                continue
+            if frame.pts in wanted:
+                wanted.discard(frame.pts)
+                yield frame.pts, frame_rgb(frame)
+            if not wanted:
+                return
+    if wanted:
+        raise InputError(f"{path.name}: {len(wanted)} of its frames cannot be decoded", hint=_HINT)
+
+
+def frame_rgb(frame: VideoFrame) -> NDArray[np.uint8]:  # [H, W, 3]
+    """A decoded frame as upright sRGB."""
+    rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
+    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
+
+
+def _signal(frame: VideoFrame) -> NDArray[np.float32]:  # [H, W, 3]
+    """R'G'B' of a Y'CbCr frame, tone-mapped to sRGB where it is HDR.
+
+    swscale only brings chroma to full resolution, at the stream's own depth and range: its matrix
+    tables are up to several levels off.
+    """
+    bits = max(component.bits for component in frame.format.components)
+    full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
+    layout = "yuv444p" if bits == 8 else "yuv444p16le"
+    side = _FULL_RANGE if full else 1
+    planar = frame.reformat(
+        format=layout, src_color_range=side, dst_color_range=side, interpolation="BICUBIC"
+    )
+    yuv = np.stack([_plane(plane, np.uint8 if bits == 8 else np.uint16) for plane in planar.planes])
+    matrix = _MATRICES.get(
+        int(frame.colorspace), "bt709" if min(frame.width, frame.height) >= 720 else "bt601"
+    )
+    rgb = rgb_from_yuv(yuv, matrix, 8 if bits == 8 else 16, full_range=full)
+    transfer = _TRANSFERS.get(int(frame.color_trc))
+    return rgb if transfer is None else srgb_from_hdr(np.clip(rgb, 0, 1), transfer)
+
+
+def _plane(plane: VideoPlane, code: type[np.uint8] | type[np.uint16]) -> NDArray[np.float32]:  # [H, W]
+    """The code values of a plane, without the padding at the end of its lines."""
+    rows = np.frombuffer(memoryview(plane), np.dtype(code)).reshape(plane.height, -1)
+    return np.asarray(rows[:, : plane.width], np.float32)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open the first video stream; every FFmpeg error inside the block becomes an InputError."""
+    try:
+        if path.stat().st_size == 0:
+            raise InputError(f"{path.name} is empty (zero bytes)", hint=_HINT)
+        with av.open(path) as container:
+            if not container.streams.video:
+                raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
+            yield container, container.streams.video[0]
+    except (av.error.FFmpegError, OSError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{path.name} cannot be read as a video: {reason}", hint=_HINT) from error
+
+
+def _broken(path: Path, frames: int, stream: VideoStream) -> InputError:
+    whole = f" of {stream.frames}" if stream.frames else ""
+    return InputError(f"{path.name} is damaged or breaks off after {frames}{whole} frames", hint=_HINT)
+
+
+def _edited(stream: VideoStream) -> bool:
+    """Whether an edit list hides frames (the container counts them, the demuxer drops them)."""
+    return stream.start_time is not None and stream.start_time < 0

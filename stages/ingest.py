@@ -1,0 +1,86 @@
+"""Ingest: a capture becomes undistorted frames with poses, and the sparse points that each frame observes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cleargs.capture import layout
+from cleargs.capture.config import IngestConfig
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+
+VERSION = 1
+CONFIG = IngestConfig
+INPUTS: Mapping[str, tuple[str, ...]] = {}
+OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
+LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy")
+
+
+def externals(config: IngestConfig, source: Path) -> Mapping[str, Path]:
+    """The files and folders of the capture that are read."""
+    return layout.externals(source, config)
+
+
+def estimate(context: StageContext[IngestConfig]) -> Estimate:
+    """From the number of frames, their size, and the number of pairs to match (measured on two cores)."""
+    from cleargs.capture.sources import open_capture
+
+    config = context.config
+    capture = open_capture(context.source, config)
+    count = len(capture.frames)
+    distant = count * (2 * config.overlap + config.loop_candidates)
+    pairs = count * (count - 1) / 2 if count < config.exhaustive_below else distant
+    megapixels = 0.65 * (max(config.feature_size, config.max_size) / 1000) ** 2
+    found_anew = capture.model is None
+    # Seconds of one core: a frame's features, a pair's matches, a frame's share of the mapping.
+    parallel = (2.0 * megapixels * count + 0.07 * pairs) if found_anew else 0.0
+    alone = count * (0.4 * megapixels + (0.0 if capture.posed else 0.5))
+    seconds = parallel / max(1, context.threads) + alone
+    disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if found_anew else 0.0)
+    return Estimate(minutes=seconds / 60, memory_gb=0.4 + 0.001 * count, disk_gb=disk)
+
+
+def run(context: StageContext[IngestConfig]) -> StageResult:
+    """Choose frames, make them upright and small, find or take their poses, undistort, publish."""
+    from cleargs.capture.holdout import held_out
+    from cleargs.capture.prepare import prepare
+    from cleargs.capture.publish import publish
+    from cleargs.capture.sfm import reconstruct
+    from cleargs.capture.sources import open_capture
+    from cleargs.media.image import read_rgb
+
+    config, work, reporter = context.config, context.checkpoints, context.reporter
+    capture = open_capture(context.source, config)
+    reporter.info(
+        f"{len(capture.frames)} of {capture.n_available} frames ({capture.kind}), "
+        f"long side at most {config.max_size} px"
+    )
+    if capture.hdr is not None:
+        reporter.warn(
+            f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
+            "highlights bent; record in SDR where colours must be exact"
+        )
+    frames = prepare(capture, work, max(config.feature_size, config.max_size), reporter)
+    scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
+    registered = {image.name for image in scene.model.images.values()}
+    test = held_out(
+        config.holdout,
+        [frame.source.name for frame in frames],
+        lambda index: read_rgb(work / "images" / frames[index].image),
+        [frame.image in registered for frame in frames],
+    )
+    model = publish(frames, scene.model, test, work, context.out, config.max_size, reporter)
+    return StageResult(
+        summary={
+            "kind": capture.kind,
+            "poses": "input" if capture.posed else "sfm",
+            "frames": len(frames),
+            "frames_available": capture.n_available,
+            "registered": len(model.images),
+            "test": len(test),
+            "points": len(model.point_ids),
+            "observations": sum(len(image.point_ids) for image in model.images.values()),
+            "mean_reprojection_error_px": round(float(model.error.mean()), 6),
+            "similarity": scene.similarity.to_json(),
+        }
+    )

@@ -1,0 +1,139 @@
+"""Inputs that cannot be used: an error of one line with a remedy, and nothing that passes for done."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from cleargs.capture.config import IngestConfig
+from cleargs.capture.sources import open_capture
+from cleargs.errors import CleargsError, InputError
+
+from .conftest import HEIGHT, WIDTH, Ingest, camera_to_world, write_transforms
+
+
+def refused(caught: pytest.ExceptionInfo[CleargsError]) -> bool:
+    """One line of cause, one of remedy."""
+    return "\n" not in str(caught.value) and bool(caught.value.hint) and "\n" not in caught.value.hint
+
+
+def edit_transforms(folder: Path, change: Any) -> None:
+    path = folder / "transforms.json"
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda d: d["frames"][3]["transform_matrix"][0].__setitem__(3, float("nan")),
+            "pose of images/003.png",
+        ),
+        (lambda d: d["frames"][3].pop("transform_matrix"), "images/003.png has no pose"),
+        (lambda d: d["frames"][3].__setitem__("transform_matrix", [[1, 2], [3, 4]]), "4x4"),
+        (lambda d: d["frames"][3].__setitem__("transform_matrix", "none"), "matrix of numbers"),
+        (lambda d: d["frames"][3].__setitem__("transform_matrix", np.zeros((4, 4)).tolist()), "rotation"),
+        (lambda d: d["frames"][3].__setitem__("file_path", "images/nowhere.png"), "images/nowhere.png"),
+        (lambda d: d.pop("frames"), "frames"),
+        (lambda d: d.__setitem__("frames", 7), "frames"),
+        (lambda d: d.__setitem__("fl_x", "long"), "camera"),
+        (lambda d: d.__setitem__("fl_x", -5), "focal length"),
+        (lambda d: d.__setitem__("k1", float("inf")), "not finite"),
+        (lambda d: d.__setitem__("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+        (lambda d: d.__setitem__("w", 999), "proportions"),
+        (lambda d: d.__setitem__("frames", d["frames"][:2]), "at least 3"),
+    ],
+)
+def test_bad_transforms(posed: Path, ingest: Ingest, change: Any, words: str) -> None:
+    edit_transforms(posed, change)
+    with pytest.raises(InputError, match=words) as caught:
+        ingest(posed)
+    assert refused(caught)
+
+
+def test_damaged_json(posed: Path, ingest: Ingest) -> None:
+    (posed / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(InputError, match="cannot read"):
+        ingest(posed)
+
+
+def test_cameras_that_do_not_move(posed: Path, ingest: Ingest) -> None:
+    poses = camera_to_world(10)
+    for pose in poses:
+        pose[:3, 3] = 1.0
+    write_transforms(posed, poses)
+    with pytest.raises(InputError, match="same place"):
+        ingest(posed)
+
+
+def test_zero_byte_and_broken_images(images: Path, ingest: Ingest) -> None:
+    (images / "view4.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"view4\.png is empty") as caught:
+        ingest(images, "one")
+    assert refused(caught)
+    (images / "view4.png").write_bytes(b"not a picture at all")
+    with pytest.raises(InputError, match=r"view4\.png is not an image"):
+        ingest(images, "two")
+
+
+def test_mixed_sizes(images: Path, ingest: Ingest) -> None:
+    picture = cv2.imread(str(images / "view4.png"))
+    cv2.imwrite(str(images / "view4.png"), cv2.resize(picture, (WIDTH // 2, HEIGHT // 2)))
+    with pytest.raises(InputError, match="2 sizes") as caught:
+        ingest(images)
+    assert "ingest.shared_camera=false" in caught.value.hint
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_images(images: Path, count: int) -> None:
+    for path in sorted(images.iterdir())[count:]:
+        path.unlink()
+    with pytest.raises(InputError, match="no images" if count == 0 else "at least 3") as caught:
+        open_capture(images, IngestConfig())
+    assert refused(caught)
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        open_capture(tmp_path / "nowhere", IngestConfig())
+
+
+def test_damaged_colmap_model(posed: Path, ingest: Ingest) -> None:
+    project = ingest(posed, "first").out
+    sparse = project / "colmap" / "sparse" / "0"
+    whole = {path: path.read_bytes() for path in sparse.iterdir()}
+    for path, data in whole.items():
+        path.write_bytes(data[: len(data) // 2])
+        with pytest.raises(InputError, match="cannot read the COLMAP model") as caught:
+            open_capture(project, IngestConfig())
+        assert refused(caught)
+        path.write_bytes(data)
+    images = bytearray(whole[sparse / "images.bin"])
+    struct.pack_into("<d", images, 12, float("nan"))
+    (sparse / "images.bin").write_bytes(images)
+    with pytest.raises(InputError, match="not finite"):
+        open_capture(project, IngestConfig())
+    (sparse / "images.bin").write_bytes(whole[sparse / "images.bin"])
+    (project / "images" / "000005.png").unlink()
+    with pytest.raises(InputError, match=r"000005\.png"):
+        open_capture(project, IngestConfig())
+    assert open_capture(project, IngestConfig(poses="sfm")).kind == "images"
+
+
+def test_inputs_stay_as_they_are(posed: Path, ingest: Ingest) -> None:
+    before = {
+        path: (path.stat().st_mtime_ns, path.read_bytes()) for path in posed.rglob("*") if path.is_file()
+    }
+    ingest(posed)
+    after = {
+        path: (path.stat().st_mtime_ns, path.read_bytes()) for path in posed.rglob("*") if path.is_file()
+    }
+    assert before == after

@@ -1,0 +1,114 @@
+"""The child process: it may abort, it can be killed, and it does not outlive its parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cleargs.capture.child import run_child
+from cleargs.errors import StageError
+from cleargs.progress import SilentReporter
+
+PREAMBLE = """
+import os, sys, time
+from pathlib import Path
+from cleargs.capture.child import ChildChannel
+channel = ChildChannel.open()
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module of that name for the child, to be filled by the test."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path / "child_under_test.py"
+
+
+def run(module: Path) -> None:
+    run_child(module.stem, module.with_suffix(".json"), module.with_suffix(".log"), 1, SilentReporter())
+
+
+def test_a_failed_check_becomes_an_error(module: Path) -> None:
+    module.write_text(PREAMBLE + "import pycolmap\npycolmap.logging.fatal('the sky fell')\n")
+    with pytest.raises(StageError, match=r"SIGABRT.*the sky fell") as caught:
+        run(module)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_traceback_becomes_an_error(module: Path) -> None:
+    module.write_text(PREAMBLE + "raise ValueError('no such thing')\n")
+    with pytest.raises(StageError, match=r"exit 1.*no such thing"):
+        run(module)
+
+
+def test_a_named_error_arrives(module: Path) -> None:
+    module.write_text(PREAMBLE + "channel.phase('x', 2)\nchannel.error('why', 'what')\nsys.exit(3)")
+    with pytest.raises(StageError, match="why") as caught:
+        run(module)
+    assert caught.value.hint == "what"
+
+
+def test_prints_do_not_disturb_the_reports(module: Path) -> None:
+    module.write_text(
+        PREAMBLE + "print('hello'); channel.phase('x', 2); os.system('echo hi'); channel.done(2)"
+    )
+    run(module)
+    assert "hello" in module.with_suffix(".log").read_text()
+
+
+def gone(pid: int) -> bool:
+    """Whether the process ends within ten seconds (a zombie without a parent to wait for it counts as ended)."""
+    for _ in range(200):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_the_child_ends_with_its_parent(module: Path, how: signal.Signals) -> None:
+    # Busy in COLMAP, not in Python: what must be interruptible is C++.
+    module.write_text(
+        PREAMBLE
+        + """
+import pycolmap
+Path(sys.argv[1]).write_text(str(os.getpid()))
+options = pycolmap.SyntheticDatasetOptions()
+options.num_frames_per_rig, options.num_points3D = 200, 20000
+while True:
+    pycolmap.synthesize_dataset(options)
+"""
+    )
+    note = module.with_suffix(".json")
+    parent = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import sys; from pathlib import Path; from cleargs.capture.child import run_child; "
+            "from cleargs.progress import SilentReporter; "
+            f"run_child('{module.stem}', Path({str(note)!r}), Path({str(note) + '.log'!r}), 1, SilentReporter())",
+        ],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        for _ in range(400):
+            if note.exists() and note.read_text():
+                break
+            time.sleep(0.05)
+        child = int(note.read_text())
+        os.kill(parent.pid, how)
+        parent.wait(timeout=10)
+        assert gone(child)
+    finally:
+        parent.kill()

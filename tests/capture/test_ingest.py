@@ -1,0 +1,237 @@
+"""The stage as a whole, on a small synthetic capture whose geometry is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cleargs.capture.cameras import Pose
+from cleargs.capture.model import read_model
+from cleargs.capture.tables import Frame, load_frames, load_observations, load_points
+from cleargs.errors import InputError, StageError
+
+from .conftest import FOCAL, HEIGHT, PLANES, WIDTH, Ingest, camera_to_world, write_transforms
+
+TABLES = ("frames.parquet", "points.parquet", "observations.parquet")
+
+
+def pose_of(frame: Frame) -> Pose:
+    values = [frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz]
+    numbers = np.array(values, np.float64)
+    return Pose.from_quaternion(numbers[:4], numbers[4:])
+
+
+def same_bytes(first: Path, second: Path) -> bool:
+    files = [*TABLES, *(f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))]
+    return all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
+
+
+def back_to_input(out_similarity: dict[str, object], xyz: np.ndarray) -> np.ndarray:
+    scale, rotation, translation = (np.array(out_similarity[k]) for k in ("scale", "rotation", "translation"))
+    return np.asarray(scale * xyz @ rotation.T + translation)
+
+
+def test_given_poses_give_true_points(posed: Path, ingest: Ingest) -> None:
+    done = ingest(posed)
+    frames, points = load_frames(done.out), load_points(done.out)
+    summary = done.result.summary
+    assert summary["poses"] == "input" and summary["registered"] == len(frames) == 10
+    centres = np.stack([pose_of(frame).centre for frame in frames])
+    assert np.allclose(centres.mean(axis=0), 0, atol=1e-12)
+    assert np.isclose(np.linalg.norm(centres, axis=1).max(), 1)
+    up = -np.stack([pose_of(frame).rotation[1] for frame in frames]).mean(axis=0)
+    assert np.allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
+
+    # transforms.json speaks OpenGL cameras in the scene's own (OpenCV) world, so the way back ends in that.
+    truth = np.stack([pose[:3, 3] for pose in camera_to_world(10)])
+    assert np.allclose(back_to_input(summary["similarity"], centres), truth, atol=1e-9)
+    world = back_to_input(summary["similarity"], points.xyz)
+    distance = np.abs(world[:, 2:] - [depth for depth, *_ in PLANES]).min(axis=1)
+    # Half a pixel at f = 300 over a 1 m baseline is about 2 cm at 4 m.
+    assert len(points.xyz) > 200 and np.median(distance) < 0.01 and np.quantile(distance, 0.9) < 0.05
+
+
+def test_observations_point_at_what_they_see(posed: Path, ingest: Ingest) -> None:
+    done = ingest(posed)
+    frames, points = load_frames(done.out), load_points(done.out)
+    frame_ids, point_ids = load_observations(done.out)
+    assert len(set(zip(frame_ids.tolist(), point_ids.tolist(), strict=True))) == len(frame_ids)
+    assert [frame.n_points for frame in frames] == np.bincount(frame_ids, minlength=10).tolist()
+    lengths = dict(zip(*np.unique(point_ids, return_counts=True), strict=True))
+    assert [lengths[point] for point in points.point_id] == points.track_length.tolist()
+    # The exported model of the undistorted world agrees: every observation lies where its point projects.
+    model = read_model(done.out / "colmap" / "sparse" / "0")
+    residuals = []
+    for frame in frames:
+        image = model.images[frame.frame_id + 1]
+        assert image.name == Path(frame.image).name
+        pose = pose_of(frame)
+        xyz = points.xyz[np.searchsorted(points.point_id, image.point_ids)]
+        camera = xyz @ pose.rotation.T + pose.translation
+        uv = camera[:, :2] / camera[:, 2:] * [frame.fx, frame.fy] + [frame.cx, frame.cy]
+        residuals.append(np.linalg.norm(uv - image.xy, axis=1))
+    assert np.concatenate(residuals).mean() < 1
+    # A point's colour is the mean over its frames: near the pixel of any of them on these matt planes.
+    frame = frames[4]
+    picture = cv2.imread(str(done.out / frame.image))[..., ::-1]
+    seen = model.images[frame.frame_id + 1]
+    x, y = seen.xy.astype(int).T
+    rgb = points.rgb[np.searchsorted(points.point_id, seen.point_ids)]
+    assert np.abs(picture[y, x].astype(int) - rgb).mean() < 15
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, 1e6), (1e4, 0.0), (1e-4, 0.0)])
+def test_the_input_world_does_not_matter(
+    posed: Path, ingest: Ingest, frames: list[tuple[np.ndarray, np.ndarray]], scale: float, shift: float
+) -> None:
+    plain = ingest(posed, "plain")
+    moved = []
+    for pose, _ in frames:
+        matrix = pose.copy()
+        matrix[:3, 3] = scale * matrix[:3, 3] + shift
+        moved.append(matrix)
+    write_transforms(posed, moved)
+    other = ingest(posed, "moved")
+    for one, two in zip(load_frames(plain.out), load_frames(other.out), strict=True):
+        assert np.allclose(pose_of(one).rotation, pose_of(two).rotation, atol=1e-5)
+        assert np.allclose(pose_of(one).translation, pose_of(two).translation, atol=1e-5)
+    first, second = load_points(plain.out), load_points(other.out)
+    assert np.array_equal(first.point_id, second.point_id)
+    assert np.allclose(first.xyz, second.xyz, rtol=1e-5, atol=1e-5)
+    assert np.array_equal(first.rgb, second.rgb)
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(load_observations(plain.out), load_observations(other.out), strict=True)
+    )
+
+
+def test_sfm_finds_the_arc(images: Path, ingest: Ingest) -> None:
+    done = ingest(images, "sfm", threads=2)
+    frames = load_frames(done.out)
+    assert [frame.name for frame in frames] == [f"view{index}.png" for index in range(10)]
+    assert done.result.summary["poses"] == "sfm" and all(frame.registered for frame in frames)
+    found = np.stack([pose_of(frame).centre for frame in frames])
+    truth = np.stack([pose[:3, 3] for pose in camera_to_world(10)])
+    # Umeyama: the best similarity from one to the other.
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    d = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    aligned = (s * np.diag(d)).sum() / (a**2).sum() * a @ (u @ d @ vt).T
+    assert np.linalg.norm(aligned - b, axis=1).max() < 0.05  # of an arc 2.4 long
+
+    again = ingest(images, "again", threads=1)
+    assert same_bytes(done.out, again.out)
+
+
+def test_sequential_matching_is_reproducible(images: Path, ingest: Ingest) -> None:
+    settings = {"exhaustive_below": 0, "overlap": 2, "loop_candidates": 2}
+    one, two = (ingest(images, f"t{threads}", threads=threads, **settings) for threads in (1, 2))
+    assert one.result.summary["registered"] == 10
+    assert same_bytes(one.out, two.out)
+
+
+def test_poses_can_be_ignored(posed: Path, ingest: Ingest) -> None:
+    (posed / "transforms.json").write_text(
+        json.dumps({"frames": [{"file_path": f"images/{i:03d}"} for i in range(10)]})
+    )
+    assert ingest(posed, poses="sfm").result.summary["poses"] == "sfm"
+    with pytest.raises(InputError, match="fl_x"):
+        ingest(posed, "auto")
+
+
+def test_own_result_is_a_colmap_project(posed: Path, ingest: Ingest) -> None:
+    first = ingest(posed, "first")
+    (first.out / "images" / "999.png").write_bytes((first.out / "images" / "000003.png").read_bytes())
+    second = ingest(first.out, "second")
+    frames = load_frames(second.out)
+    assert second.result.summary["kind"] == "colmap"
+    # An image that the model does not know stays in the table, unregistered, with the shared camera.
+    assert [frame.registered for frame in frames] == [True] * 10 + [False]
+    assert frames[-1].qw is None and frames[-1].n_points == 0 and frames[-1].fx == frames[0].fx
+    one, two = load_points(first.out), load_points(second.out)
+    assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
+    assert np.array_equal(one.rgb, two.rgb)
+
+
+def test_resize_keeps_the_rays(posed: Path, ingest: Ingest) -> None:
+    frame = load_frames(ingest(posed, max_size=160, feature_size=320).out)[0]
+    assert (frame.width, frame.height) == (160, 120)
+    assert np.allclose(
+        [frame.fx, frame.fy, frame.cx, frame.cy], [FOCAL / 2, FOCAL / 2, WIDTH / 4, HEIGHT / 4]
+    )
+
+
+def test_test_frames_give_no_colour(posed: Path, ingest: Ingest) -> None:
+    # The held-out frame is painted red and black, pixel for pixel where it can still be matched.
+    plain = load_points(ingest(posed, "plain").out)
+    path = posed / "images" / "004.png"
+    held = ingest(posed, "held", holdout="004")
+    frames = load_frames(held.out)
+    assert [frame.split for frame in frames] == ["train"] * 4 + ["test"] + ["train"] * 5
+    assert frames[4].registered and frames[4].n_points > 0
+    # The colour of a point is the mean over its train frames, recomputed here from the published images.
+    model = read_model(held.out / "colmap" / "sparse" / "0")
+    points = load_points(held.out)
+    sums, counts = np.zeros((len(points.xyz), 3)), np.zeros(len(points.xyz))
+    for frame in frames:
+        if frame.split == "train":
+            image = model.images[frame.frame_id + 1]
+            rows = np.searchsorted(points.point_id, image.point_ids)
+            x, y = image.xy.astype(int).T
+            sums[rows] += cv2.imread(str(held.out / frame.image))[..., ::-1][y, x]
+            counts[rows] += 1
+    assert counts.min() >= 1
+    assert np.array_equal(points.rgb, np.rint(sums / counts[:, None]).astype(np.uint8))
+    assert path.is_file() and len(points.xyz) <= len(plain.xyz)
+
+
+def test_masks_follow_their_images(posed: Path, ingest: Ingest) -> None:
+    (posed / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    for index in range(10):
+        cv2.imwrite(str(posed / "masks" / f"{index:03d}.png"), mask)
+    done = ingest(posed, max_size=160, feature_size=320)
+    frames = load_frames(done.out)
+    published = cv2.imread(str(done.out / str(frames[0].mask)), cv2.IMREAD_UNCHANGED)
+    assert published.shape == (120, 160) and set(np.unique(published)) == {0, 255}
+    assert (published[:, :80] == 0).all() and (published[:, 80:] == 255).all()
+    model = read_model(done.out / "colmap" / "sparse" / "0")
+    assert min(image.xy[:, 0].min() for image in model.images.values()) >= 79
+
+
+def test_a_killed_run_goes_on_to_the_same_result(images: Path, ingest: Ingest, tmp_path: Path) -> None:
+    whole = ingest(images, "whole")
+    ingest(images, "resumed")
+    # As if killed after matching and half of the publishing.
+    work, out = tmp_path / "resumed.work", tmp_path / "resumed"
+    for leftover in [*(work / "model").iterdir(), out / "points.parquet", *sorted(out.glob("images/*"))[5:]]:
+        leftover.unlink()
+    (work / "model").rename(work / "model.partial")
+    (work / "images" / "000003.png").unlink()
+    assert same_bytes(whole.out, ingest(images, "resumed").out)
+
+
+def test_few_registered_frames_fail_or_warn(images: Path, ingest: Ingest) -> None:
+    for index in range(10, 14):
+        flat = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+        cv2.imwrite(str(images / f"view{index}.png"), flat)
+    done = ingest(images, min_registered=0.5)
+    assert [frame.registered for frame in load_frames(done.out)] == [True] * 10 + [False] * 4
+    assert not done.warnings
+    with pytest.raises(StageError, match="only 10 of 14") as caught:
+        ingest(images, "strict", min_registered=0.9)
+    assert "ingest.camera_model" in caught.value.hint
+
+
+def test_textureless_frames(tmp_path: Path, ingest: Ingest) -> None:
+    folder = tmp_path / "grey"
+    folder.mkdir()
+    for index in range(5):
+        cv2.imwrite(str(folder / f"{index}.png"), np.full((HEIGHT, WIDTH, 3), 100 + index, np.uint8))
+    with pytest.raises(StageError, match="could be matched"):
+        ingest(folder)

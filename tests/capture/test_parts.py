@@ -1,0 +1,285 @@
+"""The pure parts: cameras, models, pairs, hold-out, choosing frames, undistortion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from cleargs.capture.cameras import Camera, Pose, pinhole
+from cleargs.capture.config import IngestConfig
+from cleargs.capture.holdout import held_out, sharpness
+from cleargs.capture.layout import externals
+from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
+from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.capture.sources import choose_times, natural_key, open_capture, spread
+from cleargs.capture.transforms import read_transforms
+from cleargs.capture.undistort import undistorter
+from cleargs.capture.world import normalise
+from cleargs.errors import InputError
+from cleargs.media.image import read_rgb
+from cleargs.media.video import Timeline
+
+from .conftest import HEIGHT, WIDTH, texture
+
+LENSES = [
+    Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.15)),
+    Camera("OPENCV", 320, 240, (300.0, 310.0, 155.0, 125.0, 0.12, -0.05, 0.002, -0.001)),
+    Camera("OPENCV_FISHEYE", 320, 240, (150.0, 150.0, 160.0, 120.0, 0.02, -0.01, 0.0, 0.0)),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
+def test_undistorted_pixels_are_where_the_pinhole_says(lens: Camera) -> None:
+    # An image that says where it comes from: red is x, green is y of the lens's own pixels.
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    coded = np.stack([x * 0.75, y, np.full_like(x, 200)], axis=-1).astype(np.uint8)
+    way = undistorter(lens, 960)
+    flat = way.image(coded)
+    size = way.pinhole.width, way.pinhole.height
+    assert flat.shape[1::-1] == size
+    # No empty pixel, not even in the corners.
+    assert flat[..., 2].min() >= 199
+    u, v = np.meshgrid(np.arange(8, size[0] - 8, 25) + 0.5, np.arange(8, size[1] - 8, 25) + 0.5)
+    (fx, fy), (cx, cy) = way.pinhole.focal, way.pinhole.centre
+    rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
+    there = lens.colmap().img_from_cam(rays)
+    seen = flat[v.astype(int).ravel(), u.astype(int).ravel()].astype(float)
+    # The codes are truncated to whole numbers: 1 code is 1.33 px in x and 1 px in y.
+    assert np.abs(seen[:, 0] / 0.75 - there[:, 0]).max() < 2.5
+    assert np.abs(seen[:, 1] - there[:, 1]).max() < 2
+    assert np.allclose(way.points(there), np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-3)
+
+
+def test_a_pinhole_is_not_resampled() -> None:
+    picture = texture(0)[:HEIGHT, :WIDTH]
+    way = undistorter(pinhole(WIDTH, HEIGHT, 300, 300, 150, 130), 960)
+    assert np.array_equal(way.image(picture), picture)
+    half = undistorter(pinhole(WIDTH, HEIGHT, 300, 300, 150, 130), 160)
+    assert half.pinhole == pinhole(160, 120, 150, 150, 75, 65)
+
+
+@given(st.floats(0.1, 3), st.floats(-1, 1), st.integers(0, 2**31))
+@settings(max_examples=30, deadline=None)
+def test_normalised_world(scale: float, tilt: float, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    poses = []
+    for centre in random.normal(size=(6, 3)) * scale + random.normal(size=3) * 10:
+        rotation = cv2.Rodrigues(np.array([tilt, 0, 0]) + 0.2 * random.normal(size=3))[0]
+        poses.append(Pose(rotation, -rotation @ centre))
+    similarity = normalise(poses)
+    moved = [similarity.pose(pose) for pose in poses]
+    centres = np.stack([pose.centre for pose in moved])
+    assert np.allclose(centres.mean(axis=0), 0, atol=1e-9)
+    assert np.isclose(np.linalg.norm(centres, axis=1).max(), 1)
+    up = -np.stack([pose.rotation[1] for pose in moved]).mean(axis=0)
+    assert np.allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-9)
+    assert np.isclose(np.linalg.det(similarity.rotation), 1)
+    back = similarity.to_json()
+    points = random.normal(size=(5, 3))
+    there = similarity.points(points)
+    again = back["scale"] * there @ np.array(back["rotation"]).T + np.array(back["translation"])
+    assert np.allclose(again, points, atol=1e-9)
+    # Cameras see the same: x_camera is the same direction, nearer by the scale.
+    before = points @ poses[0].rotation.T + poses[0].translation
+    after = there @ moved[0].rotation.T + moved[0].translation
+    assert np.allclose(after * similarity.scale, before, atol=1e-9)
+
+
+def test_turning_about_the_half_turn() -> None:
+    # Worlds with y up (OpenGL) need half a turn, whose axis must not hang on rounding errors.
+    rotations = []
+    for error in (1e-15, -1e-15):
+        poses = [
+            Pose(np.diag([1.0, -1.0, -1.0]) + error, np.array([float(index), 0.0, 0.0])) for index in range(3)
+        ]
+        rotations.append(normalise(poses).rotation)
+    assert np.allclose(rotations[0], rotations[1], atol=1e-9)
+
+
+def small_model() -> SparseModel:
+    random = np.random.default_rng(1)
+    ids = np.array([3, 5, 9, 12], np.int64)
+    images = {
+        key: ModelImage(
+            f"a{key}.png",
+            1,
+            Pose.from_quaternion(np.array([1, 0.1, 0.2, 0.0]) / np.sqrt(1.05), random.normal(size=3)),
+            random.random((3, 2)) * 100,
+            ids[key : key + 3] if key else ids[:3],
+        )
+        for key in (0, 1)
+    }
+    images = {key + 1: image for key, image in images.items()}
+    camera = {1: Camera("OPENCV", 100, 80, (90.0, 91.0, 50.0, 40.0, 0.1, 0.0, 0.0, 0.0))}
+    return SparseModel(camera, images, ids, random.normal(size=(4, 3)), random.random(4))
+
+
+def test_models_agree_with_colmap(tmp_path: Path) -> None:
+    model = small_model()
+    rgb = np.arange(12, dtype=np.uint8).reshape(4, 3)
+    write_model(tmp_path / "ours", model, rgb)
+    theirs = pycolmap.Reconstruction(str(tmp_path / "ours"))
+    assert theirs.num_reg_images() == 2 and theirs.num_points3D() == 4
+    assert np.allclose(theirs.points3D[9].xyz, model.xyz[2]) and theirs.points3D[9].track.length() == 2
+    for write, name in ((theirs.write_binary, "binary"), (theirs.write_text, "text")):
+        (tmp_path / name).mkdir()
+        write(str(tmp_path / name))
+        back = read_model(tmp_path / name)
+        assert back.cameras == model.cameras and np.array_equal(back.point_ids, model.point_ids)
+        assert np.allclose(back.xyz, model.xyz) and np.allclose(back.error, model.error)
+        for key, image in model.images.items():
+            assert back.images[key].name == image.name
+            assert np.allclose(back.images[key].xy, image.xy)
+            assert np.array_equal(back.images[key].point_ids, image.point_ids)
+            assert np.allclose(back.images[key].pose.rotation, image.pose.rotation)
+            assert np.allclose(back.images[key].pose.translation, image.pose.translation)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
+def test_resized_camera_scales_its_pixels(lens: Camera) -> None:
+    rays = np.array([[0.2, 0.1, 1.0], [-0.3, 0.2, 1.0]])
+    before = lens.colmap().img_from_cam(rays)
+    after = lens.resized(160, 120).colmap().img_from_cam(rays)
+    assert np.allclose(after, before / 2)
+
+
+def test_pairs() -> None:
+    assert exhaustive_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    near = sequential_pairs(40, 3)
+    assert {j for i, j in near if i == 0} == {1, 2, 3, 4} and max(j for _, j in near) == 39
+    assert {j for i, j in sequential_pairs(200, 6) if i == 0} == {1, 2, 3, 4, 5, 6, 8, 16, 32}
+
+
+def test_loops_join_what_looks_alike() -> None:
+    random = np.random.default_rng(3)
+    # Frames 0 and 10 share most descriptors, as do 1 and 11; all others are unrelated.
+    descriptors = [random.integers(0, 255, (80, 128)).astype(np.uint8) for _ in range(12)]
+    for first, second in ((0, 10), (1, 11)):
+        descriptors[second][:60] = descriptors[first][:60]
+    pairs = loop_pairs(descriptors, 1, 5, seed=0)
+    assert {(0, 10), (1, 11)} <= set(pairs) and all(j - i >= 5 for i, j in pairs)
+    assert loop_pairs([np.zeros((0, 128), np.uint8)] * 12, 1, 5, seed=0) == []
+
+
+def test_holdout_rules() -> None:
+    names = [f"clip/{index:02d}.png" for index in range(12)]
+    everywhere = [True] * 12
+
+    def read(index: int) -> np.ndarray:
+        blur = 1 + 2 * (index % 4)
+        return cv2.GaussianBlur(texture(0, 128), (blur, blur), 0)
+
+    assert held_out("none", names, read, everywhere) == set()
+    assert held_out("every:4", names, read, everywhere) == {0, 4, 8}
+    assert held_out("sharpest:3", names, read, everywhere) == {0, 4, 8}
+    assert held_out("03, clip/05.png,07.png", names, read, everywhere) == {3, 5, 7}
+    assert sharpness(read(0)) > sharpness(read(1)) > sharpness(read(2))
+    # Frames without a pose cannot be test frames by sharpness.
+    assert held_out("sharpest:1", names, read, [index != 0 for index in range(12)]) == {4}
+    with pytest.raises(InputError, match="nowhere"):
+        held_out("nowhere", names, read, everywhere)
+    with pytest.raises(InputError, match="no frame to train"):
+        held_out("every:2", names, read, [index == 0 for index in range(12)])
+
+
+@pytest.mark.parametrize("rule", ["every:1", "every:x", "every:0", "fairest:3", "", " , "])
+def test_unknown_holdout_is_refused(rule: str) -> None:
+    with pytest.raises(ValidationError):
+        IngestConfig(holdout=rule)
+
+
+def test_frames_are_chosen_in_time() -> None:
+    # Ten frames in the first second, then one a second.
+    pts = (*range(0, 100, 10), *range(100, 1001, 100))
+    timeline = Timeline(pts, 0.01, None)
+    assert choose_times(timeline, None, 150) == list(range(20))
+    chosen = [timeline.seconds(index) for index in choose_times(timeline, None, 6)]
+    assert chosen == [0, 2, 4, 6, 8, 10]
+    assert [timeline.seconds(index) for index in choose_times(timeline, 0.5, 150)] == chosen
+    assert len(choose_times(timeline, 1000, 150)) == 20
+    assert [timeline.seconds(index) for index in choose_times(timeline, 1.0, 3)] == [0, 5, 10]
+    assert choose_times(Timeline((7,), 0.01, None), 5.0, 150) == [0]
+
+
+@given(st.integers(1, 300), st.integers(2, 50))
+def test_spread_keeps_order_and_ends(count: int, at_most: int) -> None:
+    chosen = spread(range(count), at_most)
+    assert len(chosen) == min(count, at_most) and chosen[0] == 0 and chosen[-1] == count - 1
+    gaps = np.diff(chosen)
+    assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
+
+
+def test_natural_order(images: Path) -> None:
+    (images / "view10.png").write_bytes((images / "view0.png").read_bytes())
+    (images / "notes.txt").write_text("not a picture")
+    names = [frame.name for frame in open_capture(images, IngestConfig()).frames]
+    assert names == [f"view{index}.png" for index in range(11)]
+    assert sorted(["b2", "B10", "a"], key=natural_key) == ["a", "b2", "B10"]
+
+
+def test_exif_orientation(tmp_path: Path) -> None:
+    picture = np.zeros((40, 60, 3), np.uint8)
+    picture[:20, :30] = 255  # bright at the top left, as stored
+    ok, jpeg = cv2.imencode(".jpg", picture)
+    assert ok
+    # A minimal EXIF block: one entry, orientation 6 (turn clockwise for display).
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    body = b"Exif\0\0" + tiff
+    path = tmp_path / "turned.jpg"
+    data = jpeg.tobytes()
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
+    upright = read_rgb(path)
+    assert upright.shape == (60, 40, 3)
+    assert upright[10, 30].min() > 200 and upright[10, 10].max() < 50  # bright at the top right
+    assert read_rgb(path, upright=False).shape == (40, 60, 3)
+
+
+@pytest.mark.parametrize(
+    ("extra", "model", "params"),
+    [
+        ({"fl_x": 300, "cx": 150, "cy": 110}, "PINHOLE", (300, 300, 150, 110)),
+        ({"camera_angle_x": 2 * np.arctan(0.5)}, "PINHOLE", (320, 320, 160, 120)),
+        ({"fl_x": 300, "fl_y": 310, "k1": 0.1, "p2": 0.01}, "OPENCV", (300, 310, 160, 120, 0.1, 0, 0, 0.01)),
+        (
+            {"fl_x": 300, "k1": 0.1, "k4": 0.2, "camera_model": "OPENCV_FISHEYE"},
+            "OPENCV_FISHEYE",
+            (300, 300, 160, 120, 0.1, 0, 0, 0.2),
+        ),
+        (
+            {"fl_x": 300, "k1": 0.1, "k3": 0.3},
+            "FULL_OPENCV",
+            (300, 300, 160, 120, 0.1, 0, 0, 0, 0.3, 0, 0, 0),
+        ),
+    ],
+)
+def test_forms_of_transforms(images: Path, extra: dict, model: str, params: tuple[float, ...]) -> None:
+    entry = {"file_path": "./view0", "transform_matrix": np.eye(4).tolist()}
+    # The frame's own entries count before those of the file; extensions may be missing.
+    data = {"w": 1, "h": 1, "frames": [entry | {"w": WIDTH, "h": HEIGHT}]} | extra
+    path = images / "transforms.json"
+    path.write_text(json.dumps(data))
+    (frame,) = read_transforms(path, poses=True)
+    assert frame.camera is not None and frame.pose is not None
+    assert frame.camera.model == model and np.allclose(frame.camera.params, params)
+    assert frame.path == images / "view0.png" and frame.name == "view0.png"
+    # OpenGL looks along -z with y up: the identity turns y and z.
+    assert np.allclose(frame.pose.rotation, np.diag([1, -1, -1]))
+
+
+def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
+    config = IngestConfig()
+    assert externals(posed, config) == {"transforms": posed / "transforms.json", "images": posed / "images"}
+    assert externals(images, config) == {"capture": images}
+    assert externals(images / "view0.png", config) == {"capture": images / "view0.png"}
+    (posed / "masks").mkdir()
+    (posed / "notes").mkdir()
+    assert externals(posed, config)["masks"] == posed / "masks"
+    assert set(externals(posed, config)) == {"transforms", "images", "masks"}

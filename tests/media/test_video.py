@@ -1,0 +1,236 @@
+"""Videos: colours, presentation times, rotation, damage."""
+
+from __future__ import annotations
+
+import struct
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+from cleargs.media.colour import (
+    KNEE,
+    LUMA,
+    linear_from_srgb,
+    srgb_from_hdr,
+    srgb_from_linear,
+    tone_map,
+)
+from cleargs.media.video import decode_frames, read_timeline
+
+# EBU bars at 75 %, with greys and a saturated red, in sRGB code values.
+BARS = np.array(
+    [
+        (191, 191, 191), (191, 191, 0), (0, 191, 191), (0, 191, 0),
+        (191, 0, 191), (191, 0, 0), (0, 0, 191), (16, 16, 16), (255, 255, 255), (255, 0, 0),
+    ],
+    np.float64,
+)  # fmt: skip
+BAR_WIDTH = 16
+MATRIX_CODE = {"bt709": 1, "bt601": 5, "bt2020": 9}
+
+
+def bar_planes(
+    matrix: str, full_range: bool, bits: int = 8, colours: NDArray[np.float64] = BARS
+) -> list[NDArray]:
+    """4:2:0 planes of vertical bars, by the forward equations of the standard."""
+    kr, kb = LUMA[matrix]
+    r, g, b = (colours / 255).T
+    y = kr * r + (1 - kr - kb) * g + kb * b
+    u, v = (b - y) / (2 * (1 - kb)), (r - y) / (2 * (1 - kr))
+    step = 2 ** (bits - 8)
+    if full_range:
+        peak = 2**bits - 1
+        codes = [y * peak, u * peak + 128 * step, v * peak + 128 * step]
+    else:
+        codes = [(16 + 219 * y) * step, (128 + 224 * u) * step, (128 + 224 * v) * step]
+    dtype = np.uint8 if bits == 8 else np.uint16
+    rounded = [np.clip(np.rint(code), 0, 2**bits - 1).astype(dtype) for code in codes]
+    width = (BAR_WIDTH, BAR_WIDTH // 2, BAR_WIDTH // 2)
+    return [
+        np.tile(np.repeat(code, w), (height, 1))
+        for code, w, height in zip(rounded, width, (64, 32, 32), strict=True)
+    ]
+
+
+def encode(
+    path: Path,
+    planes: list[NDArray],
+    *,
+    codec: str = "ffv1",
+    pixel: str = "yuv420p",
+    matrix: int = 1,
+    color_range: int = 1,
+    transfer: int = 1,
+    pts: tuple[int, ...] = (0, 1, 2),
+    options: dict[str, str] | None = None,
+) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options=options or {})
+        stream.width, stream.height, stream.pix_fmt = planes[0].shape[1], planes[0].shape[0], pixel
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 90)
+        context = stream.codec_context
+        context.colorspace, context.color_range, context.color_trc = matrix, color_range, transfer
+        context.color_primaries = 9 if matrix == 9 else 1
+        for index, stamp in enumerate(pts):
+            moved = [
+                np.roll(plane, index * plane.shape[1] // planes[0].shape[1] * 2, axis=1) for plane in planes
+            ]
+            frame = av.VideoFrame(planes[0].shape[1], planes[0].shape[0], pixel)
+            for plane, values in zip(frame.planes, moved, strict=True):
+                row = plane.line_size // values.itemsize
+                buffer = np.zeros((values.shape[0], row), values.dtype)
+                buffer[:, : values.shape[1]] = values
+                plane.update(buffer.tobytes())
+            frame.pts, frame.time_base = stamp, Fraction(1, 90)
+            frame.colorspace, frame.color_range, frame.color_trc = matrix, color_range, transfer
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def bar_centres(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """The colour in the middle of each bar, away from the chroma's transitions."""
+    return rgb[32, BAR_WIDTH // 2 :: BAR_WIDTH].astype(np.float64)
+
+
+@pytest.mark.parametrize("matrix", ["bt709", "bt601", "bt2020"])
+@pytest.mark.parametrize("full_range", [False, True])
+def test_colour_bars_come_back(tmp_path: Path, matrix: str, full_range: bool) -> None:
+    path = tmp_path / "bars.mkv"
+    encode(
+        path, bar_planes(matrix, full_range), matrix=MATRIX_CODE[matrix], color_range=2 if full_range else 1
+    )
+    timeline = read_timeline(path)
+    _, rgb = next(decode_frames(path, timeline.pts[:1]))
+    # Rounding Y'CbCr to 8 bits costs up to 1.5 levels (BT.2020 limited the most).
+    assert np.abs(bar_centres(rgb) - BARS).max() <= 2
+
+
+def test_colour_bars_through_h264(tmp_path: Path) -> None:
+    path = tmp_path / "bars.mp4"
+    encode(path, bar_planes("bt709", False), codec="libx264", options={"crf": "4", "preset": "ultrafast"})
+    _, rgb = next(decode_frames(path, read_timeline(path).pts[:1]))
+    # One level more for the codec's own loss.
+    assert np.abs(bar_centres(rgb) - BARS).max() <= 3
+
+
+def test_ten_bits_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "bars10.mkv"
+    encode(path, bar_planes("bt709", False, bits=10), pixel="yuv420p10le")
+    _, rgb = next(decode_frames(path, read_timeline(path).pts[:1]))
+    assert np.abs(bar_centres(rgb) - BARS).max() <= 1
+
+
+@pytest.mark.parametrize(("transfer", "code"), [("hlg", 18), ("pq", 16)])
+def test_hdr_is_tone_mapped(tmp_path: Path, transfer: str, code: int) -> None:
+    path = tmp_path / "hdr.mkv"
+    planes = bar_planes("bt2020", False, bits=10)
+    encode(path, planes, pixel="yuv420p10le", matrix=9, transfer=code)
+    timeline = read_timeline(path)
+    assert timeline.transfer == transfer
+    _, rgb = next(decode_frames(path, timeline.pts[:1]))
+    expected = np.rint(srgb_from_hdr(BARS[None] / 255, transfer)[0] * 255)
+    assert np.abs(bar_centres(rgb) - expected).max() <= 2
+
+
+def test_hdr_reference_white_and_curve() -> None:
+    # BT.2408: reference white is 58 % of PQ and 75 % of HLG; the curve brings it to 0.8 linear.
+    white = KNEE + (1 - KNEE) / 2
+    for transfer, signal in (("pq", 0.5807), ("hlg", 0.75)):
+        grey = srgb_from_hdr(np.full((1, 1, 3), signal), transfer)
+        assert np.abs(linear_from_srgb(grey) - white).max() < 0.005
+    light = np.linspace(0, 50, 2000)[:, None] * np.array([1.0, 0.5, 0.25])
+    mapped = tone_map(light)
+    assert (np.diff(mapped[:, 0]) > 0).all() and mapped.max() < 1
+    assert np.allclose(mapped[light[:, 0] <= KNEE], light[light[:, 0] <= KNEE])
+
+
+def test_srgb_curve_inverts() -> None:
+    values = np.linspace(0, 1, 1001)
+    assert np.abs(srgb_from_linear(linear_from_srgb(values)) - values).max() < 1e-7
+
+
+def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
+    path = tmp_path / "vfr.mkv"
+    stamps = (0, 9, 12, 60, 180)
+    encode(path, bar_planes("bt709", False), pts=stamps)
+    timeline = read_timeline(path)
+    times = [timeline.seconds(index) for index in range(len(timeline.pts))]
+    # Matroska keeps milliseconds.
+    assert np.allclose(times, [stamp / 90 for stamp in stamps], atol=1e-3)
+
+
+def test_only_wanted_frames_are_yielded(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mkv"
+    encode(path, bar_planes("bt709", False), pts=tuple(range(0, 30, 3)))
+    timeline = read_timeline(path)
+    wanted = timeline.pts[2::3]
+    frames = dict(decode_frames(path, wanted))
+    assert tuple(frames) == wanted
+    assert not np.array_equal(frames[wanted[0]], frames[wanted[1]])
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_rotation_metadata_turns_the_frame(tmp_path: Path, turn: int) -> None:
+    path = tmp_path / "turned.mp4"
+    encode(path, bar_planes("bt709", False), codec="libx264", options={"crf": "4", "preset": "ultrafast"})
+    _, upright = next(decode_frames(path, read_timeline(path).pts[:1]))
+    _write_display_matrix(path, turn)
+    _, turned = next(decode_frames(path, read_timeline(path).pts[:1]))
+    # The matrix says by how much to turn clockwise for display.
+    assert np.array_equal(turned, np.rot90(upright, -turn // 90))
+
+
+def _write_display_matrix(path: Path, clockwise: int) -> None:
+    """Put a rotation into the track header, as phones do (16.16 fixed point, the last column 2.30)."""
+    a, b = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[clockwise]
+    matrix = [a << 16, b << 16, 0, -b << 16, a << 16, 0, 0, 0, 1 << 30]
+    data = bytearray(path.read_bytes())
+    start = data.index(b"tkhd") + 4
+    assert data[start] == 0  # version 0: the matrix follows 40 bytes of other fields
+    struct.pack_into(">9i", data, start + 40, *matrix)
+    path.write_bytes(data)
+
+
+def test_empty_video(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mp4"
+    path.touch()
+    with pytest.raises(InputError, match="empty"):
+        read_timeline(path)
+
+
+@pytest.mark.parametrize("faststart", [True, False])
+def test_truncated_video(tmp_path: Path, faststart: bool) -> None:
+    whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
+    noise = [
+        np.random.default_rng(0).integers(16, 235, plane.shape, np.uint8)
+        for plane in bar_planes("bt709", False)
+    ]
+    encode(whole, noise, codec="libx264", pts=tuple(range(0, 60, 3)), options={"preset": "ultrafast"})
+    if faststart:
+        with (
+            av.open(str(whole)) as source,
+            av.open(str(cut), "w", container_options={"movflags": "faststart"}) as copy,
+        ):
+            stream = copy.add_stream_from_template(source.streams.video[0])
+            for packet in source.demux(video=0):
+                if packet.dts is not None:
+                    packet.stream = stream
+                    copy.mux(packet)
+        data = cut.read_bytes()
+    else:
+        data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    with pytest.raises(InputError, match=r"breaks off|cannot be read|damaged"):
+        read_timeline(cut)
+
+
+def test_not_a_video(tmp_path: Path) -> None:
+    path = tmp_path / "notes.mp4"
+    path.write_text("these are notes")
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        read_timeline(path)
