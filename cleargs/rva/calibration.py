@@ -1,0 +1,77 @@
+"""From raw measures to cues in [0, 1]: the response curves and every constant in them.
+
+Rule behind the blur constants: a frame whose restoration-free training use does little harm should reach the
+paper's R >= 0.70. They were set on sharp photographs blurred in linear light, with noise of 0.7 levels, so
+that R crosses 0.70 near a motion of 6 to 7 px, and 0.35 beyond 20 px, at a long side of 640 px.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cleargs.rva.scores import Floats
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Constants of the cues. Extents are standard deviations of the blur in px at the reduced size."""
+
+    neighbours: int = 4
+    """Frames before and after whose best is taken for what the content itself looks like."""
+    content_extent: float = 0.7
+    """Content explains at most this much blur extent, however soft the neighbours: what sharp photographs show in
+    their worst direction (median 0.6). More would excuse a capture that is blurred throughout."""
+    sharpness_half: float = 1.4
+    """Excess extent in the worst direction at which r_sharpness is 1/2 (a motion of about 5 px)."""
+    structure_half: float = 1.2
+    """Excess extent, mean over the directions, at which r_structure is 1/2."""
+    motion_half: float = 8.0
+    """Length of motion, px, at which b_motion_blur is 1/2."""
+    defocus_half: float = 1.5
+    """Excess extent in the best direction at which b_defocus is 1/2 (a disk of radius 3 px)."""
+    steepness: float = 3.0
+    """Exponent of the blur curves."""
+    detail_floor: float = 3.0
+    """Fine detail that a capture of plain step edges reaches; a softer best neighbour does not excuse a
+    frame.
+    """
+    detail_range: tuple[float, float] = (0.10, 0.75)
+    """Share of the best neighbour's fine detail at which r_texture is 0 and 1: content alone varies by a
+    quarter.
+    """
+    contrast_range: tuple[float, float] = (0.02, 0.10)
+    """Spread of the luma (of 1) at which texture is not to be relied on at all, and fully."""
+    noise_half: float = 8.0
+    """Noise, levels of 255, at which r_cleanness is 1/2."""
+    blocking_half: float = 4.0
+    """Blocking at which the artifacts cue is 1/2; videos of good quality stay below 2."""
+    ringing_half: float = 10.0
+    """Ringing, levels, at which the artifacts cue is 1/2."""
+    ghost_content: float = 0.10
+    """Content explains at most this height of a cepstral side peak, however high the neighbours'."""
+    ghost_range: tuple[float, float] = (0.04, 0.16)
+    """Excess of the side peak at which b_ghosting is 0 and 1."""
+    clipped_range: tuple[float, float] = (0.10, 0.50)
+    """Share of clipped pixels, beyond that of the least clipped neighbour, at which exposure is good and
+    lost.
+    """
+    dark_range: tuple[float, float] = (0.20, 0.04)
+    """Mean luma (of 1) at which darkness begins to hurt and exposure is lost."""
+    bright_range: tuple[float, float] = (0.70, 0.95)
+    """Mean luma at which brightness begins to hurt and exposure is lost."""
+    stops_range: tuple[float, float] = (0.4, 2.0)
+    """Jump of the mean luma from the neighbours' median, in factors of two, that is harmless, and that is
+    failure.
+    """
+
+
+def ramp(value: Floats, ends: tuple[float, float]) -> Floats:
+    """0 at the first end and beyond, 1 at the second, linear between; the ends may fall."""
+    return np.clip((value - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
+
+
+def decay(value: Floats, half: float, steepness: float) -> Floats:
+    """1 at 0, 1/2 at ``half``, towards 0: 1 / (1 + (value / half)^steepness)."""
+    return np.asarray(1.0 / (1.0 + (value / half) ** steepness))

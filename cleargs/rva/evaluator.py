@@ -1,0 +1,53 @@
+"""Who judges the appearance of a frame: the protocol that all evaluators follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from cleargs.progress import Reporter
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.scores import Floats
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame as an evaluator meets it: files, so that nobody has to hold a video in memory."""
+
+    frame_id: int
+    image: Path
+    mask: Path | None = None
+    """8-bit image of the same size; pixels that are 0 in it are ignored."""
+
+
+class Evaluator(Protocol):
+    """Estimates the eleven appearance cues of every frame of a capture."""
+
+    @property
+    def name(self) -> str:
+        """What the user calls it in ``rva.evaluator``."""
+
+    @property
+    def version(self) -> int:
+        """Raised when equal images get other cues."""
+
+    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+        """Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`, for frames given in trajectory order.
+
+        Neighbours in ``views`` are neighbours in the video. Images are read as they are needed: memory does
+        not grow with their number. The result does not depend on ``threads``.
+        """
+
+
+def label(evaluator: Evaluator) -> str:
+    """How the tables name an evaluator."""
+    return f"{evaluator.name}-{evaluator.version}"
+
+
+def make_evaluator(config: RvaConfig) -> Evaluator:
+    """The evaluator that the settings name."""
+    from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
+
+    return StatisticsEvaluator()

@@ -1,0 +1,139 @@
+"""Geometric evidence: coverage gain C, pose diversity D, redundancy O and utility G (paper, Geometric
+Evidence).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.spatial.distance import cdist
+
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.scores import Bools, Floats
+
+Ints = npt.NDArray[np.integer]
+
+_PAIRS_AT_ONCE = 1 << 20
+"""Pairs of frames held in memory at a time (8 MB an array of float64)."""
+
+
+def camera_centres(
+    rotations: Floats,  # [N, 3, 3] world to camera
+    translations: Floats,  # [N, 3]
+) -> Floats:  # [N, 3] in the world
+    """Camera centres -R^T t."""
+    centres: Floats = -np.einsum("nij,ni->nj", rotations, translations)
+    return centres
+
+
+def view_directions(rotations: Floats) -> Floats:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
+    """Optical axes in the world: the third row of R (OpenCV axes, z forward)."""
+    return rotations[:, 2, :]
+
+
+def view_angle(chord: Floats) -> Floats:
+    """Angle between unit vectors, divided by pi, from the length of their difference.
+
+    Unlike arccos of the dot product it is exact at 0 and accurate for small angles.
+    """
+    return np.asarray(2.0 / np.pi * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)))
+
+
+def largest_distance(points: Floats) -> float:  # [N, 3]
+    """Largest distance between any two points; 0 for fewer than two."""
+    return max(
+        (float(cdist(points[rows], points).max()) for rows in _row_blocks(len(points), len(points))),
+        default=0.0,
+    )
+
+
+def pose_diversity(
+    centres: Floats,  # [N, 3]
+    directions: Floats,  # [N, 3] unit vectors
+    reference: Bools,  # [N] the reliable set (or its stand-in)
+    config: RvaConfig,
+) -> Floats:  # D [N] in [0, 1]
+    """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
+
+    d^c is the distance of the camera centres over the largest one in the capture, d^v the view angle over pi.
+    """
+    D = np.zeros(len(centres))
+    others = np.flatnonzero(reference)
+    if not len(others):
+        return D
+    scale = largest_distance(centres)
+    for rows in _row_blocks(len(centres), len(others)):
+        angle = view_angle(cdist(directions[rows], directions[others]))
+        distance = cdist(centres[rows], centres[others]) / scale if scale > 0.0 else np.zeros_like(angle)
+        pair = config.gamma_c * distance + config.gamma_v * angle
+        pair[rows[:, None] == others[None, :]] = 0.0  # j = i: the floor of a maximum of distances
+        D[rows] = pair.max(axis=1)
+    return D
+
+
+def visibility(
+    frame_row: Ints,  # [M] row of the observing frame
+    point_id: Ints,  # [M]
+    n_frames: int,
+) -> sparse.csr_array:  # [N, P] of 0 and 1
+    """The sets P_i as a sparse matrix; a point that a frame lists twice counts once.
+
+    Columns are the points in ascending id, so that sums over points do not depend on the order of the frames.
+    """
+    _, columns = np.unique(point_id, return_inverse=True)
+    n_points = int(columns.max()) + 1 if len(columns) else 0
+    seen = sparse.csr_array(
+        (np.ones(len(columns), dtype=np.int32), (frame_row, columns)),
+        shape=(n_frames, n_points),
+        dtype=np.int32,
+    )
+    seen.sum_duplicates()
+    seen.data[:] = 1
+    return seen
+
+
+def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> C [N] in [0, 1]
+    """C_i: the share of frame i's points, weighted by 1 / sqrt(n_p), that no reference frame sees; 0 without
+    points.
+
+    n_p counts the frames of ``seen`` that observe p.
+    """
+    observers = np.bincount(seen.indices, minlength=seen.shape[1])
+    weight = 1.0 / np.sqrt(np.maximum(observers, 1))
+    covered = np.zeros(seen.shape[1], dtype=bool)
+    covered[seen[reference].indices] = True
+    total = seen @ weight
+    gained = seen @ np.where(covered, 0.0, weight)
+    share: Floats = np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
+    return share
+
+
+def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> O [N] in [0, 1]
+    """O_i = max over reference frames j != i of |P_i and P_j| / |P_i or P_j|; 0 where there is no such j.
+
+    Only pairs that share a point are visited: the work is the sum over points of (observers x reference
+    observers).
+    """
+    largest = np.zeros(seen.shape[0])
+    size = np.diff(seen.indptr)
+    others = np.flatnonzero(reference)
+    reference_points = seen[others].T.tocsr()
+    for rows in _row_blocks(seen.shape[0], len(others)):
+        shared = seen[rows] @ reference_points
+        i = np.repeat(rows, np.diff(shared.indptr))
+        j = others[shared.indices]
+        overlap = np.where(i == j, 0.0, shared.data / (size[i] + size[j] - shared.data))
+        np.maximum.at(largest, i, overlap)
+    return largest
+
+
+def geometric_utility(C: Floats, D: Floats, O: Floats, config: RvaConfig) -> Floats:  # noqa: E741 - the paper's O
+    """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
+    return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
+
+
+def _row_blocks(n_rows: int, n_columns: int) -> list[npt.NDArray[np.intp]]:
+    """Consecutive rows, so many at a time that a block with ``n_columns`` columns stays small."""
+    step = max(1, _PAIRS_AT_ONCE // max(1, n_columns))
+    return [np.arange(start, min(start + step, n_rows)) for start in range(0, n_rows, step)]

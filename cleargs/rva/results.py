@@ -1,0 +1,134 @@
+"""Between RVA's arrays and its tables: poses in, rows and figures out, the frames that others measure on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from scipy.spatial.transform import Rotation
+
+from cleargs.rva.allocation import Role, effective_sample_size
+from cleargs.rva.assessment import Assessment, Poses
+from cleargs.rva.scores import Bools, Floats
+from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
+
+_WEIGHT_STEPS = 10
+
+
+class PosedFrame(Protocol):
+    """What RVA needs to know of a frame's camera (COLMAP: world to camera, quaternion w x y z)."""
+
+    @property
+    def registered(self) -> bool: ...
+    @property
+    def qw(self) -> float | None: ...
+    @property
+    def qx(self) -> float | None: ...
+    @property
+    def qy(self) -> float | None: ...
+    @property
+    def qz(self) -> float | None: ...
+    @property
+    def tx(self) -> float | None: ...
+    @property
+    def ty(self) -> float | None: ...
+    @property
+    def tz(self) -> float | None: ...
+
+
+def poses_from(frames: Sequence[PosedFrame]) -> Poses:
+    """Rotation matrices and translations; identity where a frame has no pose."""
+    rotations = np.tile(np.eye(3), (len(frames), 1, 1))
+    translations = np.zeros((len(frames), 3))
+    registered = np.array([frame.registered for frame in frames], dtype=bool)
+    posed = [frame for frame in frames if frame.registered]
+    if posed:
+        quaternions = np.array([(f.qx, f.qy, f.qz, f.qw) for f in posed], dtype=np.float64)  # scipy: w last
+        rotations[registered] = Rotation.from_quat(quaternions).as_matrix()
+        translations[registered] = np.array([(f.tx, f.ty, f.tz) for f in posed], dtype=np.float64)
+    return Poses(rotations, translations, registered)
+
+
+def frames_table(
+    frame_id: npt.NDArray[np.int32],  # [N] ascending
+    names: Sequence[str],
+    evaluator: str,
+    cues: Floats,  # [N, 11]
+    result: Assessment,
+) -> pa.Table:
+    """The rows of rva/frames.parquet."""
+    placed = result.bin >= 0
+    columns: dict[str, Any] = {
+        "frame_id": frame_id,
+        "name": list(names),
+        "evaluator": [evaluator] * len(names),
+        **{column: cues[:, k] for k, column in enumerate(CUE_COLUMNS)},
+        "R": result.R,
+        "B": result.B,
+        "reliable": result.reliable,
+        **{
+            column: pa.array(getattr(result, column), mask=~placed)
+            for column in ("C", "D", "O", "G", "bin", "Z")
+        },
+        "role": result.role.tolist(),
+        "weight": result.weight,
+        "stand_in": result.stand_in,
+    }
+    return pa.table(columns, schema=FRAMES)
+
+
+def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:  # [N] ascending
+    """The rows of rva/bins.parquet."""
+    count = len(result.covered)
+    placed = result.bin[result.bin >= 0]
+    active = result.bin[(result.bin >= 0) & (result.weight > 0.0)]
+    reactivated: list[int | None] = [None] * count
+    for row in np.flatnonzero(result.role == Role.REACTIVATED):
+        reactivated[result.bin[row]] = int(frame_id[row])
+    return pa.table(
+        {
+            "bin": np.arange(count, dtype=np.int32),
+            "s_start": result.bin_edges[:-1],
+            "s_end": result.bin_edges[1:],
+            "n_frames": np.bincount(placed, minlength=count).astype(np.int32),
+            "n_active": np.bincount(active, minlength=count).astype(np.int32),
+            "covered": result.covered,
+            "reactivated": pa.array(reactivated, type=pa.int32()),
+        },
+        schema=BINS,
+    )
+
+
+def reference_frames(table: pa.Table) -> npt.NDArray[np.int32]:  # rows of FRAMES -> frame ids
+    """The frames on which do-no-harm is measured: the reliable ones, or their stand-ins where there are none.
+
+    With RVA enabled the reliable frames are exactly the strong ones; in the all-view ablation, where every
+    frame is strong, they remain the ones that can be trusted.
+    """
+    chosen: Bools = table.column("reliable").to_numpy() | table.column("stand_in").to_numpy()
+    return np.asarray(table.column("frame_id").to_numpy()[chosen])
+
+
+def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
+    """Figures for the manifest: frames a role, weights in steps of 0.1, reliable frames, effective sample
+    size.
+    """
+    roles = Counter(result.role.tolist())
+    histogram, _ = np.histogram(result.weight, bins=_WEIGHT_STEPS, range=(0.0, 1.0))
+    return {
+        "evaluator": evaluator,
+        "frames": len(result.R),
+        "registered": int(np.count_nonzero(result.bin >= 0)),
+        "roles": {role.value: roles[role.value] for role in Role},
+        "active": int(np.count_nonzero(result.weight)),
+        "reliable": int(np.count_nonzero(result.reliable)),
+        "stand_in": int(np.count_nonzero(result.stand_in)),
+        "weights": {f"{k / _WEIGHT_STEPS:.1f}": int(histogram[k]) for k in range(_WEIGHT_STEPS)},
+        "effective_frames": round(effective_sample_size(result.weight), 3),
+        "bins": len(result.covered),
+        "bins_uncovered_before": int(np.count_nonzero(~result.covered)),
+    }

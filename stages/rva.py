@@ -1,0 +1,68 @@
+"""RVA: judge every training frame by its pixels and its place in the scene, and weight its supervision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.rva.config import RvaConfig
+
+VERSION = 1
+CONFIG = RvaConfig
+INPUTS: Mapping[str, tuple[str, ...]] = {
+    "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
+}
+OUTPUTS = ("frames.parquet", "bins.parquet")
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")
+
+_FRAMES_PER_MINUTE = 600  # frames of about 1 MP on one core, decoding included
+
+
+def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
+    """Nothing outside the store: the evaluator has no weights."""
+    return {}
+
+
+def estimate(context: StageContext[RvaConfig]) -> Estimate:
+    """Cues take nearly all of the time; memory is a handful of images a thread."""
+    images = context.inputs.get("ingest", Path()) / "images"
+    frames = sum(1 for _ in images.iterdir()) if images.is_dir() else 0
+    return Estimate(minutes=frames / _FRAMES_PER_MINUTE, memory_gb=0.3, disk_gb=0.001)
+
+
+def run(context: StageContext[RvaConfig]) -> StageResult:
+    """Cues -> R and B -> geometric utility -> roles -> coverage -> weights; writes the two tables."""
+    import numpy as np
+
+    from cleargs.capture.tables import load_frames, load_observations
+    from cleargs.rva.assessment import Observations, assess
+    from cleargs.rva.evaluator import View, label, make_evaluator
+    from cleargs.rva.results import bins_table, frames_table, poses_from, summary
+    from cleargs.rva.tables import BINS, FRAMES
+    from cleargs.tables import write_table
+
+    config, ingest = context.config, context.inputs["ingest"]
+    frames = [frame for frame in load_frames(ingest) if frame.split == "train"]
+    observations = Observations(*load_observations(ingest))
+
+    evaluator = make_evaluator(config)
+    views = [
+        View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
+        for frame in frames
+    ]
+    cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
+    frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
+    result = assess(frame_id, cues, poses_from(frames), observations, config)
+
+    names = [frame.name for frame in frames]
+    write_table(
+        context.out / "frames.parquet", frames_table(frame_id, names, label(evaluator), cues, result), FRAMES
+    )
+    write_table(context.out / "bins.parquet", bins_table(frame_id, result), BINS)
+    figures = summary(result, label(evaluator))
+    if figures["stand_in"]:
+        context.reporter.warn(
+            "no frame is reliable: the best by R - B stand in for the reliable set in the geometry"
+        )
+    return StageResult(summary=figures)

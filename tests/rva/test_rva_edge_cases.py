@@ -1,0 +1,124 @@
+"""Captures at the edge (nothing reliable, one frame, no motion, no poses, no points), and the sparse sums."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rva_scenes import along_x, observations_of, poses_at, uniform_cues
+
+from cleargs.rva.assessment import assess
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.geometry import coverage_gain, redundancy, visibility
+from cleargs.rva.results import frames_table, reference_frames
+from cleargs.rva.trajectory import cut_into_bins
+
+CONFIG = RvaConfig()
+
+
+def ids(n: int) -> np.ndarray:
+    return np.arange(n, dtype=np.int32)
+
+
+def test_the_best_tenth_stands_in_when_no_frame_is_reliable() -> None:
+    R = np.full(20, 0.4)
+    R[[7, 3, 12]] = [0.6, 0.5, 0.5]  # two of twenty: frame 7, then the earlier of the tied 3 and 12
+    result = assess(
+        ids(20), uniform_cues(R, [0.2] * 20), poses_at(along_x(range(20))), observations_of({}), CONFIG
+    )
+    assert np.flatnonzero(result.stand_in).tolist() == [3, 7]
+    assert not result.reliable.any()
+    assert "strong" not in result.role.tolist()
+    assert result.D[19] == pytest.approx(0.65 * 16 / 19)  # farthest stand-in: frame 3
+    table = frames_table(ids(20), ["x"] * 20, "hand-1", uniform_cues(R, [0.2] * 20), result)
+    assert reference_frames(table).tolist() == [3, 7]
+
+
+@pytest.mark.parametrize(("R", "role", "weight"), [(0.9, "strong", 0.98), (0.1, "reactivated", 0.12)])
+def test_one_frame(R: float, role: str, weight: float) -> None:
+    result = assess(
+        ids(1), uniform_cues([R], [0.1]), poses_at(along_x([3.0])), observations_of({0: [5]}), CONFIG
+    )
+    assert (result.D[0], result.O[0], result.bin[0], result.Z[0]) == (0.0, 0.0, 0, 1.0)
+    assert result.role[0] == role
+    assert result.weight[0] == pytest.approx(weight)
+
+
+def test_a_camera_that_does_not_move_has_one_bin() -> None:
+    points = observations_of({k: [1, 2] for k in range(30)})
+    result = assess(
+        ids(30), uniform_cues([0.8] * 30, [0.1] * 30), poses_at(along_x([2.0] * 30)), points, CONFIG
+    )
+    assert result.bin.tolist() == [0] * 30
+    assert result.Z.tolist() == [1.0] * 30
+    assert result.D.tolist() == [0.0] * 30
+    assert result.O.tolist() == [1.0] * 30
+
+
+def test_unregistered_frames_have_no_geometry_and_no_say() -> None:
+    cues = uniform_cues([0.8, 1.0, 0.8], [0.1, 0.0, 0.1])
+    points = observations_of({0: [1], 1: [1, 2, 3], 2: [2]})
+    poses = poses_at(along_x([0.0, 99.0, 1.0]), registered=[True, False, True])
+    result = assess(ids(3), cues, poses, points, CONFIG)
+    assert np.isnan([result.C[1], result.D[1], result.O[1], result.G[1], result.Z[1]]).all()
+    assert (result.bin[1], result.role[1], result.weight[1], result.reliable[1]) == (
+        -1,
+        "suppressed",
+        0.0,
+        False,
+    )
+    assert result.D[0] == 0.65  # the largest distance is 1: frame 1's place does not count
+    row = frames_table(ids(3), ["a", "b", "c"], "hand-1", cues, result).to_pylist()[1]
+    assert [row[name] for name in ("C", "D", "O", "G", "bin", "Z")] == [None] * 6
+
+
+def test_no_frame_is_registered() -> None:
+    poses = poses_at(along_x([0.0, 1.0]), registered=[False, False])
+    result = assess(ids(2), uniform_cues([0.9, 0.9], [0.1, 0.1]), poses, observations_of({}), CONFIG)
+    assert result.role.tolist() == ["suppressed", "suppressed"]
+    assert not result.stand_in.any()
+
+
+def test_a_frame_without_points_has_neither_gain_nor_overlap() -> None:
+    points = observations_of({0: [1, 2], 2: [2, 3]})
+    result = assess(
+        ids(3), uniform_cues([0.8, 0.2, 0.2], [0.1] * 3), poses_at(along_x([0.0, 1.0, 2.0])), points, CONFIG
+    )
+    assert (result.C[1], result.O[1]) == (0.0, 0.0)
+    assert result.O[2] == pytest.approx(1 / 3)
+
+
+def test_points_of_frames_outside_the_table_count_nowhere() -> None:
+    cues, poses = uniform_cues([0.8, 0.2], [0.1, 0.1]), poses_at(along_x([0.0, 1.0]))
+    alone = assess(ids(2), cues, poses, observations_of({0: [1], 1: [1, 2]}), CONFIG)
+    beside = assess(ids(2), cues, poses, observations_of({0: [1], 1: [1, 2], 7: [1, 2, 3]}), CONFIG)
+    assert beside.C.tolist() == alone.C.tolist()
+    # n_1 = 2, n_2 = 1: C_1 = 1 / (1 + 1/sqrt 2)
+    assert alone.C[1] == pytest.approx(1 / (1 + 2**-0.5))
+
+
+def test_the_last_frame_belongs_to_the_last_bin() -> None:
+    bins = cut_into_bins(np.linspace(0.0, 0.7, 17), frames_per_bin=4)
+    assert bins.index.max() == 3
+    assert bins.index[-1] == 3
+
+
+def test_sparse_sums_equal_sets() -> None:
+    rng = np.random.default_rng(5)
+    sets = [set(rng.choice(60, size=rng.integers(0, 30), replace=False).tolist()) for _ in range(25)]
+    reference = rng.random(25) < 0.4
+    pairs = [(frame, point) for frame, seen in enumerate(sets) for point in seen]
+    pairs += pairs[:10]  # a pair listed twice is still one member of the set
+    rows, points = np.array(pairs).T
+    seen = visibility(rows, points, 25)
+    observers = {point: sum(point in one for one in sets) for point in range(60)}
+    covered = set().union(*(sets[j] for j in np.flatnonzero(reference)))
+    for i, own in enumerate(sets):
+        total = sum(observers[p] ** -0.5 for p in own)
+        gained = sum(observers[p] ** -0.5 for p in own - covered)
+        overlaps = [
+            len(own & sets[j]) / len(own | sets[j])
+            for j in np.flatnonzero(reference)
+            if j != i and own | sets[j]
+        ]
+        assert coverage_gain(seen, reference)[i] == pytest.approx(gained / total if own else 0.0)
+        assert redundancy(seen, reference)[i] == pytest.approx(max(overlaps, default=0.0))

@@ -1,0 +1,189 @@
+"""The statistics evaluator on images of known degradation: blurred in linear light, noised, mis-exposed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from cleargs.progress import SilentReporter
+from cleargs.rva.blur import blur_extents
+from cleargs.rva.calibration import Calibration
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.degradations import blocking, noise_level
+from cleargs.rva.evaluator import View
+from cleargs.rva.luminance import reduce_luminance
+from cleargs.rva.scores import appearance_scores
+from cleargs.rva.statistics import StatisticsEvaluator, as_measures, cues_from_measures, measure
+from cleargs.rva.tables import CUE_COLUMNS
+
+Linear = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+SIZE = 240, 320
+
+
+@pytest.fixture(scope="module")
+def scene() -> Linear:
+    """Linear light [240, 320]: overlapping discs and polygons with sharp, anti-aliased borders."""
+    rng = np.random.default_rng(2)
+    canvas = np.full((4 * SIZE[0], 4 * SIZE[1]), 0.3, dtype=np.float32)
+    for _ in range(160):
+        corners = rng.uniform(0, [4 * SIZE[1], 4 * SIZE[0]]) + rng.normal(0, 70, (5, 2))
+        cv2.fillConvexPoly(canvas, cv2.convexHull(corners.astype(np.int32)), float(rng.uniform(0.05, 0.7)))
+    return cv2.resize(canvas, SIZE[::-1], interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def photograph(linear: Linear, noise: float = 0.7) -> Image:
+    """8-bit sRGB [h, w, 3] with white noise of ``noise`` levels."""
+    srgb = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    )
+    levels = 255.0 * srgb + np.random.default_rng(7).normal(0.0, noise, linear.shape)
+    return np.repeat(np.clip(np.rint(levels), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+def moved(linear: Linear, length: int, *, upright: bool = False) -> Linear:
+    """Box blur of ``length`` px along the rows, or along the columns."""
+    kernel = np.full((length, 1) if upright else (1, length), 1.0 / length)
+    return np.asarray(cv2.filter2D(linear, -1, kernel, borderType=cv2.BORDER_REFLECT))
+
+
+def defocused(linear: Linear, sigma: float) -> Linear:
+    return np.asarray(cv2.GaussianBlur(linear, (0, 0), sigma))
+
+
+def cues_of(images: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
+    """Cues and scores of a video made of these images."""
+    rows = np.stack([measure(reduce_luminance(image, None)) for image in images])
+    cues = cues_from_measures(as_measures(rows), Calibration())
+    R, B = appearance_scores(cues, RvaConfig())
+    return {**{name: cues[:, k] for k, name in enumerate(CUE_COLUMNS)}, "R": R, "B": B}
+
+
+def beside_sharp(scene: Linear, worse: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
+    """Cues of the images in ``worse``, each between two sharp frames of the same content."""
+    sharp = photograph(scene)
+    images = [sharp]
+    for image in worse:
+        images += [image, sharp]
+    return {name: values[1::2] for name, values in cues_of(images).items()}
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_extents_find_the_direction_and_the_length_of_a_motion(scene: Linear, upright: bool) -> None:
+    luminance = reduce_luminance(photograph(moved(scene, 7, upright=upright)), None)
+    extents = blur_extents(luminance.reduced, luminance.valid, noise=0.7)
+    along, across = (4, 0) if upright else (0, 4)
+    assert extents.argmax() == along
+    # A box of 7 px has a standard deviation of 2.0 px; the edges of the scene have a width of their
+    # own and the two-scale ratio takes a ramp for an error function, so a quarter either way.
+    assert extents[along] == pytest.approx(7 / 12**0.5, rel=0.25)
+    # Across the motion nothing but the corners is softened.
+    assert extents[across] < 0.5 * extents[along]
+
+
+def test_extent_of_a_gaussian_blur(scene: Linear) -> None:
+    luminance = reduce_luminance(photograph(defocused(scene, 1.5)), None)
+    extents = blur_extents(luminance.reduced, luminance.valid, noise=0.7)
+    assert extents == pytest.approx(np.full(8, 1.5), rel=0.25)
+
+
+def test_longer_motion_is_worse(scene: Linear) -> None:
+    cues = beside_sharp(scene, [photograph(moved(scene, length)) for length in (1, 3, 6, 12, 20)])
+    assert (np.diff(cues["R"]) < 0.0).all()
+    assert (np.diff(cues["B"]) > 0.0).all()
+    assert (np.diff(cues["b_motion_blur"]) >= 0.0).all()
+    assert cues["R"][0] > 0.9
+    assert cues["R"][3] < 0.70  # 12 px at 320 px wide is not strong
+    assert (cues["b_motion_blur"][2:] > cues["b_defocus"][2:]).all()
+
+
+def test_stronger_defocus_is_worse_and_is_not_motion(scene: Linear) -> None:
+    cues = beside_sharp(scene, [photograph(defocused(scene, sigma)) for sigma in (0.5, 1.0, 2.0, 3.0)])
+    assert (np.diff(cues["R"]) < 0.0).all()
+    assert (np.diff(cues["b_defocus"]) > 0.0).all()
+    assert (cues["b_defocus"][2:] > cues["b_motion_blur"][2:]).all()
+
+
+def test_a_video_blurred_throughout_is_not_excused_by_its_neighbours(scene: Linear) -> None:
+    cues = cues_of([photograph(moved(scene, 12))] * 6)
+    assert (cues["R"] < 0.70).all()
+
+
+def test_exposure(scene: Linear) -> None:
+    cues = beside_sharp(scene, [photograph(np.clip(scene * 2.0**stops, 0, 1)) for stops in (-5, 0, 2.5)])
+    dark, right, glaring = cues["b_exposure_failure"]
+    assert right == 0.0
+    assert dark > 0.5
+    assert glaring > 0.5
+    assert cues["r_exposure"][1] == 1.0
+
+
+def test_noise_is_measured_and_lowers_cleanness(scene: Linear) -> None:
+    levels = [0.7, 3.0, 8.0]
+    images = [photograph(scene, noise) for noise in levels]
+    for image, level in zip(images, levels, strict=True):
+        luminance = reduce_luminance(image, None)
+        # Rounding to 8 bits adds 0.29 levels; a median of quantised values moves in quarter levels.
+        assert noise_level(luminance.reduced, luminance.valid) == pytest.approx(
+            level, abs=0.35 + 0.05 * level
+        )
+    assert (np.diff(cues_of(images)["r_cleanness"]) < 0.0).all()
+
+
+def test_ghosting(scene: Linear) -> None:
+    double = 0.5 * scene + 0.5 * np.roll(scene, (9, 14), axis=(0, 1))
+    ghost, sharp = beside_sharp(scene, [photograph(double), photograph(scene)])["b_ghosting"]
+    assert ghost > 0.5
+    assert sharp == 0.0
+
+
+def test_blocks_are_artifacts(scene: Linear) -> None:
+    clean = photograph(scene)
+    coded = cv2.imdecode(cv2.imencode(".jpg", clean, [cv2.IMWRITE_JPEG_QUALITY, 8])[1], cv2.IMREAD_COLOR)
+    assert blocking(reduce_luminance(coded, None).full) > 3.0 + blocking(reduce_luminance(clean, None).full)
+    artifacts = cues_of([coded, clean])["b_artifacts"]
+    assert artifacts[0] > artifacts[1] + 0.3
+
+
+def test_masked_pixels_do_not_count(scene: Linear) -> None:
+    sharp, blurred = photograph(scene), photograph(moved(scene, 15))
+    half = sharp.copy()
+    half[:, :160] = blurred[:, :160]
+    mask = np.full(SIZE, 255, dtype=np.uint8)
+    mask[:, :160] = 0
+    shown = reduce_luminance(half, mask)
+    extents = blur_extents(shown.reduced, shown.valid, noise=0.7)
+    hidden = reduce_luminance(sharp, mask)
+    # Beyond the support of the filters, what lies under the mask cannot matter.
+    np.testing.assert_array_equal(extents, blur_extents(hidden.reduced, hidden.valid, noise=0.7))
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_frame_without_structure_is_not_reliable(level: int) -> None:
+    cues = cues_of([np.full((*SIZE, 3), level, dtype=np.uint8)] * 3)
+    assert np.isfinite(cues["R"]).all()
+    assert (cues["R"] < 0.35).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 400), (40, 40)])
+def test_tiny_images_are_judged_without_an_error(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (*size, 3), dtype=np.uint8)
+    for values in cues_of([image]).values():
+        assert ((values >= 0.0) & (values <= 1.0)).all()
+
+
+def test_threads_do_not_change_the_cues(scene: Linear, tmp_path: Path) -> None:
+    views = []
+    for k, length in enumerate([1, 9, 1, 5, 3, 14]):
+        path = tmp_path / f"{k}.png"
+        cv2.imwrite(str(path), photograph(moved(scene, length)))
+        views.append(View(k, path))
+    one, four = (StatisticsEvaluator().evaluate(views, threads=n, reporter=SilentReporter()) for n in (1, 4))
+    np.testing.assert_array_equal(one, four)
+    assert one.shape == (6, 11)
+    assert ((one >= 0.0) & (one <= 1.0)).all()
