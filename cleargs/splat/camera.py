@@ -1,0 +1,100 @@
+"""A pinhole camera in COLMAP's conventions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cleargs.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """An undistorted pinhole camera.
+
+    Sizes, focal lengths and the principal point are in pixels; pixel centres lie at + 0.5.
+    ``world_to_camera`` is a rigid [4, 4] float64 matrix with OpenCV axes (x right, y down, z forward).
+
+    Raises:
+        InputError: when a size or focal length is not positive or a number is not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: npt.NDArray[np.float64]  # [4, 4]
+
+    def __post_init__(self) -> None:
+        pose = np.ascontiguousarray(self.world_to_camera, dtype=np.float64)
+        object.__setattr__(self, "world_to_camera", pose)
+        if pose.shape != (4, 4):
+            raise InputError(f"world_to_camera has the shape {pose.shape}", hint="give a [4, 4] rigid matrix")
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if self.width < 1 or self.height < 1 or not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
+            raise InputError(
+                f"the camera is not usable: {self.width}x{self.height}, fx fy cx cy = {numbers}",
+                hint="sizes must be positive and every number finite",
+            )
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(
+                f"the focal lengths {self.fx}, {self.fy} are not positive",
+                hint="give focal lengths in pixels",
+            )
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        qw: float,
+        qx: float,
+        qy: float,
+        qz: float,
+        tx: float,
+        ty: float,
+        tz: float,
+        *,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+    ) -> Camera:
+        """Camera from COLMAP's world-to-camera quaternion (normalised here) and translation."""
+        w, x, y, z = np.array([qw, qx, qy, qz], np.float64) / np.linalg.norm([qw, qx, qy, qz])
+        pose = np.eye(4)
+        pose[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        pose[:3, 3] = tx, ty, tz
+        return cls(width, height, fx, fy, cx, cy, pose)
+
+    @property
+    def centre(self) -> npt.NDArray[np.float64]:
+        """Position of the camera in the world, [3]."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        centre: npt.NDArray[np.float64] = -rotation.T @ translation
+        return centre
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same view resampled to ``width`` x ``height`` pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
+        )
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the view resampled by ``factor``, its size rounded to whole pixels (at least 1)."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))

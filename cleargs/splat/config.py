@@ -1,0 +1,122 @@
+"""Settings of everything that trains a scene: the first scene (G0) and the later distillations."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class TrainConfig(BaseModel):
+    """How a scene is optimised. Rates are those of 3DGS and gsplat, the schedule is for two CPU cores."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps: int = Field(2000, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
+    coarse_share: float = Field(
+        0.5, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
+    )
+    coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
+
+    densify: bool = Field(
+        True, description="move dead Gaussians, grow to the budget, add noise to the means (MCMC)"
+    )
+    budget: int | None = Field(
+        None, ge=1, le=20_000_000, description="most Gaussians; unset = from the number of training pixels"
+    )
+    growth: float = Field(
+        0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
+    )
+    refine_interval: int = Field(50, ge=1, description="steps between refinements")
+    refine_start: float = Field(
+        0.05, ge=0, le=1, description="share of the steps before the first refinement"
+    )
+    refine_stop: float = Field(
+        0.8, ge=0, le=1, description="share of the steps after which nothing is refined"
+    )
+    min_opacity: float = Field(0.005, gt=0, lt=1, description="opacity at or below which a Gaussian is dead")
+    noise: float = Field(
+        5e5, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5)"
+    )
+    opacity_reg: float = Field(0.01, ge=0, description="factor on the mean opacity in the loss")
+    scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
+
+    lr_means: float = Field(1.6e-4, ge=0, description="rate of the means, at the first step")
+    lr_means_final: float = Field(
+        0.01, gt=0, le=1, description="share of lr_means left at the last step, exponential decay"
+    )
+    lr_scales: float = Field(5e-3, ge=0, description="rate of the log scales")
+    lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
+    lr_opacities: float = Field(5e-2, ge=0, description="rate of the opacity logits")
+    lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a twentieth")
+    lr_exposure: float = Field(1e-3, ge=0, description="rate of the exposure affines, where they are on")
+    sh_interval: int = Field(
+        500,
+        ge=0,
+        description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
+    )
+
+    checkpoint_interval: int = Field(
+        200,
+        ge=1,
+        description="steps between checkpoints; changes no result",
+        json_schema_extra={"key": False},
+    )
+    cache_mb: int = Field(
+        1024,
+        ge=0,
+        description="memory for decoded images, MiB; changes no result",
+        json_schema_extra={"key": False},
+    )
+
+
+class G0Config(TrainConfig):
+    """The first scene, from the sparse points and the frames that RVA keeps."""
+
+    sh_degree: int | None = Field(
+        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
+    )
+    exposure: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="one colour affine a frame; auto = on where the frames' gains on the points differ",
+    )
+    exposure_threshold: float = Field(
+        0.05, ge=0, description="auto: spread of the frames' gains from which it is on (0.05 = 5 %)"
+    )
+    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
+    background: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="sRGB behind the scene, each in [0, 1]"
+    )
+    min_points: int = Field(
+        10_000,
+        ge=1,
+        le=5_000_000,
+        description="fewest Gaussians to start from; sparse points are added to reach it",
+    )
+    init_scale: float = Field(
+        0.5, gt=0, description="starting scale as a share of the distance to the neighbours"
+    )
+    init_opacity: float = Field(0.5, gt=0, lt=1, description="starting opacity")
+
+
+class DistilConfig(TrainConfig):
+    """Training on from a finished scene, with repaired views beside the real ones."""
+
+    steps: int = Field(600, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    coarse_share: float = Field(
+        0.0, ge=0, le=1, description="share of the steps that see reduced images; 0 = off"
+    )
+    densify: bool = Field(
+        False, description="move dead Gaussians, grow to the budget, add noise to the means (MCMC)"
+    )
+    opacity_reg: float = Field(0.0, ge=0, description="factor on the mean opacity in the loss")
+    scale_reg: float = Field(0.0, ge=0, description="factor on the mean scale in the loss")
+    lr_means: float = Field(1.6e-5, ge=0, description="rate of the means, at the first step")
+    sh_interval: int = Field(
+        0,
+        ge=0,
+        description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
+    )
+    pseudo_share: float = Field(0.5, ge=0, le=1, description="share of the steps that draw a repaired view")
+    pseudo_weight: float = Field(1.0, ge=0, description="factor on the loss of a repaired view")

@@ -1,0 +1,89 @@
+"""A scene in another world: similarity transforms of Gaussians, spherical harmonics included."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.reference import sh_basis
+from cleargs.splat.scene import Scene
+
+_DIRECTIONS = 64
+"""Directions in which two SH functions are compared; 16 coefficients need at least 16."""
+
+
+def transform_scene(
+    scene: Scene,
+    *,
+    scale: float,
+    rotation: NDArray[np.float64],  # [3, 3]
+    translation: NDArray[np.float64],  # [3]
+) -> Scene:
+    """The scene under x -> scale rotation x + translation; renders of moved cameras stay the same.
+
+    ``rotation`` must be proper (determinant 1) and ``scale`` positive, else ValueError is raised. Computed
+    in float64; the result is float32 as the files are, so an offset that is large beside the scene costs
+    digits of the means.
+    """
+    if (
+        scale <= 0
+        or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        or np.linalg.det(rotation) < 0
+    ):
+        raise ValueError("not a similarity: the scale must be positive, the rotation proper")
+    gaussians = scene.gaussians.detach()
+    turn = torch.from_numpy(np.ascontiguousarray(rotation, dtype=np.float64))
+    means = scale * gaussians.means.double() @ turn.T + torch.from_numpy(
+        np.asarray(translation, dtype=np.float64)
+    )
+    quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)  # x y z w -> w x y z
+    mixing = sh_rotation(turn, gaussians.sh.shape[1])
+    moved = Gaussians(
+        means=means.float(),
+        log_scales=(gaussians.log_scales.double() + math.log(scale)).float(),
+        rotations=_multiply(torch.from_numpy(quaternion), gaussians.rotations.double()).float(),
+        logit_opacities=gaussians.logit_opacities.clone(),
+        sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
+    )
+    return replace(scene, gaussians=moved)
+
+
+def sh_rotation(rotation: Tensor, count: int) -> Tensor:
+    """The matrix that takes the first ``count`` SH coefficients of f to those of d -> f(rotationᵀ d).
+
+    Rotation keeps each degree to itself, so the turned function is again a sum of the same basis; its
+    coefficients follow from its values in a few directions, exactly up to rounding.
+
+    rotation: [3, 3] float64; returns [count, count] float64.
+    """
+    # A Fibonacci sphere: evenly spread, so that the least squares are well conditioned.
+    index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
+    z = 1.0 - 2.0 * index / _DIRECTIONS
+    angle = index * math.pi * (3.0 - math.sqrt(5.0))
+    ring = torch.sqrt(1.0 - z * z)
+    directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=1)
+    mixing: Tensor = torch.linalg.lstsq(
+        sh_basis(directions, count), sh_basis(directions @ rotation, count)
+    ).solution
+    return mixing
+
+
+def _multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Hamilton product of one quaternion w x y z with many: turn by ``second`` [N, 4], then by ``first`` [4]."""
+    w, x, y, z = first
+    matrix = torch.stack(
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    return second @ matrix.T

@@ -1,0 +1,128 @@
+"""The Gaussians that a training starts from: one a sparse point, more between them where points are few."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cleargs.splat.constants import SH_C0
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.views import View
+
+NEIGHBOURS = 3
+"""Neighbours whose mean distance is a starting scale (Inria), and whose depth an added point takes."""
+
+DEPTH_JITTER = 0.05
+"""Standard deviation of the log depth of added points around their neighbours' depth."""
+
+ADDED_POINTS = 100
+"""Purpose of the random numbers of added points; the trainer's purposes are below it."""
+
+BLIND_DEPTHS = (0.5, 5.0)
+"""Depths between which points are added where a view sees no sparse point; the cameras span a radius of 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """The sparse reconstruction as the views of a training see it."""
+
+    xyz: NDArray[np.float64]  # [P, 3] normalised world
+    rgb: NDArray[np.uint8]  # [P, 3] sRGB
+    observed: list[NDArray[np.int64]]
+    """For each view, the rows of ``xyz`` that it observes."""
+
+
+def sh_degree_from_views(count: int) -> int:
+    """Largest SH degree that pays with ``count`` active frames: 0 below 12, then 1, and 2 from 60 on.
+
+    Few directions fix few terms: the others learn to explain the frames one by one, and cost time.
+    """
+    return 0 if count < 12 else 1 if count < 60 else 2
+
+
+def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init_opacity: float) -> Gaussians:
+    """One isotropic Gaussian a point.
+
+    Its scale is ``init_scale`` times the mean distance to the three nearest points; its colour fills the SH
+    constant.
+    """
+    xyz, rgb = sparse.xyz, sparse.rgb
+    count = len(xyz)
+    near = min(NEIGHBOURS, count - 1)
+    spacing = np.ones(count)
+    if near > 0:
+        distances, _ = cKDTree(xyz).query(xyz, k=near + 1)
+        spacing = distances[:, 1:].mean(axis=1)
+    log_scales = np.log(np.maximum(spacing * init_scale, 1e-7))
+    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = torch.from_numpy(((rgb / 255.0 - 0.5) / SH_C0).astype(np.float32))
+    rotations = torch.zeros(count, 4)
+    rotations[:, 0] = 1.0
+    return Gaussians(
+        means=torch.from_numpy(xyz.astype(np.float32)),
+        log_scales=torch.from_numpy(np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32)),
+        rotations=rotations,
+        logit_opacities=torch.full((count,), float(np.log(init_opacity / (1.0 - init_opacity)))),
+        sh=sh,
+    )
+
+
+def add_points(sparse: SparsePoints, views: Sequence[View], count: int, *, seed: int) -> SparsePoints:
+    """``sparse`` with ``count`` more points (none observed), spread evenly over the views and their pixels.
+
+    A point lies behind a random unmasked pixel, at the depth of the sparse points that the view observes
+    nearest to that pixel (mean log depth of three, with a little noise), and takes the pixel's colour. Where
+    a view observes no sparse point its depths are spread evenly in log between BLIND_DEPTHS.
+    """
+    shares = np.full(len(views), count // len(views))
+    shares[: count % len(views)] += 1
+    xyz, rgb = [sparse.xyz], [sparse.rgb]
+    for view, seen, share in zip(views, sparse.observed, shares, strict=True):
+        if share:
+            rng = np.random.default_rng([seed, ADDED_POINTS, view.frame_id])
+            added, colours = _points_of_view(view, sparse.xyz[seen], int(share), rng)
+            xyz.append(added)
+            rgb.append(colours)
+    return replace(sparse, xyz=np.concatenate(xyz), rgb=np.concatenate(rgb))
+
+
+def _points_of_view(
+    view: View, seen: NDArray[np.float64], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """``count`` points behind random pixels of one view, given the sparse points [S, 3] it sees."""
+    camera = view.camera
+    image, mask = view.load()
+    rows, columns = np.nonzero(mask) if mask is not None else np.indices(image.shape[:2]).reshape(2, -1)
+    if not len(rows):
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    pick = rng.integers(len(rows), size=count)
+    rows, columns = rows[pick], columns[pick]
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    in_camera = np.einsum("ni,ji->nj", seen, rotation) + translation
+    in_camera = in_camera[in_camera[:, 2] > 1e-3]
+    if len(in_camera):
+        depth = in_camera[:, 2:]
+        focal = np.array([camera.fx, camera.fy])
+        projected = in_camera[:, :2] / depth * focal + np.array([camera.cx, camera.cy])
+        near = min(NEIGHBOURS, len(in_camera))
+        _, nearest = cKDTree(projected).query(pixels, k=[*range(1, near + 1)])
+        log_depth = np.log(depth[:, 0])[nearest].mean(axis=1) + DEPTH_JITTER * rng.standard_normal(count)
+    else:
+        log_depth = rng.uniform(*(float(np.log(depth)) for depth in BLIND_DEPTHS), size=count)
+
+    rays = np.stack(
+        [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(count)],
+        axis=1,
+    )
+    world = np.einsum("ni,ij->nj", rays * np.exp(log_depth)[:, None] - translation, rotation)
+    colour = image[rows, columns]
+    if colour.dtype != np.uint8:
+        colour = np.rint(np.clip(colour, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return world, colour

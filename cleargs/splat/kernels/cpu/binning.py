@@ -1,0 +1,209 @@
+"""Which splats touch which tile, in depth order.
+
+Depths are sorted once (radix sort, stable, so ties go by index); a stable two-pass counting sort by tile
+then leaves every tile's splats in depth order. No sort over pairs is needed and the result does not
+depend on how the work is split.
+
+Pairs are numbered twice: *Gaussian-major* (all pairs of Gaussian 0, of Gaussian 1, ...), where the
+backward pass leaves its sums, and *tile-major*, the order of rasterisation. ``pair_slots`` leads from
+the second to the first.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from cleargs.splat import constants
+from cleargs.splat.kernels.cpu.jit import Array, Floats, exact, kernel, serial_kernel
+from cleargs.splat.kernels.cpu.layout import (
+    BEND_X,
+    BEND_Y,
+    DEPTH,
+    EXTENT_X_AT,
+    EXTENT_Y,
+    LOG2_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    SKEW,
+    TILE,
+)
+
+REACH_MARGIN = 2e-3
+"""Ellipses are taken larger by this much in log2(alpha); the rasteriser decides pixel by pixel."""
+
+LOG2_ALPHA_CUT = constants.LOG2_ALPHA_CUT - REACH_MARGIN
+PIXEL_CENTRE = constants.PIXEL_CENTRE
+BLOCK = 256
+RADIX_BITS = 11
+RADIX = 1 << RADIX_BITS
+RADIX_PASSES = 3
+
+
+@exact
+def tile_range(low: float, high: float, tiles: int) -> tuple[int, int]:
+    """Tiles [begin, end) that hold a pixel centre of the interval [low, high] px; empty when begin == end."""
+    # Bounded as floats first: the conversion of huge numbers to integers is undefined.
+    limit = np.float64(tiles * TILE)
+    first = min(max(np.ceil(low - PIXEL_CENTRE), 0.0), limit)
+    last = min(max(np.floor(high - PIXEL_CENTRE), -1.0), limit - 1.0)
+    if not first <= last:
+        return 0, 0
+    return int(first) // TILE, int(last) // TILE + 1
+
+
+@exact
+def tile_rows(splat: Floats, height: int) -> tuple[int, int]:
+    """Rows of tiles that the ellipse alpha >= 1/255 may touch."""
+    mean = np.float64(splat[MEAN_Y])
+    extent = np.float64(splat[EXTENT_Y]) * 1.001 + 0.001
+    return tile_range(mean - extent, mean + extent, (height + TILE - 1) // TILE)
+
+
+@exact
+def tile_columns(splat: Floats, row: int, width: int) -> tuple[int, int]:
+    """Tiles of one row of tiles that the ellipse alpha >= 1/255 touches.
+
+    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so
+    it is largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge
+    is its mirror image.
+    """
+    extent = np.float64(splat[EXTENT_Y]) * 1.001 + 0.001
+    at = np.float64(splat[EXTENT_X_AT])
+    low = max(row * TILE + PIXEL_CENTRE - np.float64(splat[MEAN_Y]), -extent)
+    high = min((row + 1) * TILE - PIXEL_CENTRE - np.float64(splat[MEAN_Y]), extent)
+    right_at = min(max(at, low), high)
+    left_at = min(max(-at, low), high)
+    bend_x = max(np.float64(splat[BEND_X]), 1e-30)
+    bend_y = np.float64(splat[BEND_Y])
+    reach = np.float64(splat[LOG2_OPACITY]) - LOG2_ALPHA_CUT
+    skew = np.float64(splat[SKEW])
+    right = skew * right_at + math.sqrt(max(reach - bend_y * right_at * right_at, 0.0) / bend_x)
+    left = skew * left_at - math.sqrt(max(reach - bend_y * left_at * left_at, 0.0) / bend_x)
+    mean = np.float64(splat[MEAN_X])
+    return tile_range(mean + left - 1e-3, mean + right + 1e-3, (width + TILE - 1) // TILE)
+
+
+@exact
+def count_tiles(splat: Floats, width: int, height: int) -> int:
+    """Number of tiles that a splat touches; must agree with ``list_pairs``."""
+    count = 0
+    top, bottom = tile_rows(splat, height)
+    for row in range(top, bottom):
+        begin, end = tile_columns(splat, row, width)
+        count += end - begin
+    return count
+
+
+@serial_kernel
+def pair_ranges(tile_counts: Array, pair_offsets: Array) -> int:
+    """Prefix sum of the tile counts [N] into Gaussian-major offsets [N + 1]; returns how many are visible."""
+    total = 0
+    visible = 0
+    for g in range(tile_counts.shape[0]):
+        pair_offsets[g] = total
+        total += tile_counts[g]
+        visible += tile_counts[g] > 0
+    pair_offsets[tile_counts.shape[0]] = total
+    return visible
+
+
+@serial_kernel
+def depth_order(splats: Floats, tile_counts: Array, keys: Array, ids: Array) -> int:
+    """Visible Gaussians by ascending depth, ties by index.
+
+    Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort.
+    ``keys`` and ``ids`` are [2, visible] uint32 scratch; returns which row of ``ids`` holds the order.
+    """
+    histogram = np.zeros((RADIX_PASSES, RADIX), np.int64)
+    mask = np.uint32(RADIX - 1)
+    n = 0
+    for g in range(tile_counts.shape[0]):
+        if tile_counts[g] > 0:
+            key = splats[g, DEPTH : DEPTH + 1].view(np.uint32)[0]
+            keys[0, n] = key
+            ids[0, n] = g
+            n += 1
+            for digit in range(RADIX_PASSES):
+                histogram[digit, (key >> np.uint32(RADIX_BITS * digit)) & mask] += 1
+    source = 0
+    for digit in range(RADIX_PASSES):
+        start = 0
+        for value in range(RADIX):
+            count = histogram[digit, value]
+            histogram[digit, value] = start
+            start += count
+        shift = np.uint32(RADIX_BITS * digit)
+        target = 1 - source
+        for i in range(n):
+            key = keys[source, i]
+            value = (key >> shift) & mask
+            place = histogram[digit, value]
+            histogram[digit, value] = place + 1
+            keys[target, place] = key
+            ids[target, place] = ids[source, i]
+        source = target
+    return source
+
+
+@kernel
+def list_pairs(splats: Floats, pair_offsets: Array, width: int, height: int, pair_tiles: Array) -> None:
+    """The tile of every pair [P], Gaussian-major, row by row."""
+    n = splats.shape[0]
+    tiles_x = (width + TILE - 1) // TILE
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            pair = pair_offsets[g]
+            if pair == pair_offsets[g + 1]:
+                continue
+            top, bottom = tile_rows(splats[g], height)
+            for row in range(top, bottom):
+                begin, end = tile_columns(splats[g], row, width)
+                for column in range(begin, end):
+                    pair_tiles[pair] = row * tiles_x + column
+                    pair += 1
+
+
+@kernel
+def sort_pairs_by_tile(
+    order: Array,
+    pair_offsets: Array,
+    pair_tiles: Array,
+    counts: Array,
+    tile_offsets: Array,
+    pair_ids: Array,
+    pair_slots: Array,
+) -> None:
+    """Stable counting sort of the pairs, visited in depth order, by tile.
+
+    ``counts`` is [chunks, tiles] scratch; each chunk takes an equal part of ``order``, and the result
+    does not depend on how many there are. Tile ``t`` owns ``tile_offsets[t]`` to ``[t + 1]`` of
+    ``pair_ids`` (the Gaussian) and ``pair_slots`` (the pair's Gaussian-major number).
+    """
+    chunks, tiles = counts.shape
+    n = order.shape[0]
+    for chunk in prange(chunks):
+        counts[chunk, :] = 0
+        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+            g = order[i]
+            for pair in range(pair_offsets[g], pair_offsets[g + np.uint32(1)]):
+                counts[chunk, pair_tiles[pair]] += 1
+    start = 0
+    for tile in range(tiles):
+        tile_offsets[tile] = start
+        for chunk in range(chunks):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = start
+            start += count
+    tile_offsets[tiles] = start
+    for chunk in prange(chunks):
+        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+            g = order[i]
+            for pair in range(pair_offsets[g], pair_offsets[g + np.uint32(1)]):
+                tile = pair_tiles[pair]
+                place = counts[chunk, tile]
+                counts[chunk, tile] = place + 1
+                pair_ids[place] = g
+                pair_slots[place] = pair

@@ -1,0 +1,55 @@
+"""How the CPU kernels are compiled.
+
+The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working
+(``math.isfinite`` does not: it is x - x == 0 inside, which ``reassoc`` may cancel).
+Every kernel walks over items or blocks of a fixed size, and an item's arithmetic does not depend on
+its neighbours in the loop, which makes results bitwise independent of the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+
+FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
+
+
+def kernel(function: F) -> F:
+    """A parallel entry point: called from Python, cached on disk, runs without the GIL."""
+    compiled: F = njit(cache=True, parallel=True, nogil=True, fastmath=set(FAST), error_model="numpy")(
+        function
+    )
+    return compiled
+
+
+def serial_kernel(function: F) -> F:
+    """An entry point that runs on the calling thread alone."""
+    compiled: F = njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def device(function: F) -> F:
+    """A function that kernels call; compiled into them."""
+    compiled: F = njit(fastmath=set(FAST), error_model="numpy")(function)
+    return compiled
+
+
+def inlined(function: F) -> F:
+    """A small function that LLVM must inline, so that SIMD values stay in registers."""
+    compiled: F = njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function)
+    return compiled
+
+
+def exact(function: F) -> F:
+    """Plain IEEE arithmetic: bitwise the same wherever it is compiled into."""
+    compiled: F = njit(error_model="numpy")(function)
+    return compiled

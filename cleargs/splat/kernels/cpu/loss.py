@@ -1,0 +1,257 @@
+"""L1 + D-SSIM and its gradient in two passes over the image, and squared errors.
+
+SSIM (Wang et al. 2004) as in the Inria code: 11 x 11 Gaussian window with sigma 1.5, zero padding,
+C1 = 0.01², C2 = 0.03², every channel on its own, the mean over all values. With the window means
+m = G*x, n = G*y, p = G*x², q = G*y², r = G*(xy),
+
+    A1 = 2 m n + C1,   A2 = 2 (r - m n) + C2,   B1 = m² + n² + C1,   B2 = (p - m²) + (q - n²) + C2
+    S  = A1 A2 / (B1 B2)
+    dS/dm = 2 [ n (A2 - A1) + m S (B1 - B2) ] / (B1 B2),   dS/dp = -S / B2,   dS/dr = 2 A1 / (B1 B2)
+    d(sum of S)/dx = G*(dS/dm) + 2 x G*(dS/dp) + y G*(dS/dr)
+
+because G is symmetric. The window is separable: each output row needs eleven input rows, summed
+vertically into row buffers and then horizontally, so rows are independent work items and no
+intermediate image of the five means is stored.
+
+Images are copied once into padded rows: 16 zeros, 3 W interleaved values, zeros to a multiple of 8 and 16
+more. Neighbouring pixels are then three floats apart and the zero padding comes for free. Masked pixels
+are zeroed in both images, so that they act like the padding outside the image.
+
+Sums run in float64 within each row, and over the rows in their order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from cleargs.splat import constants
+from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.simd import LANES, abs8, broadcast8, load8, select8, store8
+
+RADIUS = constants.SSIM_RADIUS
+TAPS = 2 * RADIUS + 1
+C1, C2 = np.float32(constants.SSIM_C1), np.float32(constants.SSIM_C2)
+ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
+CHANNELS = 3
+PAD = 16
+"""Zeros on both sides of a padded row: at least RADIUS pixels of three channels."""
+
+# Row buffers of window means, and the maps of derivatives.
+MEAN_X, MEAN_Y, MEAN_XX, MEAN_YY, MEAN_XY = range(5)
+BY_MEAN, BY_SQUARE, BY_PRODUCT = range(3)
+
+
+def ssim_window() -> Floats:
+    """The normalised one-dimensional window, [11]."""
+    weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * constants.SSIM_SIGMA**2))
+    return (weights / weights.sum()).astype(np.float32)
+
+
+def padded_length(width: int) -> int:
+    """Floats in a padded row."""
+    return -(-CHANNELS * width // LANES) * LANES + 2 * PAD
+
+
+@kernel
+def pad_images(
+    image: Floats,
+    target: Floats,
+    mask: Array | None,
+    padded_image: Floats,
+    padded_target: Floats,
+    counted: Floats,
+) -> None:
+    """Copy both images [H, W, 3] into padded rows; ``counted`` holds 1 for values that count, else 0."""
+    height, width, _ = image.shape
+    for y in prange(height):
+        padded_image[y, :] = ZERO
+        padded_target[y, :] = ZERO
+        counted[y, :] = ZERO
+        for x in range(width):
+            if mask is not None and not mask[y, x]:
+                continue
+            for channel in range(CHANNELS):
+                i = PAD + CHANNELS * x + channel
+                padded_image[y, i] = image[y, x, channel]
+                padded_target[y, i] = target[y, x, channel]
+                counted[y, i] = ONE
+
+
+@device
+def vertical_means(y: int, image: Floats, target: Floats, window: Floats, rows: Floats) -> None:
+    """The five window sums over the rows around ``y``, into the row buffers."""
+    height, length = image.shape
+    first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
+    for i in range(PAD, length - PAD, LANES):
+        sum_x = sum_y = sum_xx = sum_yy = sum_xy = broadcast8(ZERO)
+        for source in range(first, last + 1):
+            weight = window[source - y + RADIUS]
+            a = load8(image, source * length + i)
+            b = load8(target, source * length + i)
+            weighted_a = a * weight
+            weighted_b = b * weight
+            sum_x = sum_x + weighted_a
+            sum_y = sum_y + weighted_b
+            sum_xx = sum_xx + weighted_a * a
+            sum_yy = sum_yy + weighted_b * b
+            sum_xy = sum_xy + weighted_a * b
+        store8(rows, MEAN_X * length + i, sum_x)
+        store8(rows, MEAN_Y * length + i, sum_y)
+        store8(rows, MEAN_XX * length + i, sum_xx)
+        store8(rows, MEAN_YY * length + i, sum_yy)
+        store8(rows, MEAN_XY * length + i, sum_xy)
+
+
+@device
+def row_total(values: Floats, length: int) -> float:
+    """Sum of a row buffer in float64."""
+    total = 0.0
+    for i in range(PAD, length - PAD):
+        total += np.float64(values[i])
+    return total
+
+
+@device
+def similarity_row(
+    y: int,
+    image: Floats,
+    target: Floats,
+    counted: Floats,
+    window: Floats,
+    rows: Floats,
+    values: Floats,
+    maps: Floats,
+) -> None:
+    """SSIM of each value of a row into ``values`` and its derivatives into ``maps``."""
+    height, length = image.shape
+    vertical_means(y, image, target, window, rows)
+    for i in range(PAD, length - PAD, LANES):
+        m = n = p = q = r = broadcast8(ZERO)
+        for tap in range(TAPS):
+            weight = window[tap]
+            j = i + CHANNELS * (tap - RADIUS)
+            m = m + load8(rows, MEAN_X * length + j) * weight
+            n = n + load8(rows, MEAN_Y * length + j) * weight
+            p = p + load8(rows, MEAN_XX * length + j) * weight
+            q = q + load8(rows, MEAN_YY * length + j) * weight
+            r = r + load8(rows, MEAN_XY * length + j) * weight
+        mn = m * n
+        squares = m * m + n * n
+        a1 = TWO * mn + C1
+        a2 = TWO * (r - mn) + C2
+        b1 = squares + C1
+        b2 = (p + q - squares) + C2
+        inverse = ONE / (b1 * b2)
+        similarity = a1 * a2 * inverse
+        counts = load8(counted, y * length + i)
+        store8(values, i, similarity * counts)
+        scale = inverse * counts
+        by_mean = TWO * (n * (a2 - a1) + m * similarity * (b1 - b2)) * scale
+        store8(maps, (BY_MEAN * height + y) * length + i, by_mean)
+        store8(maps, (BY_SQUARE * height + y) * length + i, ZERO - similarity * b1 * scale)
+        store8(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
+
+
+@device
+def differences_row(y: int, image: Floats, target: Floats, values: Floats) -> None:
+    """|x - y| of each value of a row into ``values``."""
+    length = image.shape[1]
+    for i in range(PAD, length - PAD, LANES):
+        difference = load8(image, y * length + i) - load8(target, y * length + i)
+        store8(values, i, abs8(difference))
+
+
+@kernel
+def measure(
+    image: Floats,
+    target: Floats,
+    counted: Floats,
+    window: Floats,
+    maps: Floats,
+    row_sums: Array,
+) -> None:
+    """Sums of |x - y|, SSIM and counted values of each padded row, [H, 3] float64.
+
+    ``maps`` [3, H, length] takes the derivatives of SSIM by the window means; its padding is not written.
+    """
+    height, length = image.shape
+    for y in prange(height):
+        rows = np.zeros((5, length), np.float32)
+        values = np.empty(length, np.float32)
+        differences_row(y, image, target, values)
+        row_sums[y, 0] = row_total(values, length)
+        similarity_row(y, image, target, counted, window, rows, values, maps)
+        row_sums[y, 1] = row_total(values, length)
+        row_sums[y, 2] = row_total(counted[y], length)
+
+
+@device
+def vertical_maps(y: int, maps: Floats, window: Floats, rows: Floats) -> None:
+    """Window sums of the three derivative maps over the rows around ``y``."""
+    _, height, length = maps.shape
+    first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
+    for i in range(PAD, length - PAD, LANES):
+        by_mean = by_square = by_product = broadcast8(ZERO)
+        for source in range(first, last + 1):
+            weight = window[source - y + RADIUS]
+            by_mean = by_mean + load8(maps, (BY_MEAN * height + source) * length + i) * weight
+            by_square = by_square + load8(maps, (BY_SQUARE * height + source) * length + i) * weight
+            by_product = by_product + load8(maps, (BY_PRODUCT * height + source) * length + i) * weight
+        store8(rows, BY_MEAN * length + i, by_mean)
+        store8(rows, BY_SQUARE * length + i, by_square)
+        store8(rows, BY_PRODUCT * length + i, by_product)
+
+
+@kernel
+def differentiate(
+    image: Floats,
+    target: Floats,
+    counted: Floats,
+    window: Floats,
+    maps: Floats,
+    l1_scale: np.float32,
+    ssim_scale: np.float32,
+    gradient: Floats,
+) -> None:
+    """gradient [H, W, 3] = l1_scale sign(x - y) + ssim_scale d(sum of SSIM)/dx, zero where masked."""
+    height, length = image.shape
+    width = gradient.shape[1]
+    for y in prange(height):
+        rows = np.zeros((3, length), np.float32)
+        values = np.empty(length, np.float32)
+        vertical_maps(y, maps, window, rows)
+        plus, minus, zero = broadcast8(l1_scale), broadcast8(-l1_scale), broadcast8(ZERO)
+        for i in range(PAD, length - PAD, LANES):
+            by_mean = by_square = by_product = zero
+            for tap in range(TAPS):
+                weight = window[tap]
+                j = i + CHANNELS * (tap - RADIUS)
+                by_mean = by_mean + load8(rows, BY_MEAN * length + j) * weight
+                by_square = by_square + load8(rows, BY_SQUARE * length + j) * weight
+                by_product = by_product + load8(rows, BY_PRODUCT * length + j) * weight
+            a = load8(image, y * length + i)
+            b = load8(target, y * length + i)
+            sign = select8(a > b, plus, select8(a < b, minus, zero))
+            similarity = by_mean + TWO * a * by_square + b * by_product
+            store8(values, i, (sign + similarity * ssim_scale) * load8(counted, y * length + i))
+        for x in range(width):
+            for channel in range(CHANNELS):
+                gradient[y, x, channel] = values[PAD + CHANNELS * x + channel]
+
+
+@kernel
+def squared_errors(image: Floats, target: Floats, mask: Array | None, row_sums: Array) -> None:
+    """Sum of squared differences and number of values of each row, [H, 2] float64."""
+    height, width, channels = image.shape
+    for y in prange(height):
+        total = 0.0
+        count = 0
+        for x in range(width):
+            if mask is None or mask[y, x]:
+                count += channels
+                for channel in range(channels):
+                    difference = np.float64(image[y, x, channel]) - np.float64(target[y, x, channel])
+                    total += difference * difference
+        row_sums[y, 0] = total
+        row_sums[y, 1] = count

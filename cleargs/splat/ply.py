@@ -1,0 +1,122 @@
+"""``scene.ply`` in the layout of the Inria code, which viewers read: binary little endian, float32.
+
+Values are stored before activation: log scales, opacity logits, unnormalised quaternions (w x y z). Comments
+hold what the layout has no place for: the anti-aliasing mode and the background.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from cleargs.errors import StoreError
+from cleargs.files import atomic_path
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+
+_ANTIALIAS = "cleargs antialias"
+_BACKGROUND = "cleargs background"
+
+
+def write_ply(path: Path, scene: Scene) -> None:
+    """Write ``scene`` atomically; equal scenes give equal bytes."""
+    gaussians = scene.gaussians.to("cpu")
+    count, coefficients = gaussians.num, gaussians.sh.shape[1]
+    names = _properties(coefficients)
+    rows = np.zeros((count, len(names)), dtype="<f4")
+    rows[:, 0:3] = gaussians.means.detach().numpy()
+    rows[:, 6:9] = gaussians.sh.detach().numpy()[:, 0]
+    by_colour = gaussians.sh.detach().numpy()[:, 1:].transpose(0, 2, 1)  # [N, 3, K - 1]
+    rows[:, 9:-8] = by_colour.reshape(count, 3 * (coefficients - 1))
+    rows[:, -8] = gaussians.logit_opacities.detach().numpy()
+    rows[:, -7:-4] = gaussians.log_scales.detach().numpy()
+    rows[:, -4:] = gaussians.rotations.detach().numpy()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {_ANTIALIAS} {'mip' if scene.antialias else 'none'}",
+        f"comment {_BACKGROUND} {' '.join(repr(float(c)) for c in scene.background)}",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(rows.tobytes())
+
+
+def read_ply(path: Path) -> Scene:
+    """Read a scene in the Inria layout, with float32 properties in any order.
+
+    Raises StoreError when the file is missing, cut short, or lacks a property.
+    """
+    try:
+        with path.open("rb") as file:
+            count, names, comments = _read_header(file)
+            rows = np.frombuffer(file.read(), dtype="<f4").reshape(count, len(names))
+        columns = {name: rows[:, index] for index, name in enumerate(names)}
+        rest = sum(name.startswith("f_rest_") for name in names)
+        coefficients = rest // 3 + 1
+        if coefficients not in (1, 4, 9, 16) or rest % 3:
+            raise ValueError(f"{rest} f_rest_ properties fit no SH degree")
+
+        def get(*wanted: str) -> torch.Tensor:
+            return torch.from_numpy(np.stack([columns[name] for name in wanted], axis=1).astype(np.float32))
+
+        sh = torch.empty(count, coefficients, 3)
+        sh[:, 0] = get("f_dc_0", "f_dc_1", "f_dc_2")
+        if rest:
+            by_colour = get(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, coefficients - 1)
+            sh[:, 1:] = by_colour.transpose(1, 2)
+        background = tuple(float(c) for c in comments.get(_BACKGROUND, "0 0 0").split())
+        if len(background) != 3:
+            raise ValueError("the background needs three values")
+        return Scene(
+            Gaussians(
+                means=get("x", "y", "z"),
+                log_scales=get("scale_0", "scale_1", "scale_2"),
+                rotations=get("rot_0", "rot_1", "rot_2", "rot_3"),
+                logit_opacities=get("opacity")[:, 0].contiguous(),
+                sh=sh,
+            ),
+            antialias=comments.get(_ANTIALIAS, "none") == "mip",
+            background=background,
+        )
+    except (OSError, ValueError, KeyError) as error:
+        raise StoreError(
+            f"cannot read the scene {path}: {error}", hint="run the stage that wrote it again with --force"
+        ) from error
+
+
+def _properties(coefficients: int) -> list[str]:
+    """Names in the order of the Inria code, for ``coefficients`` SH terms a colour."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
+    """Number of vertices, property names, and ClearGS's comments; leaves ``file`` at the first vertex."""
+    lines: list[list[str]] = []
+    while (line := file.readline()) not in (b"end_header\n", b"end_header\r\n"):
+        if not line or len(lines) > 1000:
+            raise ValueError("the header does not end")
+        lines.append(line.decode("ascii").split())
+    if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
+        raise ValueError("not a binary little endian PLY")
+    elements = [line for line in lines if line[0] == "element"]
+    if len(elements) != 1 or elements[0][1] != "vertex":
+        raise ValueError("expected vertices and nothing else")
+    properties = [line for line in lines if line[0] == "property"]
+    if any(line[1] not in ("float", "float32") for line in properties):
+        raise ValueError("expected float properties only")
+    comments = {" ".join(line[1:3]): " ".join(line[3:]) for line in lines if line[0] == "comment"}
+    return int(elements[0][2]), [line[2] for line in properties], comments

@@ -1,0 +1,31 @@
+"""Training state on disk: ``state.safetensors`` beside a finished scene, and checkpoints inside a stage.
+
+Everything is a tensor, the step included: metadata of several keys would be written in no fixed order.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from cleargs.files import write_bytes
+from cleargs.progress import Reporter
+
+
+def save_state(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Write named tensors atomically; equal tensors give equal bytes."""
+    write_bytes(path, save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
+
+
+def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:
+    """The tensors at ``path``; None where there is no file, and (with a warning) where it is damaged."""
+    if not path.exists():
+        return None
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError, ValueError) as error:
+        reporter.warn(f"ignoring the damaged checkpoint {path.name}: {error}")
+        return None

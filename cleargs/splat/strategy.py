@@ -1,0 +1,177 @@
+"""Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
+
+As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
+the means are shaken by noise that only transparent Gaussians feel.
+
+Pure functions on numpy arrays: one thread, so the results depend on no thread count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Arrays = dict[str, F32]
+
+MAX_COPIES = 51
+"""Most copies that equation 9 is evaluated for, as in gsplat (its sum over binomials loses digits beyond)."""
+
+NOISE_CUT = 0.15
+"""Opacity above which the noise factor is under 1e-6, and is left out."""
+
+
+def budget_from_pixels(pixels: int) -> int:
+    """Hard budget of a capture whose active frames hold ``pixels`` pixels in all.
+
+    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
+    within [10,000, 150,000], which keeps an iteration on two cores well under a second.
+    """
+    return int(np.clip(pixels // 160, 10_000, 150_000))
+
+
+def sample(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """``count`` indices with replacement, in proportion to ``weights`` [N] >= 0 (sum > 0)."""
+    cumulative = np.cumsum(weights, dtype=np.float64)
+    drawn = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
+    return np.minimum(drawn, len(weights) - 1)
+
+
+def split_opacity(opacity: F64, copies: NDArray[np.int64]) -> tuple[F64, F64]:
+    """Opacity and scale factor with which ``copies`` [M] Gaussians at one place look like the one before.
+
+    Equation 9 of the paper: (opacities [M], factors on the scales [M]) from ``opacity`` [M] in (0, 1).
+    """
+    copies = np.minimum(copies, MAX_COPIES)
+    split = 1.0 - (1.0 - opacity) ** (1.0 / copies)
+    denominator = np.zeros_like(split)
+    for i in range(1, int(copies.max(initial=0)) + 1):
+        terms = sum(
+            math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1.0) * split ** (k + 1) for k in range(i)
+        )
+        denominator += np.where(i <= copies, terms, 0.0)
+    return split, opacity / denominator
+
+
+def relocate(
+    arrays: Arrays, moments: Sequence[Arrays], *, min_opacity: float, rng: np.random.Generator
+) -> int:
+    """Move dead Gaussians onto live ones drawn by opacity, in place; returns how many moved.
+
+    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which are
+    forgotten for every Gaussian that changed.
+    """
+    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
+    dead = np.flatnonzero(~(opacity > min_opacity))
+    alive = np.flatnonzero(opacity > min_opacity)
+    if not len(dead) or not len(alive):
+        return 0
+    sources = alive[sample(opacity[alive], len(dead), rng)]
+    changed = _split(arrays, sources, min_opacity)
+    for array in arrays.values():
+        array[dead] = array[sources]
+    for moment in moments:
+        for array in moment.values():
+            array[changed] = 0
+            array[dead] = 0
+    return len(dead)
+
+
+def grow(
+    arrays: Arrays,
+    moments: Sequence[Arrays],
+    *,
+    rate: float,
+    budget: int,
+    min_opacity: float,
+    rng: np.random.Generator,
+) -> tuple[Arrays, list[Arrays]]:
+    """Add copies, drawn by opacity: at most a share ``rate``, never beyond ``budget``.
+
+    Returns new arrays and moments. ``arrays`` and ``moments`` as in `relocate`; those given are changed and must
+    not be used again.
+    """
+    count = len(arrays["logit_opacities"])
+    extra = min(budget, int((1.0 + rate) * count)) - count
+    if extra <= 0:
+        return arrays, list(moments)
+    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
+    sources = sample(opacity, extra, rng)
+    changed = _split(arrays, sources, min_opacity)
+    grown = {name: np.concatenate([array, array[sources]]) for name, array in arrays.items()}
+    forgotten = []
+    for moment in moments:
+        for array in moment.values():
+            array[changed] = 0
+        forgotten.append(
+            {
+                name: np.concatenate([array, np.zeros((extra, *array.shape[1:]), array.dtype)])
+                for name, array in moment.items()
+            }
+        )
+    return grown, forgotten
+
+
+def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> NDArray[np.int64]:
+    """Give every Gaussian that ``sources`` names, once a copy, its share of opacity and scale, in place.
+
+    Returns their indices without repetition.
+    """
+    unique, counts = np.unique(sources, return_counts=True)
+    opacity = sigmoid(arrays["logit_opacities"][unique].astype(np.float64))
+    split, factor = split_opacity(opacity, counts + 1)
+    split = np.clip(split, min_opacity, 1.0 - 1e-7)
+    arrays["log_scales"][unique] += np.log(factor)[:, None].astype(np.float32)
+    arrays["logit_opacities"][unique] = np.log(split) - np.log1p(-split)
+    return unique
+
+
+def mean_noise(
+    log_scales: F32,
+    rotations: F32,
+    logit_opacities: F32,
+    *,
+    amount: float,
+    min_opacity: float,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.int64], F32]:
+    """Noise for one step: (indices [U] of the Gaussians that feel it, offsets of their means [U, 3]).
+
+    ``amount`` times the covariance times a normal draw, faded out by a sigmoid around ``min_opacity``
+    (gsplat, inject_noise_to_position). Gaussians whose factor is under 1e-6 are left out.
+    """
+    limit = np.float32(math.log(NOISE_CUT / (1.0 - NOISE_CUT)))
+    felt = np.flatnonzero(logit_opacities < limit)
+    opacity = sigmoid(logit_opacities[felt])
+    fade = sigmoid(np.float32(100.0) * (np.float32(min_opacity) - opacity))
+    draw = rng.standard_normal((len(felt), 3), dtype=np.float32)
+    rotation = rotation_matrices(rotations[felt])
+    variance = np.exp(np.float32(2.0) * log_scales[felt])
+    local = np.stack([_dot3(rotation[:, :, axis], draw) for axis in range(3)], axis=1) * variance  # S^2 R^T n
+    world = np.stack([_dot3(rotation[:, axis, :], local) for axis in range(3)], axis=1)
+    return felt, world * (fade * np.float32(amount))[:, None]
+
+
+def rotation_matrices(quaternions: F32) -> F32:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w x y z) of any length; zero: no rotation."""
+    norm = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
+    w, x, y, z = (quaternions / np.maximum(norm, np.float32(1e-12))).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+
+def sigmoid(x: NDArray[np.floating]) -> NDArray[np.floating]:
+    """1 / (1 + exp(-x)), in the type of ``x``; the input is kept within +-80, where exp stays finite."""
+    return 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+
+
+def _dot3(a: F32, b: F32) -> F32:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]

@@ -1,0 +1,176 @@
+"""What a training looks at: views (a camera, an image, a weight) and the bounded cache of their images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cleargs.errors import StageError
+from cleargs.splat.camera import Camera
+
+Pixels = NDArray[np.uint8] | NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image that a scene should explain."""
+
+    frame_id: int
+    camera: Camera
+    weight: float
+    """Factor on the loss: the RVA weight w_i of a real frame."""
+    kind: Literal["real", "pseudo"]
+    """A captured frame, or a repaired one."""
+    load: Callable[[], tuple[Pixels, Mask | None]]
+    """Gives image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and mask [H, W] (True counts; None: all do).
+    Called when first needed, and again when the cache could not keep the image."""
+
+
+class FrameRow(Protocol):
+    """The columns of ``ingest/frames`` that make a view (properties, since rows are immutable)."""
+
+    @property
+    def frame_id(self) -> int: ...
+    @property
+    def image(self) -> str: ...
+    @property
+    def mask(self) -> str | None: ...
+    @property
+    def registered(self) -> bool: ...
+    @property
+    def split(self) -> str: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+    @property
+    def qw(self) -> float | None: ...
+    @property
+    def qx(self) -> float | None: ...
+    @property
+    def qy(self) -> float | None: ...
+    @property
+    def qz(self) -> float | None: ...
+    @property
+    def tx(self) -> float | None: ...
+    @property
+    def ty(self) -> float | None: ...
+    @property
+    def tz(self) -> float | None: ...
+
+
+def view_of(frame: FrameRow, folder: Path, weight: float) -> View:
+    """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
+    pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
+    if not frame.registered or any(value is None for value in pose):
+        raise ValueError(f"frame {frame.frame_id} has no pose")
+    camera = Camera.from_quaternion(
+        *(float(value) for value in pose if value is not None),
+        width=frame.width,
+        height=frame.height,
+        fx=frame.fx,
+        fy=frame.fy,
+        cx=frame.cx,
+        cy=frame.cy,
+    )
+    image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
+    return View(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
+
+
+def real_views(frames: Iterable[FrameRow], weights: Mapping[int, float], folder: Path) -> list[View]:
+    """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
+    active = [
+        frame
+        for frame in frames
+        if frame.registered and frame.split == "train" and weights.get(frame.frame_id, 0.0) > 0.0
+    ]
+    return [
+        view_of(frame, folder, weights[frame.frame_id]) for frame in sorted(active, key=lambda f: f.frame_id)
+    ]
+
+
+class ImageCache:
+    """Decoded images within a limit of bytes, at one scale at a time.
+
+    An image is held as it was loaded (uint8), or as half floats where it was float32, and always passes
+    through that form, so that results do not depend on what fitted. What fits first stays: under the
+    trainer's shuffled epochs dropping the oldest would only lower the share of hits.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit = limit_bytes
+        self._used = 0
+        self._factor = 1.0
+        self._held: dict[View, tuple[NDArray[np.generic], Mask | None]] = {}
+        self._scratch: dict[tuple[int, int], Tensor] = {}
+
+    def get(self, view: View, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
+        """Image [H, W, 3] float32 and mask [H, W] (or None) of a view, resampled by ``factor``.
+
+        The image lies in a buffer of the cache, and is valid until the next call.
+        """
+        if factor != self._factor:
+            self._held.clear()
+            self._used, self._factor = 0, factor
+        entry = self._held.get(view)
+        if entry is None:
+            entry = _prepare(view, factor)
+            size = entry[0].nbytes + (0 if entry[1] is None else entry[1].nbytes)
+            if self._used + size <= self._limit:
+                self._held[view] = entry
+                self._used += size
+        stored, mask = entry
+        height, width = stored.shape[:2]
+        if (height, width) not in self._scratch:
+            self._scratch[height, width] = torch.empty(height, width, 3)
+        image = self._scratch[height, width]
+        divisor = np.float32(255.0 if stored.dtype == np.uint8 else 1.0)
+        np.divide(stored, divisor, out=image.numpy(), dtype=np.float32)
+        return image, None if mask is None else torch.from_numpy(mask)
+
+
+def _prepare(view: View, factor: float) -> tuple[NDArray[np.generic], Mask | None]:
+    """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
+    image, mask = view.load()
+    camera = view.camera.scaled(factor)
+    expected = (view.camera.height, view.camera.width)
+    if image.shape != (*expected, 3) or (mask is not None and mask.shape != expected):
+        raise StageError(
+            f"the image of frame {view.frame_id} is {image.shape[1]}x{image.shape[0]}, "
+            f"its camera {expected[1]}x{expected[0]}",
+            hint="run ingest again with --force ingest",
+        )
+    if factor != 1.0:
+        size = (camera.width, camera.height)
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return (image if image.dtype == np.uint8 else image.astype(np.float16)), mask
+
+
+def _load(image: Path, mask: Path | None) -> tuple[Pixels, Mask | None]:
+    """Decode a PNG and its mask (0 = ignore)."""
+    pixels = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
+    ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask is not None else None
+    if pixels is None or (mask is not None and ignored is None):
+        missing = image if pixels is None else mask
+        raise StageError(f"cannot read {missing}", hint="run ingest again with --force ingest")
+    return pixels, None if ignored is None else ignored > 0

@@ -1,0 +1,156 @@
+"""G0: the first scene, from the sparse points and the frames that RVA keeps, each with its weight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.splat.config import G0Config
+
+if TYPE_CHECKING:
+    from cleargs.splat.compensation import Exposure
+    from cleargs.splat.gaussians import Gaussians
+    from cleargs.splat.initialise import SparsePoints
+    from cleargs.splat.views import View
+
+VERSION = 1
+CONFIG = G0Config
+INPUTS: Mapping[str, tuple[str, ...]] = {
+    "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
+    "rva": ("frames.parquet",),
+}
+OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "state.safetensors")
+LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
+
+_SECONDS_PER_STEP = 0.02
+_SECONDS_PER_MEGAPIXEL = 0.2
+
+
+def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
+    """Nothing outside the store."""
+    return {}
+
+
+def estimate(context: StageContext[G0Config]) -> Estimate:
+    """Steps times a cost a pixel (two cores); memory is the image cache and the kernels' buffers."""
+    config, ingest = context.config, context.inputs.get("ingest", Path())
+    megapixels, count = 0.5, 50
+    if (ingest / "frames.parquet").is_file():
+        from cleargs.capture.tables import load_frames
+
+        frames = load_frames(ingest)
+        count = len(frames)
+        megapixels = max((frame.width * frame.height for frame in frames), default=0) / 1e6
+    seen = config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share
+    seconds = config.steps * (_SECONDS_PER_STEP + _SECONDS_PER_MEGAPIXEL * megapixels * seen)
+    memory = 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
+    return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
+
+
+def run(context: StageContext[G0Config]) -> StageResult:
+    """Sparse points -> Gaussians -> trained on the active frames, each with its RVA weight."""
+    from cleargs.capture.tables import load_frames
+    from cleargs.rva.tables import FRAMES as RVA_FRAMES
+    from cleargs.splat.compensation import Exposure, write_exposure
+    from cleargs.splat.initialise import sh_degree_from_views
+    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.ply import write_ply
+    from cleargs.splat.scene import Scene
+    from cleargs.splat.state import save_state
+    from cleargs.splat.tables import TRAIN
+    from cleargs.splat.trainer import evaluate_views, train
+    from cleargs.splat.views import real_views
+    from cleargs.tables import read_table, write_table
+
+    config, ingest = context.config, context.inputs["ingest"]
+    set_threads(context.threads)
+    allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
+    views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
+    sparse = _sparse_points(ingest, [view.frame_id for view in views])
+
+    sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree
+    gaussians = _start(context, views, sparse, sh_degree)
+    exposure, spread = _exposure(config, views, sparse)
+    trained = train(
+        Scene(gaussians, config.antialias, config.background),
+        views,
+        config,
+        seed=(context.seed,),
+        exposure=exposure,
+        checkpoint=context.checkpoints / "g0.safetensors",
+        reporter=context.reporter,
+        label="G0",
+        device=context.device,
+    )
+    write_ply(context.out / "scene.ply", trained.scene)
+    write_table(context.out / "train.parquet", trained.rows, TRAIN)
+    learned = trained.exposure or Exposure.identity([view.frame_id for view in views])
+    write_exposure(context.out / "exposure.parquet", learned)
+    save_state(context.out / "state.safetensors", trained.state)
+
+    psnr = dict(
+        zip((view.frame_id for view in views), evaluate_views(trained.scene, views, learned), strict=True)
+    )
+    strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
+    return StageResult(
+        summary={
+            "views": len(views),
+            "gaussians_start": gaussians.num,
+            "gaussians": trained.scene.gaussians.num,
+            "steps": config.steps,
+            "sh_degree": sh_degree,
+            "exposure": exposure is not None,
+            "exposure_spread": spread,
+            "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
+            "psnr_active": _mean(list(psnr.values())),
+        }
+    )
+
+
+def _sparse_points(ingest: Path, frame_ids: list[int]) -> SparsePoints:
+    """The sparse points, and which of them each of these frames observes."""
+    import numpy as np
+
+    from cleargs.capture.tables import load_observations, load_points
+    from cleargs.splat.initialise import SparsePoints
+
+    points = load_points(ingest)
+    frame_id, point_id = load_observations(ingest)
+    order = np.argsort(points.point_id)
+    index = order[np.searchsorted(points.point_id, point_id, sorter=order)]
+    return SparsePoints(points.xyz, points.rgb, [index[frame_id == wanted] for wanted in frame_ids])
+
+
+def _start(
+    context: StageContext[G0Config], views: list[View], sparse: SparsePoints, sh_degree: int
+) -> Gaussians:
+    """One Gaussian a sparse point, and more behind random pixels until there are ``min_points``."""
+    from cleargs.splat.initialise import add_points, from_points
+
+    config = context.config
+    missing = config.min_points - len(sparse.xyz)
+    if missing > 0:
+        context.reporter.info(f"G0: {len(sparse.xyz)} sparse points, {missing} are added between them")
+        sparse = add_points(sparse, views, missing, seed=context.seed)
+    return from_points(
+        sparse, sh_degree=sh_degree, init_scale=config.init_scale, init_opacity=config.init_opacity
+    )
+
+
+def _exposure(
+    config: G0Config, views: list[View], sparse: SparsePoints
+) -> tuple[Exposure | None, float | None]:
+    """Affines to learn, or None; and the measured spread of the frames' gains where it decides."""
+    from cleargs.splat.compensation import Exposure, frame_gains, gain_spread
+
+    frame_ids = [view.frame_id for view in views]
+    if config.exposure != "auto":
+        return (Exposure.identity(frame_ids) if config.exposure == "on" else None), None
+    spread = gain_spread(frame_gains(views, sparse))
+    return (Exposure.identity(frame_ids) if spread > config.exposure_threshold else None), spread
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,128 @@
+"""Small scenes for the splatting tests, and the comparison of the kernels with the oracle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cleargs.splat.camera import Camera
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.render import render
+
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+def make_camera(width: int = 64, height: int = 48, focal: float | None = None) -> Camera:
+    """A camera turned by 0.1 rad about y and off the origin, its principal point off the centre."""
+    focal = 0.9 * width if focal is None else focal
+    angle = 0.1
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = 0.2, -0.1, 0.3
+    return Camera(width, height, focal, 1.05 * focal, 0.52 * width, 0.47 * height, pose)
+
+
+def make_gaussians(
+    camera: Camera,
+    n: int,
+    *,
+    seed: int = 0,
+    opacity: tuple[float, float] = (0.05, 0.95),
+    size_px: float = 4.0,
+    aspect: float = 2.0,
+    sh_count: int = 16,
+) -> Gaussians:
+    """``n`` random Gaussians in and a little beyond the camera's frustum, quaternions not normalised."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(2, 10, n)
+    u = rng.uniform(-0.1, 1.1, n) * camera.width
+    v = rng.uniform(-0.1, 1.1, n) * camera.height
+    local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    sigma = (size_px * np.exp(rng.normal(0, 0.4, n)) * z / camera.fx)[:, None]
+    opacities = rng.uniform(*opacity, n)
+    sh = rng.normal(0, 0.15, (n, sh_count, 3))
+    sh[:, 0] = rng.normal(0.3, 1.0, (n, 3))
+    arrays = (
+        (local - translation) @ rotation,
+        np.log(sigma * aspect ** rng.uniform(-1, 1, (n, 3))),
+        rng.normal(size=(n, 4)) * rng.uniform(0.3, 3.0, (n, 1)),
+        np.log(opacities / (1 - opacities)),
+        sh,
+    )
+    return Gaussians(*(torch.tensor(array, dtype=torch.float32) for array in arrays))
+
+
+@dataclass
+class Comparison:
+    """Worst errors of the kernels against the oracle."""
+
+    image: float  # max |error| of image and alpha
+    depth: float  # max |error| relative to the largest depth
+    gradients: dict[str, float]  # max |error| / max |gradient| of each parameter
+    alpha: Tensor  # [H, W] of the oracle
+    gradient_sizes: dict[str, float]  # max |gradient|
+    fragile: float  # share of pixels left out because a float32 may fall on the other side of a cut-off
+
+
+def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
+    """Copies that collect gradients."""
+    return Gaussians(
+        *(tensor.detach().to(dtype).clone().requires_grad_() for tensor in gaussians.tensors().values())
+    )
+
+
+def compare(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    antialias: bool = False,
+    sh_degree: int | None = None,
+    margin: float = 2e-5,
+) -> Comparison:
+    """Render with kernels and oracle and differentiate a random linear functional of all three outputs.
+
+    Pixels where an alpha lies within ``margin`` (relative) of 1/255, or a transmittance of 1e-4, are left
+    out: there the image is discontinuous and float32 may decide the other way.
+    """
+    from cleargs.splat.engine import sh_count
+    from cleargs.splat.kernels import reference
+
+    single, double = leaves(gaussians, torch.float32), leaves(gaussians, torch.float64)
+    ours = render(single, camera, background=BACKGROUND, sh_degree=sh_degree, antialias=antialias)
+    truth = reference.render(
+        double,
+        camera,
+        background=BACKGROUND,
+        sh_count=sh_count(double, sh_degree),
+        antialias=antialias,
+    )
+    safe = truth.margin > margin
+    generator = torch.Generator().manual_seed(7)
+    shape = (camera.height, camera.width)
+    weights = [torch.randn(*shape, k, generator=generator, dtype=torch.float64) for k in (3, 1, 1)]
+    for outputs in (ours, truth):
+        functional = sum(
+            (output.double().reshape(*shape, -1) * weight * safe[..., None]).sum()
+            for output, weight in zip(outputs[:3], weights, strict=True)
+        )
+        functional.backward()
+    gradients, sizes = {}, {}
+    for name in single.tensors():
+        mine, exact = getattr(single, name).grad.double(), getattr(double, name).grad
+        sizes[name] = exact.abs().max().item()
+        gradients[name] = (mine - exact).abs().max().item() / max(sizes[name], 1e-30)
+    image_error = ((ours.image - truth.image).abs() * safe[..., None]).max().item()
+    alpha_error = ((ours.alpha - truth.alpha).abs() * safe).max().item()
+    depth_error = ((ours.depth - truth.depth).abs() * safe).max().item()
+    return Comparison(
+        image=max(image_error, alpha_error),
+        depth=depth_error / max(1.0, truth.depth.max().item()),
+        gradients=gradients,
+        alpha=truth.alpha.detach(),
+        gradient_sizes=sizes,
+        fragile=1.0 - safe.double().mean().item(),
+    )

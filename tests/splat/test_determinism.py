@@ -1,0 +1,62 @@
+"""Bitwise equality across thread counts and runs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = """
+import hashlib, sys
+import torch
+from splat_scenes import make_camera, make_gaussians
+from cleargs.splat.adam import adam_step
+from cleargs.splat.engine import Engine
+from cleargs.splat.exposure import affine_backward
+from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.losses import photometric_loss, psnr
+
+def digest(threads):
+    set_threads(threads)
+    result = hashlib.sha256()
+    camera = make_camera(150, 101)
+    scene = make_gaussians(camera, 1500, size_px=3.0)
+    scene.means[:300, 2] = scene.means[0, 2]
+    target = torch.rand(101, 150, 3, generator=torch.Generator().manual_seed(1))
+    mask = target[..., 0] > 0.2
+    engine = Engine()
+    moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
+    for step in range(1, 4):
+        view = engine.forward(scene, camera, depth=True, antialias=step == 2)
+        loss = photometric_loss(view.image, target, ssim_lambda=0.2, mask=mask)
+        gradients = engine.backward(loss.grad_image, view.alpha, view.depth)
+        _, affine = affine_backward(view.image, torch.eye(3, 4), loss.grad_image)
+        for tensor in (*view, loss.grad_image, affine, engine.radii, *gradients.tensors().values()):
+            result.update(tensor.numpy().tobytes())
+        result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())
+        for name, tensor in scene.tensors().items():
+            adam_step(tensor, getattr(gradients, name), *moments[name], step=step, lr=0.01)
+    for tensor in scene.tensors().values():
+        assert tensor.isfinite().all()
+        result.update(tensor.numpy().tobytes())
+    return result.hexdigest()
+
+print(*(digest(threads) for threads in (1, 2, 16, 16)))
+"""
+
+
+def run() -> list[str]:
+    here = Path(__file__).parent
+    environment = os.environ | {"NUMBA_NUM_THREADS": "16", "PYTHONPATH": str(here)}
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.split()
+
+
+def test_training_steps_are_bitwise_equal_for_1_2_and_16_threads_and_for_two_runs():
+    digests = [*run(), *run()]
+    assert len(digests) == 8
+    assert len(set(digests)) == 1

@@ -1,0 +1,131 @@
+"""Cameras, and finite differences of the whole rendering."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians
+
+from cleargs.errors import InputError
+from cleargs.splat.camera import Camera
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels import reference
+from cleargs.splat.kernels.cpu import binning, projection
+from cleargs.splat.kernels.cpu.layout import SPLAT_COLUMNS, TILE
+from cleargs.splat.render import render
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("name", ["means", "log_scales", "rotations", "logit_opacities", "sh"])
+def test_gradient_equals_finite_differences(name, antialias):
+    """Central differences of the oracle along random directions, against the kernels' gradient.
+
+    The image jumps where an alpha crosses 1/255, so only pixels well away from that count. With a step of
+    1e-6 in float64 the difference quotient is good to about 1e-8, the float32 gradient to some 1e-6.
+    """
+    camera = make_camera(32, 24)
+    gaussians = make_gaussians(camera, 25, size_px=3.0)
+    exact = leaves(gaussians, torch.float64).detach()
+    safe = reference.render(exact, camera, background=BACKGROUND, antialias=antialias).margin > 2e-3
+    assert safe.double().mean() > 0.6
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.randn(24, 32, 3, generator=generator, dtype=torch.float64) * safe[..., None]
+    live = leaves(gaussians, torch.float32)
+    (render(live, camera, background=BACKGROUND, antialias=antialias).image * weights).sum().backward()
+    gradient = getattr(live, name).grad.double()
+    errors = []
+    for _ in range(3):
+        direction = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
+        values = []
+        for sign in (1, -1):
+            moved = Gaussians(**{**exact.tensors(), name: getattr(exact, name) + sign * 1e-6 * direction})
+            image = reference.render(moved, camera, background=BACKGROUND, antialias=antialias).image
+            values.append((image * weights).sum().item())
+        slope = (values[0] - values[1]) / 2e-6
+        size = (gradient * direction).abs().sum().item()
+        assert size > 0.1
+        errors.append(abs(slope - (gradient * direction).sum().item()) / size)
+    assert np.median(errors) < 3e-6
+
+
+def project(gaussians, camera, antialias=False):
+    n = gaussians.num
+    splats, tiles, radii = (
+        np.zeros((n, SPLAT_COLUMNS), np.float32),
+        np.empty(n, np.int64),
+        np.empty(n, np.float32),
+    )
+    arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
+    view = projection.view_of(camera)
+    projection.project(*arrays, 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
+    return splats, tiles, radii
+
+
+@pytest.mark.parametrize("aspect", [2.0, 30.0])
+def test_tiles_hold_every_touched_pixel_and_few_others(aspect):
+    """The tile list against alpha >= 1/255 at every pixel, from the float64 projection."""
+    camera = make_camera(150, 100)
+    gaussians = make_gaussians(camera, 60, size_px=8.0, aspect=aspect)
+    splats, tiles, radii = project(gaussians, camera)
+    offsets = np.concatenate([[0], np.cumsum(tiles)])
+    pairs = np.empty(offsets[-1], np.uint32)
+    binning.list_pairs(splats, offsets, camera.width, camera.height, pairs)
+    tiles_x = -(-camera.width // TILE)
+
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    needed = listed = 0
+    for g in range(gaussians.num):
+        one = leaves(gaussians.select(torch.tensor([g])), torch.float64).detach()
+        truth = reference.project(one, camera, 16, False)
+        (mx, my), (a, b, c) = truth.means[0].numpy(), truth.conics[0].numpy()
+        power = 0.5 * (a * (x - mx) ** 2 + 2 * b * (x - mx) * (y - my) + c * (y - my) ** 2)
+        rows, columns = np.nonzero(truth.opacities[0].item() * np.exp(-power) >= 1 / 255)
+        touched = set(rows // TILE * tiles_x + columns // TILE)
+        mine = pairs[offsets[g] : offsets[g + 1]].tolist()
+        assert touched <= set(mine)
+        assert len(mine) == len(set(mine))
+        if touched:
+            assert np.abs(columns + 0.5 - mx).max() <= radii[g] + 1e-3
+        needed += len(touched)
+        listed += len(mine)
+    assert needed > 100
+    # A row of tiles is cut by the ellipse between its pixel centres, so next to nothing is listed in vain.
+    assert listed <= 1.02 * needed + 2
+
+
+def test_order_is_by_depth_then_index():
+    n = 3000
+    rng = np.random.default_rng(0)
+    splats = np.zeros((n, SPLAT_COLUMNS), np.float32)
+    splats[:, 9] = rng.choice(np.concatenate([rng.uniform(0.01, 1e4, 200), [0.01, 1e30]]), n)
+    tiles = rng.integers(0, 2, n)
+    visible = np.flatnonzero(tiles)
+    scratch = [np.empty((2, len(visible)), np.uint32) for _ in range(2)]
+    order = scratch[1][binning.depth_order(splats, tiles, *scratch)]
+    expected = visible[np.argsort(splats[visible, 9], kind="stable")]
+    np.testing.assert_array_equal(order, expected)
+
+
+def test_camera():
+    camera = Camera.from_quaternion(
+        2 * np.cos(0.3), 0, 2 * np.sin(0.3), 0, 1, 2, 3, width=100, height=50, fx=80, fy=70, cx=51, cy=24
+    )
+    # A turn by 0.6 about y takes z to x = sin 0.6.
+    np.testing.assert_allclose(camera.world_to_camera[:3, 2], [np.sin(0.6), 0, np.cos(0.6)], atol=1e-15)
+    np.testing.assert_allclose(camera.world_to_camera @ [*camera.centre, 1], [0, 0, 0, 1], atol=1e-15)
+    half = camera.scaled(0.5)
+    assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (50, 25, 40, 35, 25.5, 12)
+    assert camera.scaled(1e-6).width == 1
+    with pytest.raises(InputError, match="focal"):
+        Camera(10, 10, 0.0, 1.0, 5.0, 5.0, np.eye(4))
+    with pytest.raises(InputError, match="not usable"):
+        Camera(10, 10, 1.0, 1.0, float("nan"), 5.0, np.eye(4))
+
+
+def test_scaled_camera_sees_the_same():
+    """Twice the resolution, averaged 2 x 2, is close to the original for splats much larger than a pixel."""
+    camera = make_camera(32, 24)
+    gaussians = make_gaussians(camera, 20, size_px=8.0)
+    fine = render(gaussians, camera.scaled(2.0)).image.reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))
+    assert (fine - render(gaussians, camera).image).abs().mean() < 0.01

@@ -1,0 +1,73 @@
+"""Where compiled kernels are kept, and compiling ahead of use."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from cleargs.splat.kernels import runtime
+
+
+def test_cache_folder_is_named_by_the_sources(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = runtime.cache_folder()
+    assert folder == tmp_path / f"kernels-{runtime.kernel_digest()}"
+    assert folder.is_dir()
+
+
+def test_digest_follows_every_kernel_source(monkeypatch):
+    before = runtime.kernel_digest()
+    read = Path.read_bytes
+    for name in ("constants.py", "simd.py", "harmonics.py"):
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "read_bytes", lambda path, name=name: read(path) + b"#" * (path.name == name))
+            assert runtime.kernel_digest() != before
+    assert runtime.kernel_digest() == before
+
+
+def test_cache_falls_back_to_a_temporary_folder(monkeypatch, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.touch()  # a file, so that no folder can be made below it, not even by root
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.setenv(name, str(blocked))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = runtime.cache_folder()
+    assert folder.parent == tmp_path
+    assert folder.name.startswith("cleargs-kernels-")
+
+
+def test_warm_up_reports_every_kernel():
+    seen = []
+    runtime.warm_up(lambda name, done, total: seen.append((name, done, total)))
+    total = len(seen) - 1
+    assert total > 5
+    assert [done for _, done, _ in seen] == list(range(total + 1))
+    assert {n for _, _, n in seen} == {total}
+
+
+def test_set_threads():
+    from cleargs.splat.kernels.cpu import launch
+
+    before = launch.threads()
+    try:
+        runtime.set_threads(1)
+        assert launch.threads() == 1
+        runtime.set_threads(10_000)
+        assert launch.threads() >= 1
+        with pytest.raises(ValueError, match="0 threads"):
+            runtime.set_threads(0)
+    finally:
+        runtime.set_threads(before)
+
+
+def test_importing_the_core_imports_neither_numba_nor_media_libraries():
+    program = (
+        "import sys, cleargs.splat.render, cleargs.splat.engine, cleargs.splat.losses, cleargs.splat.adam\n"
+        "print([name for name in ('numba', 'pycolmap', 'OpenImageIO', 'cv2') if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
