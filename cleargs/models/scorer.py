@@ -1,0 +1,99 @@
+"""No-reference image scorers: how good does an image look, judged without the clean one.
+
+RIVR asks two of them: the primary one decides between candidates, the other breaks near-ties (the paper uses MUSIQ
+and CLIP-IQA). The two that ship with ClearGS were trained for it and bear their own names.
+
+Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a strongly
+blurred frame lies near 70, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from cleargs.errors import InputError
+from cleargs.models.naturalness import StatisticsScorer
+from cleargs.models.onnx import OnnxModel
+from cleargs.models.tile_mean import Image, mean_over_tiles
+
+CLARITY = "clarity-net"
+"""The embedded network, meant for the primary role."""
+NATURALNESS = "naturalness-stats"
+"""The embedded image statistics, meant for the tie-break role."""
+
+_TRAINED_ON = 128  # the side of clarity-net's training patches
+
+
+class Scorer(Protocol):
+    """Judges single images."""
+
+    @property
+    def name(self) -> str:
+        """A short name for tables."""
+
+    @property
+    def digest(self) -> str:
+        """Identifies the weights; part of the store key."""
+
+    def score(self, image: Image, *, threads: int = 1) -> float:
+        """Higher is better, on a scale that ends at 100; bitwise equal for any ``threads``.
+
+        image: [H, W, 3] float32 sRGB in [0, 1], at least 32 pixels on each side.
+        """
+
+
+class LearnedScorer:
+    """A scoring network in an ONNX file: [N, 3, H, W] float32 sRGB in [0, 1] in, one score an image out.
+
+    With ``tile``, or where the model fixes its input size, the score is the mean over tiles of that side: LPIPS is a
+    mean over pixels too, so the score of an image then hardly depends on its size. Otherwise the model sees the
+    image at once.
+
+    Raises InputError when the file is missing, no ONNX model, or of another form.
+    """
+
+    def __init__(self, path: Path, name: str | None = None, tile: int | None = None) -> None:
+        model = OnnxModel(path)
+        shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+        if len(shape) != 4 or shape[0] not in (None, 1) or shape[1] != 3:
+            raise InputError(
+                f"{path} does not take RGB images: its inputs are {[info.shape for info in model.inputs]}",
+                hint="a scoring model takes [N, 3, H, W] and returns one score an image",
+            )
+        self.name = name or path.stem
+        self._model = model
+        self._tile = (shape[2] or tile, shape[3] or tile)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the ONNX file."""
+        return self._model.digest
+
+    def score(self, image: Image, *, threads: int = 1) -> float:
+        """See Scorer."""
+        return mean_over_tiles(self._score_tile, image, self._tile, threads)
+
+    def _score_tile(self, tile: Image) -> float:
+        planes = np.ascontiguousarray(tile.transpose(2, 0, 1)[None], np.float32)
+        return float(self._model.run(planes)[0].ravel()[0])
+
+
+def load_scorer(spec: str) -> Scorer:
+    """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, or the path of an ONNX file.
+
+    Raises InputError for any other name or an unusable file.
+    """
+    if spec == CLARITY:
+        weights = files("cleargs.models") / "weights" / "scorer.onnx"
+        return LearnedScorer(Path(str(weights)), CLARITY, _TRAINED_ON)
+    if spec == NATURALNESS:
+        return StatisticsScorer(NATURALNESS)
+    if spec.endswith(".onnx"):
+        return LearnedScorer(Path(spec))
+    raise InputError(
+        f"no scorer is called {spec!r}", hint=f"use {CLARITY}, {NATURALNESS} or the path of an .onnx file"
+    )

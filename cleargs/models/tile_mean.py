@@ -1,0 +1,54 @@
+"""The mean of a figure over tiles that cover an image: how both embedded scorers see an image of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+
+Image: TypeAlias = NDArray[np.float32]
+
+MIN_SIDE = 32
+
+
+def mean_over_tiles(
+    figure: Callable[[Image], float],
+    image: Image,
+    sides: tuple[int | None, int | None],
+    threads: int = 1,
+) -> float:
+    """The mean of ``figure`` over evenly spaced tiles [h, w, 3] that together cover ``image`` [H, W, 3].
+
+    ``sides`` are the height and width of a tile, None for the whole side; a smaller image is one tile in that
+    direction. The mean is taken in the tiles' order, so it does not depend on ``threads``.
+    Raises InputError for anything but a colour image of at least 32 pixels on each side.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
+        raise InputError(
+            f"an image of shape {image.shape} cannot be scored",
+            hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
+        )
+    tiles = [
+        image[row, column]
+        for row in _windows(image.shape[0], sides[0])
+        for column in _windows(image.shape[1], sides[1])
+    ]
+    if threads == 1 or len(tiles) == 1:
+        figures = [figure(tile) for tile in tiles]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            figures = list(pool.map(figure, tiles))
+    return float(np.mean(figures, dtype=np.float64))
+
+
+def _windows(length: int, tile: int | None) -> list[slice]:
+    if tile is None or length <= tile:
+        return [slice(0, length)]
+    count = -(-length // tile)
+    starts = np.linspace(0, length - tile, count).round().astype(int).tolist()
+    return [slice(start, start + tile) for start in starts]

@@ -1,0 +1,195 @@
+"""Synthetic degradations of sharp photographs: motion blur, defocus, noise, JPEG.
+
+Light adds up before a camera encodes it, so blur acts on scene-linear values:
+
+    sRGB -> linear -> convolve -> sRGB -> noise -> 8 bits -> (JPEG)
+
+Noise is added to the *encoded* values: its level then means the same in shadows and highlights, and "at most
+1/255" really is one code value (in linear light it would be thirteen of them in the shadows).
+
+Images are [H, W, 3] float32 sRGB in [0, 1]. Everything random takes a ``numpy.random.Generator``; nothing holds state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image: TypeAlias = NDArray[np.float32]
+Kernel: TypeAlias = NDArray[np.float32]
+
+IDENTITY: Kernel = np.ones((1, 1), np.float32)
+
+
+def srgb_to_linear(image: Image) -> Image:
+    """IEC 61966-2-1 decoding of sRGB values in [0, 1], any shape."""
+    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(image: Image) -> Image:
+    """IEC 61966-2-1 encoding of linear values in [0, 1], any shape."""
+    curve = 1.055 * np.maximum(image, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(image <= 0.0031308, image * 12.92, curve).astype(np.float32)
+
+
+def line_path(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A straight stroke at constant speed in a random direction: points [N, 2] evenly spaced in time."""
+    angle = rng.uniform(0.0, np.pi)
+    t = np.linspace(-0.5, 0.5, 257)
+    return np.outer(t, [np.cos(angle), np.sin(angle)])
+
+
+def handheld_path(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A smooth trajectory of a shaking hand: points [N, 2] evenly spaced in time.
+
+    A drift (constant velocity) plus three harmonics of tremor with falling amplitude; speed varies along the path,
+    so the kernel is denser where the hand turns, as in Boracchi & Foi, "Modeling the performance of image
+    restoration from motion blur" (2012).
+    """
+    t = np.linspace(0.0, 1.0, 257)[:, None]
+    path = t * rng.normal(size=2)
+    tremor = rng.uniform(0.0, 1.0)
+    for harmonic in (1, 2, 3):
+        phase = rng.uniform(0.0, 2 * np.pi, size=2)
+        amplitude = tremor * rng.normal(size=2) / (2.0 * harmonic)
+        path = path + amplitude * np.sin(np.pi * harmonic * t + phase)
+    return path
+
+
+def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
+    """The blur kernel of a path [N, 2] scaled so that its two farthest points lie ``length`` pixels apart.
+
+    The kernel is odd, square, sums to one, and has its centre of mass at its centre, so that blurring does not shift
+    the image. Points are splatted bilinearly.
+    """
+    coarse = path[::4]
+    diameter = float(np.linalg.norm(coarse[:, None] - coarse[None], axis=-1).max())
+    points = (path - path.mean(axis=0)) * (length / diameter if diameter > 0 else 0.0)
+    radius = int(np.ceil(np.abs(points).max())) + 1
+    size = 2 * radius + 1
+    corner = np.floor(points).astype(np.int64)
+    frac = points - corner
+    kernel = np.zeros((size, size), np.float64)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            weight = np.abs(1 - dx - frac[:, 0]) * np.abs(1 - dy - frac[:, 1])
+            np.add.at(kernel, (corner[:, 1] + dy + radius, corner[:, 0] + dx + radius), weight)
+    return (kernel / kernel.sum()).astype(np.float32)
+
+
+def motion_kernel(rng: np.random.Generator, length: float, line_share: float = 0.4) -> Kernel:
+    """A motion kernel of the given length in pixels (largest distance between two of its points).
+
+    Straight with probability ``line_share``, otherwise handheld.
+    """
+    path = line_path(rng) if rng.random() < line_share else handheld_path(rng)
+    return rasterise_path(path, length)
+
+
+def disc_kernel(radius: float) -> Kernel:
+    """A defocus disc of the given radius in pixels with anti-aliased rim; sums to one."""
+    reach = int(np.ceil(radius)) + 1
+    sub = 8
+    axis = (np.arange((2 * reach + 1) * sub) + 0.5) / sub - reach - 0.5
+    inside = (axis[:, None] ** 2 + axis[None, :] ** 2 <= radius**2).astype(np.float64)
+    kernel = inside.reshape(2 * reach + 1, sub, 2 * reach + 1, sub).mean(axis=(1, 3))
+    total = kernel.sum()
+    return (kernel / total).astype(np.float32) if total > 0 else IDENTITY
+
+
+def convolve(linear: Image, kernel: Kernel) -> Image:
+    """Convolution of an image [H, W, 3] with a kernel, borders reflected."""
+    if kernel.shape == (1, 1):
+        return linear * kernel[0, 0]
+    flipped = np.ascontiguousarray(kernel[::-1, ::-1])  # filter2D correlates
+    return np.asarray(cv2.filter2D(linear, -1, flipped, borderType=cv2.BORDER_REFLECT_101), np.float32)
+
+
+def jpeg(image: Image, quality: int) -> Image:
+    """The image after one JPEG round trip at the given quality (4:2:0 chroma, OpenCV's default)."""
+    code = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", code[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / np.float32(255.0)
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """One degradation of one image.
+
+    kernel: blur kernel; the identity leaves the image sharp.
+    second: where given, blur changes across the image from ``kernel`` to ``second`` along ``direction``, as under
+        camera rotation or depth.
+    direction: angle in radians of that change.
+    noise: standard deviation of Gaussian noise on encoded values in [0, 1].
+    quantise: round to 8 bits.
+    jpeg_quality: None for no JPEG.
+    """
+
+    kernel: Kernel = field(default_factory=lambda: IDENTITY)
+    second: Kernel | None = None
+    direction: float = 0.0
+    noise: float = 0.0
+    quantise: bool = True
+    jpeg_quality: int | None = None
+
+
+def degrade(image: Image, degradation: Degradation, rng: np.random.Generator) -> Image:
+    """The degraded image: [H, W, 3] float32 sRGB in [0, 1] in and out. ``rng`` draws the noise."""
+    if degradation.kernel.shape == (1, 1) and degradation.second is None:
+        out = image
+    else:
+        linear = srgb_to_linear(image)
+        blurred = convolve(linear, degradation.kernel)
+        if degradation.second is not None:
+            ramp = _ramp(image.shape[0], image.shape[1], degradation.direction)
+            blurred = blurred + ramp[..., None] * (convolve(linear, degradation.second) - blurred)
+        out = linear_to_srgb(np.clip(blurred, 0.0, 1.0))
+    if degradation.noise > 0.0:
+        out = out + np.float32(degradation.noise) * rng.standard_normal(image.shape, np.float32)
+    out = np.clip(out, 0.0, 1.0)
+    if degradation.quantise:
+        out = np.round(out * 255.0) / np.float32(255.0)
+    if degradation.jpeg_quality is not None:
+        out = jpeg(out, degradation.jpeg_quality)
+    return np.ascontiguousarray(out, np.float32)
+
+
+def _ramp(height: int, width: int, direction: float) -> Image:
+    """Values from 0 to 1 across the image along a direction: [H, W]."""
+    y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+    x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
+    reach = abs(np.cos(direction)) + abs(np.sin(direction))
+    along = np.cos(direction) * x + np.sin(direction) * y
+    return np.asarray(0.5 + 0.5 * along / reach, np.float32)
+
+
+def handheld_degradation(rng: np.random.Generator) -> Degradation:
+    """What a frame of a handheld video may look like: the distribution the restoration expert is trained on.
+
+    Sharp 10 %, motion shorter than 7 px 12 %, defocus 8 %, motion of 7-22 px 70 %; a fifth of the blurred ones vary
+    across the image. Noise up to 1/255 in most, up to 3/255 in a quarter; JPEG of quality 60-95 in a quarter.
+    """
+    kind = rng.random()
+    second = None
+    if kind < 0.10:
+        kernel = IDENTITY
+    elif kind < 0.22:
+        kernel = motion_kernel(rng, rng.uniform(0.5, 7.0))
+    elif kind < 0.30:
+        kernel = disc_kernel(rng.uniform(0.7, 5.0))
+    else:
+        length = rng.uniform(7.0, 22.0)
+        kernel = motion_kernel(rng, length)
+        if rng.random() < 0.2:
+            second = motion_kernel(rng, length * rng.uniform(0.5, 1.0))
+    return Degradation(
+        kernel=kernel,
+        second=second,
+        direction=rng.uniform(0.0, 2 * np.pi),
+        noise=rng.uniform(0.0, 3.0 if rng.random() < 0.25 else 1.0) / 255.0,
+        jpeg_quality=int(rng.integers(60, 96)) if rng.random() < 0.25 else None,
+    )
