@@ -1,0 +1,75 @@
+"""Settings of RIVR and of the consolidation."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cleargs.splat.config import DistilConfig
+
+MAX_ROUNDS = 16
+"""Most rounds of RIVR."""
+
+
+class HarmConfig(BaseModel):
+    """When a distilled scene counts as worse than G0 on the frames held back from distillation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    psnr_margin: float = Field(0.5, ge=0.0, le=100.0, description="mean PSNR may fall by this much, dB")
+    score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
+
+
+class RepairDistilConfig(DistilConfig):
+    """Joint distillation of raw frames and repairs."""
+
+    steps: int = Field(300, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    pseudo_weight: float = Field(0.5, ge=0, description="factor on the loss of a repaired view")
+
+
+class RivrConfig(BaseModel):
+    """Render-Guided In-Video Restoration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="times that every target frame is repaired")
+    targets: Literal["all", "degraded"] = Field(
+        "all", description="frames to repair: all registered training frames, or those that are not strong"
+    )
+    expert: str = Field(
+        "embedded",
+        description="restoration expert: embedded, or the path of an ONNX file",
+        json_schema_extra={"key": False},  # its content is in the key
+    )
+    primary_scorer: str = Field(
+        "clarity-net", description="decides between candidates: the name of a scorer, or an ONNX file"
+    )
+    tiebreak_scorer: str = Field(
+        "naturalness-stats",
+        description="decides near-ties: the name of a scorer, or an ONNX file",
+    )
+    margin: float = Field(
+        1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
+    )
+    fuse_sigma: float = Field(
+        2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
+    )
+    use_observation: bool = Field(
+        True, description="false: the ablation whose expert restores the render instead of the raw frame"
+    )
+    use_fused: bool = Field(True, description="false: the ablation without the fused candidate")
+    distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
+    harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
+
+
+class ConsolidateConfig(BaseModel):
+    """Full-Trajectory Repair Consolidation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scorer: str = Field(
+        "clarity-net", description="measures harm: the name of a scorer, or the path of an ONNX file"
+    )
+    distil: RepairDistilConfig = Field(RepairDistilConfig(), description="the final distillation")
+    harm: HarmConfig = Field(HarmConfig(), description="when the consolidated scene is rejected")

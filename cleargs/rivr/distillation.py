@@ -1,0 +1,111 @@
+"""Joint distillation of raw frames and repairs into the scene, and what came of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+
+from cleargs.files import atomic_path
+from cleargs.models.scorer import Scorer
+from cleargs.progress import Reporter
+from cleargs.rivr.candidates import Image
+from cleargs.rivr.gates import Fidelity
+from cleargs.rivr.rounds import observation
+from cleargs.rivr.selection import hide_masked
+from cleargs.splat.compensation import Exposure, read_exposure, write_exposure
+from cleargs.splat.config import DistilConfig
+from cleargs.splat.engine import Engine
+from cleargs.splat.ply import read_ply, write_ply
+from cleargs.splat.state import save_state
+from cleargs.splat.tables import TRAIN
+from cleargs.splat.trainer import evaluate_views, render_view, train
+from cleargs.splat.views import View
+from cleargs.tables import read_table, write_table
+
+SCENE, EXPOSURE, STATE, LOG = "scene.ply", "exposure.parquet", "state.safetensors", "train.parquet"
+REJECTED = "rejected.ply"
+
+
+class Snapshot:
+    """A scene on disk (``scene.ply`` and ``exposure.parquet`` in ``folder``), ready to be rendered."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.scene = read_ply(folder / SCENE)
+        self._written_exposure = read_exposure(folder / EXPOSURE)
+        self._engine = Engine()
+
+    @property
+    def exposure(self) -> Exposure | None:
+        """The affines of the frames; None where compensation is off."""
+        return self._written_exposure if self._written_exposure.enabled else None
+
+    def render(self, view: View) -> Image:
+        """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
+        image: Image = render_view(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
+        return image
+
+    def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity:
+        """How well the scene explains the held-back frames."""
+        psnr = evaluate_views(self.scene, judges, self.exposure, engine=self._engine)
+        shown = [hide_masked(self.render(view), *observation(view)) for view in judges]
+        return Fidelity(tuple(psnr), tuple(scorer.score(image, threads=threads) for image in shown))
+
+    def trained(
+        self,
+        views: Sequence[View],
+        config: DistilConfig,
+        folder: Path,
+        *,
+        seed: Sequence[int],
+        label: str,
+        round: int,
+        device: str,
+        reporter: Reporter,
+    ) -> Snapshot:
+        """This scene after training with fresh Adam moments on raw and repaired views, kept in ``folder``.
+
+        A training that is done already is read back; one that was cut off goes on from its checkpoint.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / SCENE).exists():
+            result = train(
+                self.scene,
+                views,
+                config,
+                seed=seed,
+                exposure=self.exposure,
+                pseudo_share=config.pseudo_share,
+                pseudo_weight=config.pseudo_weight,
+                checkpoint=folder / "checkpoint.safetensors",
+                reporter=reporter,
+                label=label,
+                round=round,
+                device=device,
+            )
+            write_table(folder / LOG, result.rows, TRAIN)
+            save_state(folder / STATE, result.state)
+            write_exposure(folder / EXPOSURE, result.exposure or self._written_exposure)
+            write_ply(folder / SCENE, result.scene)  # last: it says that the training is done
+        return Snapshot(folder)
+
+
+def publish(snapshot: Snapshot, trainings: Sequence[Snapshot], out: Path, rejected: Snapshot | None) -> None:
+    """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all ``trainings``.
+
+    A rejected scene lies beside it as ``rejected.ply``.
+    """
+    logs = [read_table(training.folder / LOG, TRAIN) for training in trainings]
+    write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
+    for name in (EXPOSURE, STATE, SCENE):
+        _copy(snapshot.folder / name, out / name)
+    if rejected is not None:
+        _copy(rejected.folder / SCENE, out / REJECTED)
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

@@ -1,0 +1,191 @@
+"""One round of RIVR: the candidates of every target frame, scored, one of them chosen, recorded in an EXR.
+
+The EXR is the record of a frame: it holds the candidates and, as attributes, its row of the selection table.
+It appears whole or not at all, so a round that was cut off goes on at the first frame without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cleargs.errors import StoreError
+from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
+from cleargs.models.scorer import Scorer
+from cleargs.progress import Reporter
+from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, fuse
+from cleargs.rivr.gates import refusal
+from cleargs.rivr.selection import choose, hide_masked
+from cleargs.rivr.tables import Selection
+from cleargs.splat.views import Mask, View
+
+PREFIX = "cleargs:"
+"""Of the attributes in the EXR."""
+
+Renderer = Callable[[View], Image]
+"""The current scene at a view, through the frame's exposure: R_t."""
+Restorer = Callable[[View, Image], Image]
+"""D_t, given the view and its render R_t."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How candidates are made and one of them is chosen."""
+
+    primary: Scorer
+    tiebreak: Scorer
+    margin: float
+    fuse_sigma: float
+    use_fused: bool
+    threads: int
+
+
+def run_round(
+    number: int,
+    targets: Sequence[View],
+    render: Renderer,
+    restore: Restorer,
+    rules: Rules,
+    out: Path,
+    reporter: Reporter,
+) -> list[Selection]:
+    """Repair every target frame; EXRs go to ``out/round_NN/``. Frames that have theirs are left alone."""
+    folder = f"round_{number:02d}"
+    (out / folder).mkdir(exist_ok=True)
+    rows = []
+    with reporter.task(f"round {number}: candidates", total=len(targets)) as task:
+        for view in targets:
+            exr = f"{folder}/{view.frame_id:06d}.exr"
+            row = recorded_row(out, exr)
+            if row is None:
+                rendered = render(view)
+                row, image = repair(number, view, exr, rendered, restore(view, rendered), rules)
+                write_exr(out / exr, image)
+            rows.append(row)
+            task.update(done=len(rows), note=_tally(rows))
+    return rows
+
+
+def repair(
+    number: int, view: View, exr: str, rendered: Image, restored: Image, rules: Rules
+) -> tuple[Selection, LayeredImage]:
+    """Make, score and choose the candidates of one frame.
+
+    All work is on the images as the EXR will give them back (half floats, scene-linear), so that
+    whoever goes on from the file sees what was scored.
+    """
+    observed, mask = observation(view)
+    layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
+    if rules.use_fused:
+        fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)
+        layers["fused"] = to_layer(fused)
+    shown = {
+        name: hide_masked(from_layer(layers[name]), observed, mask) for name in CANDIDATES if name in layers
+    }
+    primary, tiebreak = (
+        {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
+        for scorer in (rules.primary, rules.tiebreak)
+    )
+    choice = choose(primary, tiebreak, rules.margin)
+    refused = refusal(mask)
+    row = Selection(
+        round=number,
+        frame_id=view.frame_id,
+        exr=exr,
+        primary_metric=rules.primary.name,
+        primary_render=primary["render"],
+        primary_restored=primary["restored"],
+        primary_fused=primary.get("fused"),
+        tiebreak_metric=rules.tiebreak.name,
+        tiebreak_render=tiebreak["render"],
+        tiebreak_restored=tiebreak["restored"],
+        tiebreak_fused=tiebreak.get("fused"),
+        chosen=choice.chosen,
+        accepted=refused is None,
+        reason=refused or choice.reason,
+    )
+    return row, LayeredImage(layers | {"observed": to_layer(observed)}, _attributes(row))
+
+
+def recorded_row(out: Path, exr: str) -> Selection | None:
+    """The row that the EXR at ``out/exr`` carries; None where there is no whole EXR."""
+    if not (out / exr).exists():
+        return None
+    try:
+        attributes: dict[str, Any] = dict(read_exr(out / exr, PREFIX).attributes)
+        values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
+        frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
+        without_fused = {"primary_fused": None, "tiebreak_fused": None}
+        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(without_fused | values))
+    except (StoreError, KeyError, TypeError):
+        return None
+
+
+def _attributes(row: Selection) -> dict[str, int | float | str]:
+    values = {name: value for name, value in asdict(row).items() if name != "exr" and value is not None}
+    values["frame"] = values.pop("frame_id")
+    values["accepted"] = int(row.accepted)
+    return {f"{PREFIX}{name}": value for name, value in values.items()}
+
+
+def restore_observations(
+    targets: Sequence[View], restore: Callable[[Image], Image], cache: Path, reporter: Reporter
+) -> None:
+    """Restore the raw frame O_t of every target once, into ``cache``; what is there is kept."""
+    cache.mkdir(exist_ok=True)
+    with reporter.task("restoring", total=len(targets)) as task:
+        for view in targets:
+            path = restored_path(cache, view)
+            if not _readable(path):
+                restored = to_layer(restore(observation(view)[0]))
+                write_exr(path, LayeredImage({"restored": restored}, {}))
+            task.advance()
+
+
+def cached_observation(cache: Path, view: View) -> Image:
+    """D_t as `restore_observations` left it."""
+    return from_layer(read_exr(restored_path(cache, view)).layers["restored"])
+
+
+def restored_path(cache: Path, view: View) -> Path:
+    """Where D_t of a frame is kept."""
+    return cache / f"{view.frame_id:06d}.exr"
+
+
+def observation(view: View) -> tuple[Image, Mask | None]:
+    """O_t as float32 sRGB, and its mask."""
+    pixels, mask = view.load()
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.float32) / np.float32(255.0), mask
+    return pixels.astype(np.float32), mask
+
+
+def pseudo_view(target: View, row: Selection, out: Path) -> View:
+    """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
+
+    def load() -> tuple[Image, Mask | None]:
+        return from_layer(read_exr(out / row.exr).layers[row.chosen]), target.load()[1]
+
+    return replace(target, weight=1.0, kind="pseudo", load=load)
+
+
+def _score(scorer: Scorer, image: Image, threads: int) -> float:
+    """In single precision, as the EXR holds it."""
+    return float(np.float32(scorer.score(image, threads=threads)))
+
+
+def _readable(path: Path) -> bool:
+    try:
+        read_exr(path)
+    except StoreError:
+        return False
+    return True
+
+
+def _tally(rows: Sequence[Selection]) -> str:
+    counts: dict[CandidateName, int] = {name: sum(row.chosen == name for row in rows) for name in CANDIDATES}
+    return ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -1,0 +1,51 @@
+"""Which candidate becomes the pseudo observation: the paper's reference-free rule.
+
+The primary scorer decides (MUSIQ in the paper); when the best two of its scores are within a margin, the
+tie-break scorer (CLIP-IQA in the paper) decides among the candidates within it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen candidate and why."""
+
+    chosen: CandidateName
+    reason: str
+
+
+def choose(
+    primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
+) -> Choice:
+    """The candidate with the highest primary score, or the tie-break's favourite within ``margin`` of it.
+
+    primary, tiebreak: score of each candidate, higher is better, on a scale of 0-100; both have the same
+    candidates. Equal tie-break scores: the higher primary score wins, then the order of `CANDIDATES`.
+    Raises ValueError when a score is not finite.
+    """
+    if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
+        raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
+    names = [name for name in CANDIDATES if name in primary]
+    best = max(primary.values())
+    close = [name for name in names if best - primary[name] <= margin]
+    if len(close) == 1:
+        return Choice(close[0], "primary score")
+    chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
+    return Choice(chosen, "tie-break among " + ", ".join(close))
+
+
+def hide_masked(image: Image, observed: Image, mask: np.ndarray | None) -> Image:
+    """``image`` with the observation in its masked pixels.
+
+    All candidates then agree there, so that what is masked cannot decide between them.
+    mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
+    """
+    return image if mask is None else np.where(mask[..., None], image, observed)

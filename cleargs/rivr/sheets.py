@@ -1,0 +1,61 @@
+"""The contact sheets of RIVR and the consolidation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from cleargs.media.exr import from_layer, read_exr
+from cleargs.media.image import write_rgb
+from cleargs.report.contact import Tile, contact_sheet
+from cleargs.rivr.candidates import CANDIDATES
+from cleargs.rivr.distillation import Snapshot
+from cleargs.rivr.rounds import observation
+from cleargs.rivr.tables import Selection
+from cleargs.splat.views import View
+
+SHEET_FRAMES = 6
+"""Frames on a sheet."""
+
+
+def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
+    """One line a row: the observation and its candidates with both scores, the chosen one marked."""
+    write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
+
+
+def write_before_after_sheet(
+    path: Path,
+    views: Sequence[View],
+    before: Snapshot,
+    after: Snapshot,
+    repairs: Mapping[int, Selection],
+    rivr: Path,
+) -> None:
+    """One line a view: G0's render, the final render, the observation, and the repair that was distilled."""
+    lines = []
+    for view in views:
+        row = repairs.get(view.frame_id)
+        repair = None if row is None else from_layer(read_exr(rivr / row.exr).layers[row.chosen])
+        lines.append(
+            [
+                Tile(before.render(view), f"frame {view.frame_id}: G0"),
+                Tile(after.render(view), "final"),
+                Tile(observation(view)[0], "observed"),
+                Tile(repair, "no repair" if row is None else f"repair: {row.chosen}, round {row.round}"),
+            ]
+        )
+    write_rgb(path, contact_sheet(lines or [_nothing()]))
+
+
+def _candidates(row: Selection, rivr: Path) -> list[Tile]:
+    layers = read_exr(rivr / row.exr).layers
+    tiles = [Tile(from_layer(layers["observed"]), f"frame {row.frame_id}, round {row.round}: observed")]
+    for name in CANDIDATES:
+        if name in layers:
+            scores = f"{getattr(row, f'primary_{name}'):.1f} / {getattr(row, f'tiebreak_{name}'):.1f}"
+            tiles.append(Tile(from_layer(layers[name]), f"{name} {scores}", marked=row.chosen == name))
+    return tiles
+
+
+def _nothing() -> list[Tile]:
+    return [Tile(None, "no frame was repaired")]

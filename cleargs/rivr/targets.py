@@ -1,0 +1,49 @@
+"""Which frames RIVR repairs, and which it holds back to measure whether repairing does harm."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Targets: TypeAlias = Literal["all", "degraded"]
+
+
+@dataclass(frozen=True)
+class Appraisal:
+    """What RVA says about a frame."""
+
+    frame_id: int
+    R: float
+    B: float
+    role: str
+    stand_in: bool
+    """No frame is reliable, and this one is among the best by R - B."""
+
+
+def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collection[int]) -> list[int]:
+    """The frames that every round visits, in order.
+
+    frames: the registered training frames by frame_id. ``all`` takes each of them, ``degraded`` those whose
+    role is not ``strong``; ``held_back`` ones are never taken.
+    """
+    return [
+        frame.frame_id
+        for frame in frames
+        if frame.frame_id not in held_back and (which == "all" or frame.role != "strong")
+    ]
+
+
+def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
+    """A fixed eighth (at least one) of the strong frames, spread evenly over them; in order.
+
+    Where no frame is strong, the stand-in set takes their place. These frames are kept from distillation, raw
+    and repaired, and judge its result. Empty when RVA names neither.
+    """
+    references = [frame.frame_id for frame in frames if frame.role == "strong"]
+    if not references:
+        references = [frame.frame_id for frame in frames if frame.stand_in]
+    if not references:
+        return []
+    count = max(1, len(references) // 8)
+    return [references[(2 * k + 1) * len(references) // (2 * count)] for k in range(count)]

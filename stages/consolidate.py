@@ -1,0 +1,128 @@
+"""Full-Trajectory Repair Consolidation: a last distillation of every frame's latest repair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
+
+VERSION = 1
+CONFIG = ConsolidateConfig
+INPUTS: Mapping[str, tuple[str, ...]] = {
+    "ingest": ("frames.parquet", "images", "masks"),
+    "rva": ("frames.parquet",),
+    "g0": ("scene.ply", "exposure.parquet", "state.safetensors"),
+    "rivr": (
+        "scene.ply",
+        "exposure.parquet",
+        "state.safetensors",
+        "selection.parquet",
+        *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1)),
+    ),
+}
+OUTPUTS = (
+    "scene.ply",
+    "repairs.parquet",
+    "train.parquet",
+    "exposure.parquet",
+    "state.safetensors",
+    "before_after.png",
+)
+LIBRARIES = (
+    "torch",
+    "numba",
+    "numpy",
+    "onnxruntime",
+    "OpenImageIO",
+    "opencv-contrib-python-headless",
+    "pyarrow",
+    "safetensors",
+)
+
+_STREAM = 6
+"""Sets the random numbers of this stage apart from those of the others."""
+
+
+def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
+    """The scorer's model file, whose content enters the key."""
+    from cleargs.rivr.model_files import scorer_path
+
+    path = scorer_path(config.scorer)
+    return {} if path is None else {"scorer": path}
+
+
+def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
+    """A training step takes about 0.25 s a megapixel on two cores."""
+    from cleargs.rivr.cost import capture_size
+
+    _, megapixels = capture_size(context.inputs.get("ingest"))
+    return Estimate(
+        minutes=0.25 * megapixels * context.config.distil.steps / 60.0,
+        memory_gb=1.0 + context.config.distil.cache_mb / 1024.0,
+        disk_gb=0.2,
+    )
+
+
+def run(context: StageContext[ConsolidateConfig]) -> StageResult:
+    """Latest accepted repairs -> distillation from RIVR's scene -> the check for harm."""
+    from cleargs.models.scorer import load_scorer
+    from cleargs.rivr.distillation import Snapshot, publish
+    from cleargs.rivr.gates import judge_harm
+    from cleargs.rivr.results import consolidation_summary
+    from cleargs.rivr.rounds import pseudo_view
+    from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
+    from cleargs.rivr.supervision import load_supervision
+    from cleargs.rivr.tables import latest_accepted, read_selection, write_repairs
+    from cleargs.splat.kernels.runtime import set_threads
+
+    config, threads, reporter = context.config, context.threads, context.reporter
+    rivr = context.inputs["rivr"]
+    set_threads(threads)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
+    scorer = load_scorer(config.scorer)
+    repairs = latest_accepted(read_selection(rivr / "selection.parquet"))
+    write_repairs(context.out / "repairs.parquet", repairs)
+
+    g0 = Snapshot(context.inputs["g0"])
+    start = Snapshot(rivr) if repairs else g0
+    consolidated, trainings = start, []
+    if repairs:
+        pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
+        consolidated = start.trained(
+            [*supervision.real, *pseudo],
+            config.distil,
+            context.checkpoints / "consolidation",
+            seed=(context.seed, _STREAM),
+            label="consolidating",
+            round=0,
+            device=context.device,
+            reporter=reporter,
+        )
+        trainings.append(consolidated)
+
+    verdict = judge_harm(
+        supervision.held_back,
+        g0.fidelity(supervision.judges, scorer, threads),
+        consolidated.fidelity(supervision.judges, scorer, threads),
+        psnr_margin=config.harm.psnr_margin,
+        score_margin=config.harm.score_margin,
+    )
+    final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)
+    if rejected is not None:
+        reporter.warn(
+            f"the consolidated scene is rejected, RIVR's stays: {verdict.harm} on the held-back frames"
+        )
+    publish(final, trainings, context.out, rejected)
+
+    frames = [row.frame_id for row in repairs] or list(supervision.views)
+    write_before_after_sheet(
+        context.out / "before_after.png",
+        supervision.worst(frames, SHEET_FRAMES),
+        g0,
+        final,
+        {row.frame_id: row for row in repairs},
+        rivr,
+    )
+    return StageResult(summary=consolidation_summary(repairs, scorer.name, verdict))

@@ -1,0 +1,152 @@
+"""RIVR: render, restore, fuse, select and distil, round after round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.rivr.config import RivrConfig
+
+VERSION = 1
+CONFIG = RivrConfig
+INPUTS: Mapping[str, tuple[str, ...]] = {
+    "ingest": ("frames.parquet", "images", "masks"),
+    "rva": ("frames.parquet",),
+    "g0": ("scene.ply", "exposure.parquet", "state.safetensors"),
+}
+OUTPUTS = (
+    "selection.parquet",
+    "scene.ply",
+    "train.parquet",
+    "exposure.parquet",
+    "state.safetensors",
+    "candidates.png",
+)
+LIBRARIES = (
+    "torch",
+    "numba",
+    "numpy",
+    "onnxruntime",
+    "OpenImageIO",
+    "opencv-contrib-python-headless",
+    "pyarrow",
+    "safetensors",
+)
+
+_STREAM = 5
+"""Sets the random numbers of this stage apart from those of the others."""
+
+
+def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
+    """The model files, whose content enters the key."""
+    from cleargs.models.expert import expert_path
+    from cleargs.rivr.model_files import scorer_path
+
+    files = {
+        "expert": expert_path(config.expert),
+        "primary scorer": scorer_path(config.primary_scorer),
+        "tie-break scorer": scorer_path(config.tiebreak_scorer),
+    }
+    return {role: path for role, path in files.items() if path is not None}
+
+
+def estimate(context: StageContext[RivrConfig]) -> Estimate:
+    """Restoring takes about 6 s a megapixel, scoring 1 s, a training step 0.25 s (two cores)."""
+    from cleargs.rivr.cost import capture_size
+
+    config = context.config
+    frames, megapixels = capture_size(context.inputs.get("ingest"))
+    restorings = 1 if config.use_observation else config.rounds
+    seconds = megapixels * (
+        frames * (6.0 * restorings + 6.0 * config.rounds) + 0.25 * config.rounds * config.distil.steps
+    )
+    return Estimate(
+        minutes=seconds / 60.0,
+        memory_gb=1.0 + config.distil.cache_mb / 1024.0,
+        disk_gb=0.02 * megapixels * frames * (config.rounds + 1),
+    )
+
+
+def run(context: StageContext[RivrConfig]) -> StageResult:
+    """Candidates -> scores -> choice -> distillation, for every round; then the check for harm."""
+    from cleargs.models.expert import load_expert
+    from cleargs.models.scorer import load_scorer
+    from cleargs.rivr.candidates import Image
+    from cleargs.rivr.distillation import Snapshot, publish
+    from cleargs.rivr.gates import judge_harm
+    from cleargs.rivr.results import summary
+    from cleargs.rivr.rounds import Rules, cached_observation, pseudo_view, restore_observations, run_round
+    from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
+    from cleargs.rivr.supervision import load_supervision
+    from cleargs.rivr.tables import write_selection
+    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.views import View
+
+    config, threads, reporter = context.config, context.threads, context.reporter
+    set_threads(threads)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
+    targets = supervision.targets(config.targets)
+    expert = load_expert(config.expert)
+    rules = Rules(
+        primary=load_scorer(config.primary_scorer),
+        tiebreak=load_scorer(config.tiebreak_scorer),
+        margin=config.margin,
+        fuse_sigma=config.fuse_sigma,
+        use_fused=config.use_fused,
+        threads=threads,
+    )
+
+    cache = context.checkpoints / "restored"
+    if config.use_observation:
+        restore_observations(targets, lambda image: expert.restore(image, threads=threads), cache, reporter)
+
+    def restored(view: View, render: Image) -> Image:
+        if config.use_observation:
+            return cached_observation(cache, view)
+        return expert.restore(render, threads=threads)
+
+    g0 = current = Snapshot(context.inputs["g0"])
+    rows, repairs, trainings = [], [], []
+    for number in range(1, config.rounds + 1):
+        found = run_round(number, targets, current.render, restored, rules, context.out, reporter)
+        rows += found
+        repairs += [
+            pseudo_view(supervision.views[row.frame_id], row, context.out) for row in found if row.accepted
+        ]
+        if repairs:  # without any there is nothing to distil, and the scene stays as it is
+            current = current.trained(
+                [*supervision.real, *repairs],
+                config.distil,
+                context.checkpoints / f"round_{number:02d}",
+                seed=(context.seed, _STREAM, number),
+                label=f"round {number}: distilling",
+                round=number,
+                device=context.device,
+                reporter=reporter,
+            )
+            trainings.append(current)
+    write_selection(context.out / "selection.parquet", rows)
+
+    before = g0.fidelity(supervision.judges, rules.primary, threads)
+    after = current.fidelity(supervision.judges, rules.primary, threads)
+    verdict = judge_harm(
+        supervision.held_back,
+        before,
+        after,
+        psnr_margin=config.harm.psnr_margin,
+        score_margin=config.harm.score_margin,
+    )
+    if verdict.harm is not None:
+        reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
+    publish(
+        current if verdict.harm is None else g0,
+        trainings,
+        context.out,
+        rejected=None if verdict.harm is None else current,
+    )
+    worst = supervision.worst([view.frame_id for view in targets], SHEET_FRAMES)
+    last = {row.frame_id: row for row in rows}
+    shown = [last[view.frame_id] for view in worst]
+    write_candidates_sheet(context.out / "candidates.png", shown, context.out)
+    return StageResult(summary=summary(rows, expert.name, verdict))

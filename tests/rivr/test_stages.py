@@ -1,0 +1,289 @@
+"""RIVR and the consolidation from end to end, on a tiny capture with a stand-in expert and scorers."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import pkgutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from cleargs.stages import consolidate, rivr
+from tiny_capture import (
+    MASKED_FRAME,
+    ROLES,
+    Capture,
+    Contrast,
+    Darkness,
+    Sharpen,
+    tiny_consolidate,
+    tiny_rivr,
+    write_capture,
+)
+
+from cleargs.media.exr import from_layer, read_exr
+from cleargs.rivr.candidates import fuse
+from cleargs.rivr.tables import REPAIRS, SELECTION, Selection, read_selection, write_selection
+
+HELD_BACK = 3
+"""The middle one of the strong frames 0, 3 and 5."""
+TARGETS = [k for k in range(len(ROLES)) if k != HELD_BACK]
+
+
+@pytest.fixture
+def expert() -> Sharpen:
+    return Sharpen()
+
+
+@pytest.fixture
+def capture(tmp_path: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) -> Capture:
+    """The tiny capture, with small stand-ins for the expert and the scorers."""
+    return make_capture(tmp_path, expert, monkeypatch)
+
+
+def make_capture(root: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) -> Capture:
+    scorers = {"clarity-net": Contrast(), "naturalness-stats": Darkness()}
+    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec: expert)
+    monkeypatch.setattr("cleargs.models.scorer.load_scorer", scorers.__getitem__)
+    write_capture(root)
+    return Capture(root)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Relative path -> digest of every file."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def same_scene(a: Path, b: Path) -> bool:
+    return all(
+        (a / name).read_bytes() == (b / name).read_bytes()
+        for name in ("scene.ply", "exposure.parquet", "state.safetensors")
+    )
+
+
+def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> None:
+    context = capture.context("rivr", tiny_rivr())
+    result = rivr.run(context)
+
+    assert expert.calls == len(TARGETS)  # once a frame, not once a round
+    assert pq.read_schema(context.out / "selection.parquet").names == SELECTION.names
+    rows = read_selection(context.out / "selection.parquet")
+    assert [(row.round, row.frame_id) for row in rows] == [(n, k) for n in (1, 2) for k in TARGETS]
+    assert all(row.accepted for row in rows)
+    assert {row.primary_metric for row in rows} == {"contrast"}
+    for row in rows:
+        exr = read_exr(context.out / row.exr, "cleargs:")
+        assert exr.attributes["cleargs:frame"] == row.frame_id
+        assert exr.attributes["cleargs:round"] == row.round
+        assert exr.attributes["cleargs:chosen"] == row.chosen
+        assert exr.attributes["cleargs:primary_fused"] == row.primary_fused
+        images = {name: from_layer(layer) for name, layer in exr.layers.items()}
+        fused = fuse(images["render"], images["restored"], 2.0)
+        np.testing.assert_allclose(images["fused"], fused, atol=1 / 4096)  # half floats
+    assert not same_scene(context.out, capture.root / "g0")
+    assert set(rivr.OUTPUTS) <= {path.name for path in context.out.iterdir()}
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    assert set(log["round"]) == {1, 2}
+    assert HELD_BACK not in log["frame_id"]
+    real = {k for k, kind in zip(log["frame_id"], log["kind"], strict=True) if kind == "real"}
+    assert real <= {0, 2, 4, 5, 6}
+    summary = result.summary
+    assert summary["held_back"]["frames"] == [HELD_BACK]
+    assert sum(summary["rounds"][0]["chosen"].values()) == len(TARGETS)
+    assert summary["published"] == "distilled scene"
+
+
+def test_later_rounds_render_the_distilled_scene(capture: Capture) -> None:
+    context = capture.context("rivr", tiny_rivr())
+    rivr.run(context)
+    first, second = (read_exr(context.out / f"round_0{n}/000001.exr").layers for n in (1, 2))
+    np.testing.assert_array_equal(first["restored"], second["restored"])
+    np.testing.assert_array_equal(first["observed"], second["observed"])
+    assert (first["render"] != second["render"]).any()
+
+
+def test_degraded_targets_only(capture: Capture) -> None:
+    context = capture.context("rivr", tiny_rivr(targets="degraded", rounds=1))
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
+
+
+def test_without_the_observation_the_expert_restores_the_render(capture: Capture, expert: Sharpen) -> None:
+    context = capture.context("rivr", tiny_rivr(use_observation=False))
+    rivr.run(context)
+    assert expert.calls == 2 * len(TARGETS)
+    layers = read_exr(context.out / "round_02/000001.exr").layers
+    assert set(layers) == {"render", "restored", "fused", "observed"}
+    # The expert saw the float32 render, the EXR holds its half: a few half steps of slack for the sharpening.
+    np.testing.assert_allclose(
+        from_layer(layers["restored"]), expert.restore(from_layer(layers["render"])), atol=4e-3
+    )
+
+
+def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
+    context = capture.context("rivr", tiny_rivr(use_fused=False, rounds=1))
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    assert {row.chosen for row in rows} <= {"render", "restored"}
+    assert {(row.primary_fused, row.tiebreak_fused) for row in rows} == {(None, None)}
+    assert set(read_exr(context.out / rows[0].exr).layers) == {"render", "restored", "observed"}
+
+
+def test_masked_pixels_do_not_reach_the_scores(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch, expert: Sharpen
+) -> None:
+    """An expert that ruins the masked pixels changes no score; one that ruins the others does."""
+
+    def scores(run: str, ruined: slice) -> Selection:
+        def ruin(image: np.ndarray, **_: Any) -> np.ndarray:
+            restored = image.copy()
+            restored[:, ruined] = np.random.default_rng(0).random(restored[:, ruined].shape)
+            return restored
+
+        monkeypatch.setattr(expert, "restore", ruin)
+        context = capture.context("rivr", tiny_rivr(rounds=1, use_fused=False), run=run)
+        rivr.run(context)
+        rows = read_selection(context.out / "selection.parquet")
+        return next(row for row in rows if row.frame_id == MASKED_FRAME)
+
+    untouched, masked, seen = scores("a", slice(0, 0)), scores("b", slice(0, 20)), scores("c", slice(20, 40))
+    assert masked.primary_restored == untouched.primary_restored
+    assert seen.primary_restored != untouched.primary_restored
+
+
+@pytest.mark.parametrize("stage", ["rivr", "consolidate"])
+def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
+    """Rates that wreck the scene: it is not published, and lies beside the one that is."""
+    wrecking = {"steps": 12, "lr_scales": 3.0}
+    harm = {"psnr_margin": 0.5, "score_margin": 100}
+    first = capture.context(
+        "rivr", tiny_rivr(distil=wrecking, harm=harm) if stage == "rivr" else tiny_rivr(rounds=1)
+    )
+    result, context, better = rivr.run(first), first, capture.root / "g0"
+    if stage == "consolidate":
+        config = tiny_consolidate(distil=wrecking, harm=harm)
+        context, better = capture.context("consolidate", config), first.out
+        result = consolidate.run(context)
+    assert same_scene(context.out, better)
+    assert (context.out / "rejected.ply").read_bytes() != (context.out / "scene.ply").read_bytes()
+    verdict = result.summary["held_back"]
+    assert "PSNR fell" in verdict["harm"]
+    assert verdict["psnr_after"] < verdict["psnr_before"] - 0.5
+
+
+def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> None:
+    first = capture.context("rivr", tiny_rivr())
+    rivr.run(first)
+    rows = read_selection(first.out / "selection.parquet")
+    refused = {(2, 1), (1, 4), (2, 4)}
+    rows = [dataclasses.replace(row, accepted=(row.round, row.frame_id) not in refused) for row in rows]
+    write_selection(first.out / "selection.parquet", rows)
+
+    context = capture.context("consolidate", tiny_consolidate())
+    result = consolidate.run(context)
+    table = pq.read_table(context.out / "repairs.parquet")
+    assert table.schema.names == REPAIRS.names
+    latest = {row["frame_id"]: row["round"] for row in table.to_pylist()}
+    assert latest == {k: 1 if k == 1 else 2 for k in TARGETS if k != 4}
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    pseudo = {k for k, kind in zip(log["frame_id"], log["kind"], strict=True) if kind == "pseudo"}
+    assert pseudo <= set(latest)
+    assert not same_scene(context.out, first.out)
+    assert set(consolidate.OUTPUTS) <= {path.name for path in context.out.iterdir()}
+    assert result.summary["repairs"] == len(TARGETS) - 1
+
+
+def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:
+    first = capture.context("rivr", tiny_rivr(rounds=1))
+    rivr.run(first)
+    rows = [
+        dataclasses.replace(row, accepted=False) for row in read_selection(first.out / "selection.parquet")
+    ]
+    write_selection(first.out / "selection.parquet", rows)
+
+    context = capture.context("consolidate", tiny_consolidate())
+    result = consolidate.run(context)
+    assert same_scene(context.out, capture.root / "g0")
+    assert pq.read_table(context.out / "repairs.parquet").num_rows == 0
+    assert pq.read_table(context.out / "train.parquet").num_rows == 0
+    assert result.summary["published"] == "G0"
+    assert set(consolidate.OUTPUTS) <= {path.name for path in context.out.iterdir()}
+
+
+class KilledError(Exception):
+    """Stands for kill -9."""
+
+
+def dying(after: int, function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function``, until it is called for the ``after``-th time."""
+    calls = iter(range(after))
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if next(calls, None) is None:
+            raise KilledError
+        return function(*args, **kwargs)
+
+    return call
+
+
+def run_both(capture: Capture, *, threads: int) -> dict[str, dict[str, str]]:
+    """Run both stages; the digests of their files."""
+    found = {}
+    for name, stage, config in (("rivr", rivr, tiny_rivr()), ("consolidate", consolidate, tiny_consolidate())):
+        context = capture.context(name, config, threads=threads)
+        stage.run(context)
+        found[name] = digests(context.out)
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
+    """What both stages leave when nothing disturbs them, on one thread."""
+    with pytest.MonkeyPatch.context() as patch:
+        return run_both(make_capture(tmp_path_factory.mktemp("undisturbed"), Sharpen(), patch), threads=1)
+
+
+@pytest.mark.parametrize(
+    ("where", "after"),
+    [
+        ("cleargs.rivr.rounds.write_exr", 3),  # while restoring
+        ("cleargs.rivr.rounds.write_exr", 10),  # inside round 1
+        ("cleargs.rivr.rounds.write_exr", 17),  # inside round 2
+        ("cleargs.splat.trainer.Trainer.step", 8),  # inside the distillation of round 1
+        ("cleargs.splat.trainer.Trainer.step", 12),  # after it, before its files
+        ("cleargs.splat.trainer.Trainer.step", 20),  # inside the distillation of round 2
+        ("cleargs.splat.trainer.Trainer.step", 30),  # inside the consolidation
+        ("cleargs.rivr.distillation.write_ply", 1),  # the last file of round 2
+        ("cleargs.rivr.distillation._copy", 1),  # while publishing
+    ],
+)
+def test_a_killed_run_goes_on_to_the_same_files(
+    capture: Capture,
+    undisturbed: dict[str, dict[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    after: int,
+) -> None:
+    with monkeypatch.context() as patch:
+        module, _, name = where.rpartition(".")
+        patch.setattr(where, dying(after, getattr(pkgutil.resolve_name(module), name)))
+        with pytest.raises(KilledError):
+            run_both(capture, threads=2)
+    assert run_both(capture, threads=2) == undisturbed
+
+
+def test_a_damaged_exr_is_made_again(capture: Capture, undisturbed: dict[str, dict[str, str]]) -> None:
+    """Its frame alone: the expert's cached restoration and the finished trainings are used again."""
+    assert run_both(capture, threads=1) == undisturbed
+    victim = capture.root / "run" / "rivr" / "round_01" / "000004.exr"
+    victim.write_bytes(victim.read_bytes()[:1000])
+    assert run_both(capture, threads=1) == undisturbed

@@ -1,0 +1,45 @@
+"""Which frames are repaired, and which judge the result."""
+
+from __future__ import annotations
+
+import pytest
+
+from cleargs.rivr.targets import Appraisal, held_back_frames, target_frames
+
+
+def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[Appraisal]:
+    """One frame a role, with ids 10, 11, ..."""
+    return [
+        Appraisal(10 + k, R=0.5, B=0.5, role=role, stand_in=10 + k in (stand_in or set()))
+        for k, role in enumerate(roles)
+    ]
+
+
+ROLES = ["strong", "geometric", "suppressed", "strong", "reactivated", "auxiliary"]
+
+
+def test_all_takes_every_frame_but_the_held_back() -> None:
+    assert target_frames(appraised(ROLES), "all", {13}) == [10, 11, 12, 14, 15]
+
+
+def test_degraded_leaves_the_strong_ones_out() -> None:
+    assert target_frames(appraised(ROLES), "degraded", {13}) == [11, 12, 14, 15]
+
+
+@pytest.mark.parametrize(("strong", "expected"), [(1, 1), (7, 1), (8, 1), (16, 2), (23, 2), (24, 3)])
+def test_an_eighth_of_the_strong_frames_is_held_back(strong: int, expected: int) -> None:
+    frames = appraised(["strong"] * strong + ["suppressed"] * 5)
+    held = held_back_frames(frames)
+    assert len(set(held)) == expected
+    assert all(frame_id < 10 + strong for frame_id in held)
+    assert held == sorted(held)
+
+
+def test_held_back_frames_are_spread_over_the_strong_ones() -> None:
+    assert held_back_frames(appraised(["strong"] * 16)) == [14, 22]
+
+
+def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
+    assert held_back_frames(appraised(["suppressed"] * 5, stand_in={12})) == [12]
+    assert held_back_frames(appraised(["strong", "suppressed"], stand_in={11})) == [10]
+    assert held_back_frames(appraised(["suppressed"])) == []
