@@ -1,0 +1,91 @@
+"""What several commands share: options, and opening a run with its store."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import click
+
+from cleargs.errors import InputError
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.run_file import Device
+from cleargs.pipeline.store import Store
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+DeviceChoice = Literal["auto", "cpu", "cuda"]
+
+store_option = click.option(
+    "--store",
+    envvar="CLEARGS_STORE",
+    show_envvar=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Where results are kept; may be shared by runs.  [default: RUN/.store]",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only.")
+force_help = "Make the stage again, even if its results are there."
+partial_option = click.option(
+    "--allow-partial", is_flag=True, help="Go on after a stage that is done only in part."
+)
+run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
+
+
+def work_options(command: F) -> F:
+    """Options of the commands that run stages."""
+    command = click.option(
+        "--device",
+        type=click.Choice(["auto", "cpu", "cuda"]),
+        default="auto",
+        show_default=True,
+        help="Where to compute.",
+    )(command)
+    return click.option(
+        "--threads",
+        type=click.IntRange(min=1),
+        help="CPU threads; results do not depend on it.  [default: all cores]",
+    )(command)
+
+
+def threads_or_all(threads: int | None) -> int:
+    """The given number of threads, or that of the cores which this process may use."""
+    return threads or len(os.sched_getaffinity(0))
+
+
+def resolve_device(choice: DeviceChoice) -> Device:
+    """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
+
+    Raises InputError when ``cuda`` is asked for and cannot be had.
+    """
+    obstacle = cuda_obstacle() if choice != "cpu" else None
+    if choice == "cuda" and obstacle is not None:
+        raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu or auto")
+    return "cpu" if choice == "cpu" or obstacle is not None else "cuda"
+
+
+def cuda_obstacle() -> str | None:
+    """Why work cannot run on an NVIDIA GPU here; None when it can."""
+    if find_spec("cleargs.splat.kernels.cuda") is None:
+        return "this version of ClearGS has no CUDA kernels"
+    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg")):
+        return "there is no NVIDIA GPU"
+    return None
+
+
+@contextmanager
+def opened_store(root: Path) -> Iterator[Store]:
+    """The store at ``root`` with its digest memo. Its folder appears when the first stage starts."""
+    root = root.absolute()
+    with DigestMemo(root / "digests.sqlite") as memo:
+        yield Store(root, memo)
+
+
+def print_json(value: Any) -> None:
+    """Print ``value`` as indented JSON on stdout."""
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False))

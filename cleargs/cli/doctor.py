@@ -1,0 +1,107 @@
+"""``cleargs doctor``: what this machine offers, and what stands in the way."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+import click
+
+import cleargs
+from cleargs.cli.common import cuda_obstacle, json_option, print_json
+
+LIBRARIES = (
+    "torch",
+    "numba",
+    "numpy",
+    "pycolmap",
+    "OpenImageIO",
+    "onnxruntime",
+    "opencv-contrib-python-headless",
+    "pyarrow",
+    "av",
+)
+LEAST_MEMORY_GB = 4.0
+LEAST_DISK_GB = 5.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at."""
+
+    what: str
+    state: Literal["ok", "note", "bad"]
+    text: str
+
+
+@click.command()
+@click.argument("folder", default=".", type=click.Path(file_okay=False, exists=True, path_type=Path))
+@json_option
+def doctor(folder: Path, as_json: bool) -> int:
+    """Check this machine: versions, cores, memory, disk, device, caches.
+
+    FOLDER is where runs would be kept. Exit code 1 when something would keep a run from working.
+    """
+    findings = [
+        Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
+        *(_library(name) for name in LIBRARIES),
+        Finding("cores", "ok", str(len(os.sched_getaffinity(0)))),
+        _memory(),
+        _disk(folder),
+        _device(),
+        _writable("runs", folder),
+        _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
+        _writable("temporary files", Path(tempfile.gettempdir())),
+    ]
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        for finding in findings:
+            click.echo(f"{finding.state:<5} {finding.what:<32} {finding.text}")
+    return 1 if any(finding.state == "bad" for finding in findings) else 0
+
+
+def _library(name: str) -> Finding:
+    try:
+        return Finding(name, "ok", version(name))
+    except PackageNotFoundError:
+        return Finding(name, "bad", "not installed: install cleargs again")
+
+
+def _memory() -> Finding:
+    """Free memory as Linux counts it (what can be had without swapping)."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        available = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) / 1e6
+    except (OSError, StopIteration, ValueError):
+        return Finding("memory", "note", "unknown")
+    enough = available >= LEAST_MEMORY_GB
+    advice = "" if enough else f"; a run may want {LEAST_MEMORY_GB:.0f} GB: lower ingest.max_size"
+    return Finding("memory", "ok" if enough else "note", f"{available:.1f} GB free{advice}")
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free / 1e9
+    enough = free >= LEAST_DISK_GB
+    advice = "" if enough else "; cleargs gc frees what no run needs"
+    return Finding("disk", "ok" if enough else "note", f"{free:.1f} GB free at {folder.absolute()}{advice}")
+
+
+def _device() -> Finding:
+    obstacle = cuda_obstacle()
+    return Finding("device", "ok", "cuda" if obstacle is None else f"cpu ({obstacle})")
+
+
+def _writable(what: str, folder: Path) -> Finding:
+    place = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            return Finding(what, "ok", f"{folder.absolute()} can be written")
+    except OSError as error:
+        return Finding(what, "bad", f"{folder.absolute()} cannot be written: {error.strerror}")

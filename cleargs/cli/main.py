@@ -1,0 +1,131 @@
+"""The console script ``cleargs``: its commands, and how errors become exit codes."""
+
+from __future__ import annotations
+
+import errno
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib import import_module
+
+import click
+
+import cleargs
+from cleargs.errors import CleargsError
+from cleargs.pipeline.dag import Dag, installed
+
+INTERRUPTED = 130
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("cleargs.cli.run", "Turn a capture into a clean scene: all stages, or those that are missing."),
+    "stage": ("cleargs.cli.stage", "Run one stage of a prepared run."),
+    "explain": ("cleargs.cli.explain", "Say for each stage whether it is done, and what changed if not."),
+    "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
+    "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
+    "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
+    "models": ("cleargs.cli.models", "List, install and verify model weights."),
+    "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
+    "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
+}
+"""Command -> (module that holds the click command of that name, the line in ``cleargs --help``)."""
+
+EPILOG = """\b
+Examples:
+  cleargs run video.mp4 -o room              a video, an image folder, a COLMAP project ...
+  cleargs run video.mp4 -o room --set rva.tau_R=0.7
+  cleargs show room                          what each stage found
+  cleargs explain room                       what the same command would do again, and why
+  cleargs export room --format ply -o room.ply
+
+\b
+Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
+130 interrupted (the same command goes on).
+"""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module only when the command is used: help stays quick."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(cleargs.__version__, prog_name="cleargs")
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+def cli(debug: bool) -> None:
+    """Turn a handheld video of mixed quality into a clean 3D Gaussian Splatting scene.
+
+    Five stages: ingest (poses), rva (which frames to trust), g0 (a first scene), rivr (repaired views) and
+    consolidate (the final scene). Results are kept by content: the same command again does only what is
+    missing.
+    """
+
+
+def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
+    """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
+    from cleargs.cli.interrupt import answer_signals
+
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    answer_signals()
+    sys.exit(invoke(given, dag))
+
+
+def invoke(arguments: list[str], dag: Dag | None = None) -> int:
+    """Run one command; returns its exit code. Errors go to stderr as one line of cause and one of remedy.
+
+    ``--debug`` may stand anywhere.
+    """
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        code = cli.main(arguments, prog_name="cleargs", standalone_mode=False, obj=dag or installed())
+        return int(code or 0)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted; what is done is kept, and the same command goes on from there", err=True)
+        return INTERRUPTED
+    except BrokenPipeError:
+        return 1  # whoever read our output has gone
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        code, cause, remedy = explanation(error)
+        click.echo(f"error: {cause}", err=True)
+        click.echo(f"hint: {remedy}", err=True)
+        return code
+
+
+def explanation(error: Exception) -> tuple[int, str, str]:
+    """Exit code, cause and remedy for an error, each of the two in one line."""
+    match error:
+        case CleargsError():
+            return error.exit_code, _one_line(error), error.hint
+        case click.ClickException():
+            context = getattr(error, "ctx", None)
+            command = context.command_path if context is not None else "cleargs"
+            return error.exit_code, _one_line(error.format_message()), f"see {command} --help"
+        case MemoryError():
+            return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
+        case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
+        case OSError():
+            where = f": {error.filename}" if error.filename else ""
+            return 1, f"{error.strerror or _one_line(error)}{where}", "check the disk and its permissions"
+        case _:
+            cause = f"unexpected {type(error).__name__}: {_one_line(error)}"
+            return 1, cause, "run it again with --debug for the traceback, and please report it"
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split()) or "no further details"

@@ -1,0 +1,148 @@
+"""What the user sees while work goes on: bars on a terminal, plain lines elsewhere, always on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cleargs.progress import Reporter, SilentTask, Task
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+LINE_EVERY = 10.0
+"""Seconds between two lines of one task where there is no terminal."""
+
+
+def make_reporter(quiet: bool = False) -> Reporter:
+    """The reporter that suits stderr; ``quiet`` leaves the warnings only."""
+    if quiet:
+        return QuietReporter()
+    return BarReporter() if sys.stderr.isatty() else LineReporter()
+
+
+class QuietReporter:
+    """Warnings only."""
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        yield SilentTask()
+
+    def info(self, text: str) -> None: ...
+
+    def warn(self, text: str) -> None:
+        click.echo(f"warning: {text}", err=True)
+
+
+class LineReporter(QuietReporter):
+    """Plain lines, as a log wants them."""
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        begin = time.monotonic()
+        line = LineTask(label, total)
+        yield line
+        note = f", {line.note}" if line.note else ""
+        click.echo(f"{label}: done in {time.monotonic() - begin:.1f} s{note}", err=True)
+
+    def info(self, text: str) -> None:
+        click.echo(text, err=True)
+
+
+class LineTask:
+    """Counted work that says every few seconds how far it is."""
+
+    def __init__(self, label: str, total: int | None) -> None:
+        self.label = label
+        self.total = total
+        self.done = 0
+        self.note = ""
+        self._begin = self._said = time.monotonic()
+
+    def advance(self, steps: int = 1) -> None:
+        self.update(done=self.done + steps)
+
+    def update(self, *, done: int | None = None, note: str | None = None) -> None:
+        self.done = self.done if done is None else done
+        self.note = self.note if note is None else note
+        now = time.monotonic()
+        if now - self._said >= LINE_EVERY:
+            self._said = now
+            click.echo(self._text(now - self._begin), err=True)
+
+    def _text(self, elapsed: float) -> str:
+        words = [f"{self.label}: {self.done}" + (f"/{self.total}" if self.total else "")]
+        if self.note:
+            words.append(self.note)
+        if self.total and self.done:
+            words.append(f"{elapsed * (self.total - self.done) / self.done:.0f} s left")
+        return ", ".join(words)
+
+
+class BarReporter:
+    """Bars with the time left, remarks above them. The display lives as long as the outermost task."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+
+        self._console = Console(stderr=True)
+        self._progress: Progress | None = None
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        if self._progress is not None:
+            bar = self._progress.add_task(label, total=total, note="")
+            yield BarTask(self._progress, bar)
+            self._progress.stop_task(bar)
+            return
+        self._progress = _bars(self._console)
+        try:
+            with self._progress:
+                bar = self._progress.add_task(label, total=total, note="")
+                yield BarTask(self._progress, bar)
+        finally:
+            self._progress = None
+
+    def info(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False)
+
+    def warn(self, text: str) -> None:
+        self._console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+
+
+class BarTask:
+    """One bar."""
+
+    def __init__(self, progress: Progress, bar: TaskID) -> None:
+        self._progress = progress
+        self._bar = bar
+
+    def advance(self, steps: int = 1) -> None:
+        self._progress.advance(self._bar, steps)
+
+    def update(self, *, done: int | None = None, note: str | None = None) -> None:
+        changes: dict[str, Any] = {}
+        if done is not None:
+            changes["completed"] = done
+        if note is not None:
+            changes["note"] = note
+        self._progress.update(self._bar, **changes)
+
+
+def _bars(console: Console) -> Progress:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        TextColumn("{task.fields[note]}", markup=False),
+        console=console,
+    )

@@ -1,0 +1,114 @@
+"""``cleargs run``: a capture through all stages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cleargs.cli.common import (
+    DeviceChoice,
+    json_option,
+    opened_store,
+    partial_option,
+    print_json,
+    quiet_option,
+    resolve_device,
+    store_option,
+    threads_or_all,
+    work_options,
+)
+from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import InputError
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.runner import Runner, check_same_input
+from cleargs.pipeline.store import STORE_FOLDER
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs run video.mp4 -o room
+  cleargs run photos/ -o room --workflow smoke            quick look
+  cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
+  cleargs run photos/ -o room --dry-run                   what would be done, why, and the cost
+  cleargs run photos/ -o room --until rva                 stop before training
+"""
+)
+@click.argument("source", metavar="INPUT", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    metavar="RUN",
+    required=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="The run folder; an existing one goes on.",
+)
+@click.option(
+    "--workflow",
+    default="default",
+    show_default=True,
+    metavar="NAME|FILE.toml",
+    help="The recipe: default, smoke, paper, or a TOML file of your own.",
+)
+@click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of all randomness.  [default: 0]")
+@click.option("--until", metavar="STAGE", help="Stop after this stage.")
+@click.option(
+    "--force", multiple=True, metavar="STAGE", help="Make the stage again, even if its results are there."
+)
+@click.option("--dry-run", is_flag=True, help="Only say what would be done, why, and what it costs.")
+@partial_option
+@work_options
+@store_option
+@json_option
+@quiet_option
+@click.pass_obj
+def run(
+    dag: Dag,
+    source: Path,
+    folder: Path,
+    workflow: str,
+    overrides: tuple[str, ...],
+    seed: int | None,
+    until: str | None,
+    force: tuple[str, ...],
+    dry_run: bool,
+    allow_partial: bool,
+    device: DeviceChoice,
+    threads: int | None,
+    store: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Turn INPUT into a clean scene in the folder RUN.
+
+    INPUT is a video, an image folder, a COLMAP project (images/ and sparse/0), or a folder with
+    transforms.json. Results that are there already are not made again; an interrupted run goes on.
+    """
+    if not source.exists():
+        raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
+    config = load_config(dag, workflow, overrides, seed)
+    folder = folder.absolute()
+    root = (store or folder / STORE_FOLDER).absolute()
+    settings = Run(folder, source.absolute(), config, root, resolve_device(device))
+    dag.until(until)
+    reporter = make_reporter(quiet)
+    with opened_store(root) as opened:
+        check_same_input(settings, dag, opened)
+        if dry_run:
+            planner = Planner(dag, settings, opened, threads_or_all(threads), reporter)
+            print_plans(planner.plan(until, tuple(dag.check(name) for name in force)), as_json)
+            return 0
+        runner = Runner(dag, settings, opened, threads_or_all(threads), reporter)
+        outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
+    if as_json:
+        print_json([outcome_json(outcome) for outcome in outcomes])
+    else:
+        print_outcomes(outcomes, folder)
+    return exit_code(outcomes)

@@ -1,0 +1,233 @@
+"""The command line as a user meets it: exit codes, two lines of error, results on stdout."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from toy import Bench
+
+from cleargs.cli.main import COMMANDS, explanation, invoke
+from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.tables import column
+
+
+@pytest.fixture
+def recipe(bench: Bench) -> str:
+    path = bench.root / "empty.toml"
+    path.touch()
+    return str(path)
+
+
+class Shell:
+    """Calls commands on the toy pipeline."""
+
+    def __init__(self, bench: Bench, recipe: str, capsys: pytest.CaptureFixture[str]) -> None:
+        self.bench = bench
+        self.recipe = recipe
+        self.capsys = capsys
+
+    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+        code = invoke(list(arguments), self.bench.dag)
+        streams = self.capsys.readouterr()
+        return code, streams.out, streams.err
+
+    def run(self, *arguments: str) -> tuple[int, str, str]:
+        capture, folder = str(self.bench.capture), str(self.bench.folder)
+        return self("run", capture, "-o", folder, "--workflow", self.recipe, *arguments)
+
+
+@pytest.fixture
+def shell(
+    bench: Bench, recipe: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Shell:
+    monkeypatch.delenv("CLEARGS_STORE", raising=False)
+    return Shell(bench, recipe, capsys)
+
+
+def test_run_twice(shell: Shell) -> None:
+    code, out, err = shell.run()
+    assert code == 0
+    assert "total        made in" in out and "results:" in out
+    assert "expected about" in err and "square: starts (not made yet)" in err
+    code, out, err = shell.run()
+    assert code == 0 and out.count("already there") == 3 and err == ""
+
+
+def test_run_json_is_json_and_nothing_else(shell: Shell) -> None:
+    code, out, _ = shell.run("--json")
+    stages = json.loads(out)
+    assert code == 0 and [stage["status"] for stage in stages] == ["complete"] * 3
+
+
+def test_quiet_says_nothing_on_stderr(shell: Shell) -> None:
+    assert shell.run("-q")[2] == ""
+
+
+def test_dry_run_writes_nothing(shell: Shell) -> None:
+    code, out, _ = shell.run("--dry-run")
+    assert code == 0 and "count        miss     not made yet" in out and "waits for count" in out
+    assert "expected about" in out
+    assert not shell.bench.folder.exists()
+
+
+def test_explain_and_stage(shell: Shell) -> None:
+    shell.run()
+    folder = str(shell.bench.folder)
+    assert shell("explain", folder)[1].count("hit") == 3
+    (shell.bench.capture / "1.txt").write_text("50")
+    code, out, _ = shell("explain", folder)
+    assert code == 0 and "external capture: 1.txt changed" in out
+    assert json.loads(shell("explain", folder, "--json")[1])[0]["state"] == "miss"
+    code, _, err = shell("stage", "total", folder)
+    assert code == 1 and "error: total needs count, which is not done" in err
+    assert shell("stage", "count", folder)[0] == 0
+    assert shell("stage", "square", folder, "--threads", "1")[0] == 0
+
+
+def test_partial_is_exit_code_3_and_says_what_is_missing(shell: Shell) -> None:
+    (shell.bench.capture / "1.txt").write_text("")
+    code, out, err = shell.run()
+    assert code == 3 and "in part" in out and "missing: count: 1.txt is empty" in err
+    code, out, err = shell.run("--allow-partial")
+    assert code == 3 and (shell.bench.folder / "total" / "total.txt").exists()
+    (shell.bench.capture / "1.txt").write_text("1")
+    assert shell.run()[0] == 0
+
+
+def test_show(shell: Shell) -> None:
+    shell.run()
+    folder = str(shell.bench.folder)
+    code, out, _ = shell("show", folder)
+    assert code == 0 and "complete" in out and "total 55" in out
+    assert json.loads(shell("show", folder, "square", "--json")[1])["summary"] == {"total": 55}
+    assert shell("show", folder, "sqare")[2].startswith(
+        "error: there is no stage 'sqare'\nhint: did you mean"
+    )
+
+
+def test_gc(shell: Shell) -> None:
+    shell.run("--set", "square.power=3")
+    shell.run()
+    folder = str(shell.bench.folder)
+    garbage = json.loads(shell("gc", folder, "--dry-run", "--json")[1])
+    assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
+    shell("gc", folder)
+    assert not any(Path(item["folder"]).exists() for item in garbage)
+    assert shell.run()[1].count("already there") == 3
+
+
+def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CLEARGS_STORE", str(tmp_path / "shared"))
+    assert shell.run()[0] == 0
+    assert (tmp_path / "shared" / "count").is_dir() and not shell.bench.store.exists()
+    monkeypatch.delenv("CLEARGS_STORE")
+    assert shell("explain", str(shell.bench.folder))[1].count("hit") == 3, "run.toml knows its store"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "cause", "hint"),
+    [
+        (["frob"], 2, "No such command 'frob'", "cleargs --help"),
+        (["run"], 2, "Missing argument 'INPUT'", "cleargs run --help"),
+        (["run", "nowhere", "-o", "r"], 2, "there is no nowhere", "give a video"),
+        (["run", ".", "-o", "r", "--workflow", "fast"], 2, "there is no workflow 'fast'", "choose default"),
+        (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
+        (["explain", "nowhere"], 2, "is no run", "cleargs run INPUT"),
+        (["show", "nowhere"], 2, "is no run", "cleargs run -o"),
+        (["gc"], 2, "neither a run nor a store", "--store"),
+        (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "the stages are count, square, total"),
+    ],
+)
+def test_wrong_usage(shell: Shell, arguments: list[str], code: int, cause: str, hint: str) -> None:
+    found, out, err = shell(*arguments)
+    lines = err.splitlines()
+    assert found == code and out == "" and len(lines) == 2
+    assert lines[0].startswith("error: ") and cause in lines[0]
+    assert lines[1].startswith("hint: ") and hint in lines[1]
+
+
+def test_bad_setting_creates_nothing(shell: Shell) -> None:
+    code, _, err = shell.run("--set", "square.power=30")
+    assert code == 2 and "at most 4" in err and not shell.bench.folder.exists()
+
+
+def test_unexpected_error_is_two_lines_and_debug_shows_the_traceback(shell: Shell) -> None:
+    (shell.bench.capture / "1.txt").write_text("one")
+    code, _, err = shell.run("-q")
+    assert code == 1 and "Traceback" not in err and len(err.splitlines()) == 2
+    assert "unexpected ValueError" in err and "--debug" in err
+    code, _, err = shell.run("-q", "--debug")
+    assert code == 1 and "Traceback" in err
+
+
+def test_machine_errors_have_a_remedy() -> None:
+    assert explanation(MemoryError())[1] == "out of memory"
+    assert explanation(OSError(28, "No space left on device"))[2].startswith("free some space")
+    assert explanation(PermissionError(13, "Permission denied", "/x"))[1] == "Permission denied: /x"
+
+
+def test_help_of_every_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS:
+        assert invoke([name, "--help"]) == 0
+        assert f"Usage: cleargs {name}" in capsys.readouterr().out
+
+
+def test_help_and_no_op_import_nothing_heavy(shell: Shell) -> None:
+    shell.run()
+    heavy = {"torch", "numba", "pycolmap", "cv2", "onnxruntime", "scipy", "pyarrow", "rich"}
+    program = (
+        "import sys; from pathlib import Path; from cleargs.cli.main import invoke; from toy import toy_dag\n"
+        "code = invoke(sys.argv[1:], toy_dag(Path('journal')))\n"
+        f"print(code, sorted({heavy!r} & set(sys.modules)))"
+    )
+    capture, folder = str(shell.bench.capture), str(shell.bench.folder)
+    for arguments in (["--help"], ["run", capture, "-o", folder, "--workflow", shell.recipe]):
+        done = subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            capture_output=True,
+            text=True,
+            env={"PYTHONPATH": str(Path(__file__).parents[1] / "pipeline")},
+        )
+        assert done.stdout.splitlines()[-1] == "0 []", done.stderr
+
+
+def test_installed_stages_load_light() -> None:
+    """Planning loads every stage module; a run with nothing to do must not pay for what `run` needs."""
+    heavy = {"torch", "numba", "pycolmap", "cv2", "onnxruntime", "scipy"}
+    program = (
+        "import sys; from cleargs.pipeline.dag import installed; from cleargs.pipeline.config import load_config\n"
+        f"load_config(installed()); print(sorted({heavy!r} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_tables_in_figures() -> None:
+    schema = pa.schema(
+        [
+            column("role", pa.string(), "what it does"),
+            column("weight", pa.float32(), "weight in [0, 1]", nullable=True),
+            column("reliable", pa.bool_(), "trusted"),
+            column("step", pa.int32(), "step"),
+        ]
+    )
+    rows = {
+        "role": ["a", "b", "b"],
+        "weight": [0.5, None, 1.0],
+        "reliable": [True, True, False],
+        "step": [1, 2, 3],
+    }
+    table = pa.table(rows, schema=schema)
+    facts = describe_table(table)
+    assert facts["role"]["counts"] == {"b": 2, "a": 1}
+    assert facts["reliable"]["counts"] == {"true": 2, "false": 1}
+    assert facts["weight"]["nulls"] == 1 and facts["weight"]["median"] == 0.75
+    assert facts["weight"]["meaning"] == "weight in [0, 1]"
+    assert [row["step"] for row in sampled_rows(table, 2)] == [1, 3]
+    assert [row["step"] for row in sampled_rows(table, 9)] == [1, 2, 3]
+    assert describe_table(table.slice(0, 0))["weight"]["distinct"] == 0
