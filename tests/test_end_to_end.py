@@ -1,0 +1,143 @@
+"""All five stages on a small synthetic capture, through the command line, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from plyfile import PlyData
+
+from cleargs.progress import SilentReporter
+from cleargs.stages import STAGES
+from cleargs.synth.capture import make_capture
+
+COMMAND = [sys.executable, "-c", "from cleargs.cli.main import main; main()"]
+SETTINGS = {
+    "ingest.poses": "sfm",
+    "ingest.max_features": "1024",
+    "g0.steps": "60",
+    "g0.min_points": "1500",
+    "g0.budget": "2000",
+    "g0.checkpoint_interval": "10",
+    "rivr.rounds": "2",
+    "rivr.distil.steps": "20",
+    "rivr.distil.checkpoint_interval": "5",
+    "consolidate.distil.steps": "20",
+    "consolidate.distil.checkpoint_interval": "5",
+}
+KILLS_A_STAGE = 2
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight frames, images alone: half of them sharp."""
+    folder = tmp_path_factory.mktemp("capture") / "room"
+    make_capture(folder, "mixed", frames=8, width=320, height=180, seed=3, reporter=SilentReporter())
+    return folder
+
+
+def command(capture: Path, run: Path, *more: str) -> list[str]:
+    settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
+    return [*COMMAND, "run", str(capture), "-o", str(run), *settings, *more]
+
+
+def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(command(capture, run, *more), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def digests(run: Path) -> dict[str, dict[str, str]]:
+    """Stage -> file -> digest, as its manifest has them."""
+    manifests = {stage: json.loads((run / stage / "manifest.json").read_text()) for stage in STAGES}
+    return {
+        stage: {name: record["digest"] for name, record in manifest["files"].items()}
+        for stage, manifest in manifests.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An undisturbed run on two threads."""
+    run = tmp_path_factory.mktemp("finished") / "run"
+    finish(capture, run, "--threads", "2")
+    return run
+
+
+def test_every_artifact_is_there_to_inspect(finished: Path) -> None:
+    frames = pq.read_table(finished / "ingest" / "frames.parquet").to_pylist()
+    assert [frame["frame_id"] for frame in frames] == list(range(8))
+    assert sum(frame["registered"] for frame in frames) >= 5
+    rva = pq.read_table(finished / "rva" / "frames.parquet").to_pylist()
+    assert len(rva) == 8 and any(row["weight"] > 0.8 for row in rva)
+    selection = pq.read_table(finished / "rivr" / "selection.parquet").to_pylist()
+    # One strong frame is held back from distillation to tell whether it did harm.
+    targets = sum(frame["registered"] for frame in frames) - 1
+    assert len(selection) == 2 * targets
+    for row in selection:
+        assert (finished / "rivr" / row["exr"]).is_file()
+    for stage in ("g0", "rivr", "consolidate"):
+        vertices = PlyData.read(finished / stage / "scene.ply")["vertex"]
+        assert {"x", "opacity", "scale_0", "rot_3", "f_dc_0"} <= {p.name for p in vertices.properties}
+        assert 1500 <= vertices.count <= 2000
+    assert (finished / "consolidate" / "before_after.png").is_file()
+
+
+def test_one_thread_gives_the_same_digests(capture: Path, finished: Path, tmp_path: Path) -> None:
+    finish(capture, tmp_path / "run", "--threads", "1")
+    assert digests(tmp_path / "run") == digests(finished)
+
+
+def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
+    done = finish(capture, finished)
+    assert all(f"{stage}: starts" not in done.stderr for stage in STAGES)
+    after = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
+    assert {path: after.get(path) for path in before} == before
+
+
+def test_a_setting_redoes_only_what_reads_it(capture: Path, finished: Path) -> None:
+    done = finish(capture, finished, "--set", "consolidate.distil.steps=10", "--dry-run", "--json")
+    states = {row["stage"]: row["state"] for row in json.loads(done.stdout)}
+    assert states == {**dict.fromkeys(STAGES, "hit"), "consolidate": "miss"}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_killed_at_any_moment_it_ends_with_the_same_digests(
+    stage: str, capture: Path, finished: Path, tmp_path: Path
+) -> None:
+    """kill -9 at random moments inside the stage, then the same command."""
+    run = tmp_path / "run"
+    if STAGES.index(stage) > 0:
+        finish(capture, run, "--until", STAGES[STAGES.index(stage) - 1])
+    seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
+    moments = random.Random(stage)
+    for _ in range(KILLS_A_STAGE):
+        _kill_inside(command(capture, run, "--until", stage), f"{stage}: starts", moments.uniform(0, seconds))
+    finish(capture, run, "--until", stage)
+    files = json.loads((run / stage / "manifest.json").read_text())["files"]
+    assert {name: record["digest"] for name, record in files.items()} == digests(finished)[stage]
+
+
+def _kill_inside(arguments: list[str], start: str, delay: float) -> None:
+    """Start the command, wait for the line ``start``, then ``delay`` seconds, then kill -9 all of it."""
+    with subprocess.Popen(
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith(start):
+                time.sleep(delay)
+                break
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            return  # it was faster than that
