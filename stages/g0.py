@@ -61,13 +61,14 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import evaluate_views, train
-    from cleargs.splat.views import real_views
+    from cleargs.splat.views import real_views, require_views
     from cleargs.tables import read_table, write_table
 
     config, ingest = context.config, context.inputs["ingest"]
     set_threads(context.threads)
     allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
     views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
+    require_views(views)
     sparse = _sparse_points(ingest, [view.frame_id for view in views])
 
     sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree

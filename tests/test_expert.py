@@ -47,7 +47,7 @@ def psnr(image: Image, reference: Image) -> float:
     return float(-10 * np.log10(np.mean(np.square(image.astype(np.float64) - reference)) + 1e-12))
 
 
-# --- tiles ---------------------------------------------------------------------------------------------------------
+# --- tiles ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fixed", [None, 100, 256])
@@ -97,7 +97,7 @@ def test_seams_are_smooth() -> None:
     blended = apply_tiled(lambda tile: np.full_like(tile, tile.mean()), image, fixed=(64, 256))
     means = 256 / 700  # difference of neighbouring tiles' means, at most
     assert blended.std() > 0.1
-    # A raised cosine over the shortest overlap, 32 pixels, climbs by at most pi/2 / 32 of the difference a pixel.
+    # A raised cosine over the shortest overlap, 32 pixels, climbs by at most pi/2 / 32 of it a pixel.
     assert np.abs(np.diff(blended, axis=1)).max() < means * np.pi / 2 / 32 * 1.05
 
 
@@ -110,7 +110,7 @@ def test_progress_counts_every_tile() -> None:
     assert {total for _, total in calls} == {len(calls)}
 
 
-# --- the shipped expert --------------------------------------------------------------------------------------------
+# --- the shipped expert ---------------------------------------------------------------------------------
 
 
 def test_shipped_model_is_small_and_has_a_stable_digest() -> None:
@@ -165,7 +165,7 @@ def test_motion_blur_is_reduced(length: float) -> None:
     assert np.mean(gains) > 0.5
 
 
-# --- other models and errors ---------------------------------------------------------------------------------------
+# --- other models and errors ----------------------------------------------------------------------------
 
 
 def test_missing_file() -> None:
@@ -201,7 +201,7 @@ def test_values_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch)
 def test_a_model_that_changes_the_size_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     expert = OnnxExpert(expert_path("embedded"))
     monkeypatch.setattr(expert, "_model", FakeModel(np.zeros((1, 3, 128, 128), np.float32)))
-    with pytest.raises(InputError, match="same size"):
+    with pytest.raises(InputError, match="maps"):
         expert.restore(noise_image(64, 64))
 
 
@@ -217,7 +217,7 @@ def test_maxim_equals_its_reference_vectors() -> None:
     np.testing.assert_allclose(restored, expected, atol=1e-4)
 
 
-# --- degradations --------------------------------------------------------------------------------------------------
+# --- degradations ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [0.5, 3.0, 7.0, 14.0, 21.0])
@@ -251,7 +251,7 @@ def test_disc_kernel() -> None:
 
 
 def test_blur_keeps_light() -> None:
-    # Away from the borders all light of a bright window stays: the mean in linear light is kept, that of sRGB is not.
+    # Away from the borders all light of a bright window stays: the linear mean is kept, that of sRGB is not.
     image = np.full((96, 96, 3), 0.05, np.float32)
     image[40:56, 40:56] = 0.9
     kernel = motion_kernel(np.random.default_rng(1), 15.0)

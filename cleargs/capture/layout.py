@@ -18,15 +18,22 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
+def mask_folder(source: Path) -> Path | None:
+    """The folder of masks beside (or in) the folder of images, or None."""
+    beside = source.parent / "masks"
+    if source.name == "images" and beside.is_dir():
+        return beside
+    return source / "masks" if (source / "masks").is_dir() else None
+
+
 def externals(source: Path, config: IngestConfig) -> Mapping[str, Path]:
-    """What ingest reads of ``source``: role -> file or folder (a missing input is not this function's business)."""
+    """What ingest reads of ``source``: role -> file or folder. A missing input is left to ingest to name."""
     if not source.is_dir():
         return {"capture": source}
-    images, masks, transforms = source / "images", source / "masks", source / "transforms.json"
-    if not images.is_dir() or (transforms.is_file() and _lists_outside(transforms)):
-        return {"capture": source}
-    found = {"images": images}
-    if masks.is_dir():
+    images, masks, transforms = source / "images", mask_folder(source), source / "transforms.json"
+    whole = not images.is_dir() or (transforms.is_file() and _lists_outside(transforms))
+    found = {"capture": source} if whole else {"images": images}
+    if masks is not None:
         found["masks"] = masks
     if transforms.is_file():
         found["transforms"] = transforms

@@ -100,7 +100,7 @@ def _upright(frame: SourceFrame) -> NDArray[np.uint8]:
 def _alike(width: int, height: int, image: NDArray[np.uint8]) -> bool:
     """Whether an image has these proportions, but for rounding to whole pixels."""
     h, w = image.shape[:2]
-    return abs(w * height - h * width) <= max(width, height) + max(w, h)
+    return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
 def _work_frame(frame: SourceFrame, image: Path, mask: Path) -> WorkFrame:

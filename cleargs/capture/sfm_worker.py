@@ -67,7 +67,7 @@ def _import(job: dict[str, Any], database: Path) -> None:
             leftover.unlink()
     cameras = [pycolmap.Camera(**camera) for camera in job["cameras"]]
     if job["exif_image"] is not None:
-        _apply_exif_focal(cameras, Path(job["exif_image"]))
+        apply_exif_focal(cameras, Path(job["exif_image"]))
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
         for index, camera in enumerate(cameras):
             camera.camera_id = index + 1
@@ -83,9 +83,12 @@ def _import(job: dict[str, Any], database: Path) -> None:
             opened.write_frame(frame, use_frame_id=True)
 
 
-def _apply_exif_focal(cameras: Sequence[pycolmap.Camera], image: Path) -> None:
+def apply_exif_focal(cameras: Sequence[pycolmap.Camera], image: Path) -> None:
     """Start from the focal length that the input's first image states, where it does."""
-    stated = pycolmap.infer_camera_from_image(image)
+    try:
+        stated = pycolmap.infer_camera_from_image(image)
+    except ValueError:  # a format that COLMAP does not read (it gets PNG copies): no EXIF either
+        return
     if not stated.has_prior_focal_length:
         return
     factor = stated.mean_focal_length() / max(stated.width, stated.height)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import find_model
+from cleargs.capture.layout import find_model, mask_folder
 from cleargs.capture.model import SparseModel, read_model
 from cleargs.capture.transforms import read_transforms
 from cleargs.errors import InputError
@@ -137,7 +137,7 @@ def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[in
 def _open_transforms(source: Path, config: IngestConfig) -> Capture:
     listed = read_transforms(source / "transforms.json", poses=config.poses == "auto")
     listed.sort(key=lambda frame: natural_key(frame.name))
-    masks = _masks(source / "masks")
+    masks = _masks(mask_folder(source))
     frames = tuple(
         SourceFrame(
             frame.name,
@@ -159,7 +159,7 @@ def _open_images(source: Path, config: IngestConfig) -> Capture:
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
-    masks = _masks(source / "masks" if folder != source else source.parent / "masks")
+    masks = _masks(mask_folder(source))
     frames = tuple(
         SourceFrame(path.name, path, mask=_mask_of(masks, path.name))
         for path in spread(files, config.max_frames)
@@ -181,7 +181,7 @@ def _open_colmap(source: Path, folder: Path, config: IngestConfig) -> Capture:
         )
     # Images that COLMAP could not register are frames too: they stay in the table, marked.
     names = sorted(set(posed) | {path.name for path in _image_files(root)}, key=natural_key)
-    masks = _masks(source / "masks")
+    masks = _masks(mask_folder(source))
     frames = []
     for name in spread(names, config.max_frames):
         image = posed.get(name)
@@ -202,8 +202,8 @@ def _image_files(folder: Path) -> list[Path]:
     )
 
 
-def _masks(folder: Path) -> dict[str, Path]:
-    return {path.stem: path for path in _image_files(folder)} if folder.is_dir() else {}
+def _masks(folder: Path | None) -> dict[str, Path]:
+    return {} if folder is None else {path.stem: path for path in _image_files(folder)}
 
 
 def _mask_of(masks: Mapping[str, Path], name: str) -> Path | None:

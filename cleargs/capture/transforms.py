@@ -140,5 +140,5 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
     u, stretch, vt = np.linalg.svd(matrix[:3, :3])
     if stretch[2] < 1e-9 or stretch[0] > 1.05 * stretch[2] or np.linalg.det(u @ vt) < 0:
         raise InputError(f"the pose of {name} is not a rotation and a translation", hint=hint)
-    # Printed poses are orthonormal to a few digits only (and some writers leave a scale in): nearest rotation.
+    # Printed poses are orthonormal to a few digits only, and some writers leave a scale in: nearest rotation.
     return Pose.from_opengl(np.column_stack([u @ vt, matrix[:3, 3]]))

@@ -68,6 +68,6 @@ def _similarity(run: Path, first: str) -> dict[str, Any]:
     found = manifest.summary.get("similarity") if manifest is not None else None
     if not isinstance(found, dict):
         raise InputError(
-            f"{run / first} does not say how it was normalised", hint="run that stage again with --force"
+            f"{run / first} does not say how it was normalised", hint="run that stage with --force"
         )
     return found

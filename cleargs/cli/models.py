@@ -82,10 +82,10 @@ def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> Non
         except InputError as error:
             faults[entry.name] = error
     if as_json:
-        print_json({name: "sound" if error is None else str(error) for name, error in faults.items()})
+        print_json({name: str(fault or "sound") for name, fault in faults.items()})
     else:
-        for name, error in faults.items():
-            click.echo(f"{name}: {'sound' if error is None else error}")
-    for error in faults.values():
-        if error is not None:
-            raise error
+        for name, fault in faults.items():
+            click.echo(f"{name}: {fault or 'sound'}")
+    for fault in faults.values():
+        if fault is not None:
+            raise fault

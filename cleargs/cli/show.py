@@ -143,7 +143,14 @@ def _print_facts(console: Console, manifest: Manifest) -> None:
 def _print_columns(console: Console, name: str, data: Any) -> None:
     from rich.table import Table
 
-    table = Table("column", "values", "meaning", box=None, header_style="bold", title_justify="left")
+    table = Table(
+        "column",
+        "min .. median .. max, or counts",
+        "meaning",
+        box=None,
+        header_style="bold",
+        title_justify="left",
+    )
     table.title = f"\n{name}: {data.num_rows} rows"
     for column, facts in describe_table(data).items():
         table.add_row(column, _describe(facts), facts.get("meaning", ""))
@@ -170,11 +177,15 @@ def _describe(facts: dict[str, Any]) -> str:
     return f"{words}, {facts['nulls']} empty" if facts["nulls"] else words
 
 
-def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for label, value in summary.items():
-        rows += _flat(value, f"{prefix}{label}.") if isinstance(value, dict) else [(prefix + label, value)]
-    return rows
+def _flat(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested figures as one list of ("outer.inner", value); the items of lists of tables count from 1."""
+    if isinstance(value, dict):
+        pairs = list(value.items())
+    elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        pairs = [(str(number), item) for number, item in enumerate(value, 1)]
+    else:
+        return [(prefix, value)]
+    return [row for label, item in pairs for row in _flat(item, f"{prefix}.{label}" if prefix else label)]
 
 
 def _is_figure(value: Any) -> bool:

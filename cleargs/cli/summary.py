@@ -14,7 +14,8 @@ MOST_COUNTED = 12
 def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:
     """Column -> its meaning (from the field's metadata), nulls, and figures that suit its type.
 
-    Words and booleans: ``counts`` of each value, most frequent first (``distinct`` where there are many).
+    Words and booleans: ``counts`` of each value, most frequent first (``distinct`` where there are many, or
+    where every row has its own).
     Numbers: ``min``, ``median``, ``mean``, ``max`` over the values that are neither null nor NaN.
     """
     return {field.name: _describe(field, table[field.name]) for field in table.schema}
@@ -26,14 +27,11 @@ def _describe(field: pa.Field, column: pa.ChunkedArray) -> dict[str, Any]:
         facts["meaning"] = field.metadata[b"meaning"].decode()
     if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
         return {**facts, **_figures(column)}
-    if (
-        pa.types.is_string(field.type)
-        or pa.types.is_boolean(field.type)
-        or pa.types.is_dictionary(field.type)
-    ):
+    if pa.types.is_string(field.type) or pa.types.is_boolean(field.type):
         counts = {item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()}
         counts.pop(None, None)
-        if len(counts) <= MOST_COUNTED:
+        names = len(counts) > 2 and len(counts) == len(column) - column.null_count
+        if len(counts) <= MOST_COUNTED and not names:
             ordered = sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))
             return {**facts, "counts": {_word(value): count for value, count in ordered}}
         return {**facts, "distinct": len(counts)}

@@ -44,8 +44,8 @@ class Expert(Protocol):
 class OnnxExpert:
     """A restoration network in an ONNX file, run on overlapping tiles.
 
-    The model takes one image as [1, 3, H, W] or [1, H, W, 3] float32 in [0, 1] and returns one of the same size in
-    either layout; of several outputs the first counts. Sides that the model fixes become the tile size.
+    The model takes one image as [1, 3, H, W] or [1, H, W, 3] float32 in [0, 1] and returns one of the same
+    size in either layout; of several outputs the first counts. Sides that the model fixes become the tiles'.
 
     Raises InputError when the file is missing, no ONNX model, or of another form.
     """
@@ -83,7 +83,7 @@ class OnnxExpert:
                 f"the restoration expert {self.name} returned values that are not finite",
                 hint="check the model file, or set rivr.expert to another one",
             )
-        return np.clip(restored, 0.0, 1.0)
+        return np.clip(restored, np.float32(0.0), np.float32(1.0))
 
     def _restore_tile(self, tile: Image) -> Image:
         batch = tile.transpose(2, 0, 1)[None] if self._channels_first else tile[None]
@@ -94,11 +94,11 @@ class OnnxExpert:
                 f"the restoration expert {self.name} maps {tile.shape} to {output.shape}",
                 hint="a restoration model returns an image of the same size",
             )
-        return restored
+        return np.asarray(restored, np.float32)
 
 
 def expert_path(spec: str) -> Path:
-    """The ONNX file of an expert: ``embedded`` is the one that ships with ClearGS, anything else is a path."""
+    """The ONNX file of an expert: ``embedded`` is the one that ships, anything else is a path."""
     if spec == EMBEDDED:
         return Path(str(files("cleargs.models"))) / "weights" / "restorer.onnx"
     return Path(spec)

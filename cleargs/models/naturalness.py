@@ -1,9 +1,10 @@
 """A no-reference score from a few image statistics, without a network.
 
-Luminance with its local mean and contrast divided out (MSCN coefficients; Ruderman 1994; Mittal et al., BRISQUE,
-2012) looks alike in all sharp photographs. Blur makes neighbours agree, over-sharpening and ringing make them
-disagree a few pixels on, noise removes the correlation, and each changes the peakedness. A quadratic in these figures
-predicts LPIPS to the unseen clean image; its coefficients lie in ``naturalness.toml``.
+Luminance with its local mean and contrast divided out (MSCN coefficients; Ruderman 1994; Mittal et al.,
+BRISQUE, 2012) looks alike in all sharp photographs. Blur makes neighbours agree, over-sharpening and ringing
+make them disagree a few pixels on, noise removes the correlation, and each changes the peakedness. A
+quadratic in these figures predicts LPIPS to the unseen clean image; its coefficients lie in
+``naturalness.toml``.
 """
 
 from __future__ import annotations
@@ -67,15 +68,17 @@ class StatisticsScorer:
 def features(image: Image) -> NDArray[np.float64]:
     """Nine figures at full and at half size. [18]
 
-    image: [H, W, 3] float32 sRGB in [0, 1]. At each size: logarithms of the variance and the kurtosis of the MSCN
-    coefficients; their correlation one and two pixels on (the larger and the smaller of the horizontal and the
-    vertical one), three pixels on and diagonally (means); the logarithm of the mean local contrast.
+    image: [H, W, 3] float32 sRGB in [0, 1]. At each size: logarithms of the variance and the kurtosis of the
+    MSCN coefficients; their correlation one and two pixels on (the larger and the smaller of the horizontal
+    and the vertical one), three pixels on and diagonally (means); the logarithm of the mean local contrast.
     """
     luma = image @ _BT601
     figures: list[float] = []
     for scale in range(_SCALES):
         if scale:
-            luma = cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            luma = np.asarray(
+                cv2.resize(luma, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.float32
+            )
         figures += _scale_features(luma)
     return np.array(figures)
 
@@ -85,7 +88,8 @@ def terms(
     mean: NDArray[np.float64],  # [F]
     deviation: NDArray[np.float64],  # [F]
 ) -> NDArray[np.float64]:
-    """The terms of the quadratic: 1, every standardised feature, every product of two. [..., 1 + F + F (F + 1) / 2]"""
+    """The terms of the quadratic: 1, every standardised feature, every product of two. [..., 1 + F + F (F +
+    1) / 2]"""
     z = np.clip((features - mean) / deviation, -_LIMIT, _LIMIT)
     i, j = np.triu_indices(z.shape[-1])
     return np.concatenate([np.ones_like(z[..., :1]), z, z[..., i] * z[..., j]], axis=-1)

@@ -1,7 +1,7 @@
-"""ONNX models on onnxruntime's CPU provider, one thread a call, so that results never depend on the thread count.
+"""ONNX models on onnxruntime's CPU provider, one thread a call: results never depend on the thread count.
 
-Parallelism is the caller's: `OnnxModel.run` may be called from several threads at once (for instance one image tile
-each), and every call computes the same bits.
+Parallelism is the caller's: `OnnxModel.run` may be called from several threads at once (for instance one
+image tile each), and every call computes the same bits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cleargs.errors import InputError
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """Name, shape (None where free) and element type (``float``, ``float16``, ...) of a model's input or output."""
+    """Name, shape (None where free) and element type (``float``, ``float16``...) of an input or output."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -64,7 +64,7 @@ class OnnxModel:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def run(self, *tensors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """All outputs for the given inputs, in the model's order. Safe to call from several threads at once."""
+        """All outputs for the given inputs, in the model's order. Several threads may call this at once."""
         feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
         outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
         return outputs

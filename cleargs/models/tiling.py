@@ -1,7 +1,7 @@
 """An image-to-image function applied tile by tile, with overlap and blended seams.
 
-The tile grid and the blend depend on the image size alone, and tiles are added up in a fixed order: the result is
-bitwise the same for any number of threads.
+The tile grid and the blend depend on the image size alone, and tiles are added up in a fixed order: the
+result is bitwise the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -41,8 +42,8 @@ class TileAxis:
 def plan_axis(length: int, fixed: int | None) -> TileAxis:
     """Tiles for an image side of ``length`` pixels.
 
-    Neighbours overlap by at least an eighth of the largest tile. Tiles of a fixed size spread evenly; free ones
-    shrink so that little is computed twice.
+    Neighbours overlap by at least an eighth of the largest tile. Tiles of a fixed size spread evenly; free
+    ones shrink so that little is computed twice.
     """
     largest = fixed or FREE_TILE
     overlap = largest // 8
@@ -58,7 +59,7 @@ def plan_axis(length: int, fixed: int | None) -> TileAxis:
 def _windows(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.float32]:
     """Blend weights [tiles, size]: raised-cosine ramps where neighbours overlap, normalised to sum to one."""
     windows = np.ones((len(starts), size), np.float64)
-    for k, (left, right) in enumerate(zip(starts, starts[1:], strict=False)):
+    for k, (left, right) in enumerate(pairwise(starts)):
         overlap = left + size - right
         ramp = np.sin(0.5 * np.pi * (np.arange(overlap) + 0.5) / overlap) ** 2
         windows[k, size - overlap :] *= ramp[::-1]
@@ -81,9 +82,10 @@ def apply_tiled(
 ) -> Image:
     """The function's result on the whole image [H, W, 3], computed on tiles.
 
-    function: maps a tile [h, w, 3] to one of the same shape; must be safe to call from several threads at once.
+    function: maps a tile [h, w, 3] to one of the same shape; several threads may call it at once.
     fixed: height and width of the tiles where the function accepts only these.
-    threads: tiles computed at once. on_tile: called with (done, total) after each tile, in the caller's thread.
+    threads: tiles computed at once.
+    on_tile: called with (done, total) after each tile, in the caller's thread.
 
     The image is padded by reflection at its right and bottom sides where it has to be.
     """

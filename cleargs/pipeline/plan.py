@@ -53,8 +53,15 @@ class StagePlan:
     """Why it is no hit, or what a partial one lacks."""
     estimate: Estimate | None = None
     """Cost of the work to do; None where there is none."""
-    key: str | None = None
+    recipe: Recipe | None = None
     """None while a stage before it must run first."""
+    manifest: Manifest | None = None
+    """That of a hit."""
+
+    @property
+    def key(self) -> str | None:
+        """The key of the stage's results; None while a stage before it must run first."""
+        return self.recipe.key if self.recipe is not None else None
 
 
 @dataclass
@@ -173,15 +180,15 @@ class Planner:
             entry = self.store.find(name, recipe.key)
             usable = entry.usable if entry is not None else None
             if name in force:
-                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name), recipe.key))
+                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name), recipe))
             elif usable is None:
                 reasons = self.reasons(recipe, entry)
-                plans.append(StagePlan(name, "miss", reasons, self.estimate(name), recipe.key))
+                plans.append(StagePlan(name, "miss", reasons, self.estimate(name), recipe))
             elif usable.missing:
-                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name), recipe.key))
+                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name), recipe))
             else:
                 done[name] = usable
-                plans.append(StagePlan(name, "hit", (), None, recipe.key))
+                plans.append(StagePlan(name, "hit", (), None, recipe, usable))
         return plans
 
 

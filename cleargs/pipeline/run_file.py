@@ -8,7 +8,7 @@ from typing import Literal, cast
 
 import tomli_w
 
-from cleargs.errors import InputError
+from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_error, write_bytes
 from cleargs.pipeline.config import Config, check_document, read_toml
 from cleargs.pipeline.dag import Dag
@@ -51,6 +51,15 @@ def write_run_file(run: Run) -> None:
             write_bytes(path, text.encode())
     except OSError as error:
         raise disk_error(error, path) from error
+
+
+def noted_source(folder: Path) -> Path | None:
+    """The capture of the run in ``folder``; None when there is no run, or its file is damaged."""
+    try:
+        source = read_toml(folder / RUN_FILE).get("input")
+    except ConfigError:
+        return None
+    return Path(source) if isinstance(source, str) else None
 
 
 def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:

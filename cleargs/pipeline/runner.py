@@ -22,7 +22,7 @@ from cleargs.pipeline.manifest import (
     write_manifest,
 )
 from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line
-from cleargs.pipeline.run_file import RUN_FILE, Run, read_run_file, write_run_file
+from cleargs.pipeline.run_file import RUN_FILE, Run, noted_source, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
@@ -67,8 +67,12 @@ class Runner:
         done: dict[str, Manifest] = {}
         with self.store.in_use():
             self.store.add_root(self.run.folder)
-            for name in self.dag.until(until):
-                outcome = self._bring(name, done, forced=name in forced)
+            for plan in plans:
+                name = plan.stage
+                if plan.recipe is not None and plan.manifest is not None:
+                    outcome = self._show("found", plan.recipe, plan.manifest)
+                else:
+                    outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
                 if outcome.manifest.status == "partial" and not allow_partial:
@@ -119,7 +123,7 @@ class Runner:
         return entry
 
     def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> Outcome:
-        """Find or make the results of ``name``, and show them in the run folder."""
+        """Find or make the results of ``name``, and let the run folder show them."""
         recipe = self.planner.recipe(name, done)
         entry = self.store.find(name, recipe.key)
         manifest = entry.whole if entry is not None and not forced else None
@@ -132,6 +136,11 @@ class Runner:
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
                     manifest, how = self._make(recipe, entry, forced=forced), "made"
+        return self._show(how, recipe, manifest)
+
+    def _show(self, how: Literal["found", "made"], recipe: Recipe, manifest: Manifest) -> Outcome:
+        """Let the run folder show the finished results of ``recipe``."""
+        name = recipe.parts.stage
         manifest = self._with_inherited(manifest, recipe.inherited)
         self.store.link(self.run.folder, name, recipe.key)
         return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
@@ -209,10 +218,8 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
 
     A capture that moved is the same when its content is.
     """
-    if not (run.folder / RUN_FILE).exists():
-        return
-    before = read_run_file(run.folder, dag)
-    if before.source == run.source:
+    before = noted_source(run.folder)
+    if before is None or before == run.source:
         return
     first = dag.names[0]
     made = linked_manifest(run.folder, first)
@@ -222,6 +229,6 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
         if now == dict(made.parts.externals):
             return
     raise InputError(
-        f"{run.folder} is a run of {before.source}, not of {run.source}",
+        f"{run.folder} is a run of {before}, not of {run.source}",
         hint="choose another folder with -o, or delete this one",
     )

@@ -217,7 +217,7 @@ def _tokens(node: ast.AST) -> Iterator[str]:
 
 
 def _is_docstring(node: ast.AST) -> bool:
-    """Whether ``node`` is a string that stands alone: documentation of a module, class, function or constant."""
+    """Whether ``node`` is a string that stands alone: documentation of whatever is above or around it."""
     return (
         isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)

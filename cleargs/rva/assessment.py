@@ -53,9 +53,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class Assessment:
-    """One entry a frame, in the order in which the frames were given; geometry is NaN (bin -1) where
-    unregistered.
-    """
+    """One entry a frame, in the order given; geometry is NaN (bin -1) where the frame is unregistered."""
 
     R: Floats
     B: Floats

@@ -1,8 +1,10 @@
 """From raw measures to cues in [0, 1]: the response curves and every constant in them.
 
 Rule behind the blur constants: a frame whose restoration-free training use does little harm should reach the
-paper's R >= 0.70. They were set on sharp photographs blurred in linear light, with noise of 0.7 levels, so
-that R crosses 0.70 near a motion of 6 to 7 px, and 0.35 beyond 20 px, at a long side of 640 px.
+paper's R >= 0.70. They were set on sharp photographs and captures blurred in linear light, with noise of 0.7
+levels: beside sharp neighbours R crosses 0.70 at a motion of 5 to 8 px, depending on the content, at a long
+side of at most 640 px; alone, where soft content cannot be told from blur, half of the photographs cross it
+by 8 px.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ class Calibration:
     neighbours: int = 4
     """Frames before and after whose best is taken for what the content itself looks like."""
     content_extent: float = 0.7
-    """Content explains at most this much blur extent, however soft the neighbours: what sharp photographs show in
-    their worst direction (median 0.6). More would excuse a capture that is blurred throughout."""
+    """Content explains at most this much blur extent, however soft the neighbours: what sharp photographs
+    show in their worst direction (median 0.6). More would excuse a capture that is blurred throughout."""
     sharpness_half: float = 1.4
     """Excess extent in the worst direction at which r_sharpness is 1/2 (a motion of about 5 px)."""
     structure_half: float = 1.2
@@ -34,13 +36,9 @@ class Calibration:
     steepness: float = 3.0
     """Exponent of the blur curves."""
     detail_floor: float = 3.0
-    """Fine detail that a capture of plain step edges reaches; a softer best neighbour does not excuse a
-    frame.
-    """
+    """Fine detail of a scene of plain step edges; a softer best neighbour does not excuse a frame."""
     detail_range: tuple[float, float] = (0.10, 0.75)
-    """Share of the best neighbour's fine detail at which r_texture is 0 and 1: content alone varies by a
-    quarter.
-    """
+    """Share of the best neighbour's fine detail at which r_texture is 0 and 1: content alone varies it."""
     contrast_range: tuple[float, float] = (0.02, 0.10)
     """Spread of the luma (of 1) at which texture is not to be relied on at all, and fully."""
     noise_half: float = 8.0
@@ -54,17 +52,13 @@ class Calibration:
     ghost_range: tuple[float, float] = (0.04, 0.16)
     """Excess of the side peak at which b_ghosting is 0 and 1."""
     clipped_range: tuple[float, float] = (0.10, 0.50)
-    """Share of clipped pixels, beyond that of the least clipped neighbour, at which exposure is good and
-    lost.
-    """
+    """Share of clipped pixels, beyond the least clipped neighbour's, at which exposure is good, and lost."""
     dark_range: tuple[float, float] = (0.20, 0.04)
     """Mean luma (of 1) at which darkness begins to hurt and exposure is lost."""
     bright_range: tuple[float, float] = (0.70, 0.95)
     """Mean luma at which brightness begins to hurt and exposure is lost."""
     stops_range: tuple[float, float] = (0.4, 2.0)
-    """Jump of the mean luma from the neighbours' median, in factors of two, that is harmless, and that is
-    failure.
-    """
+    """Jump of the mean luma from the neighbours' median, in stops, that is harmless, and that is failure."""
 
 
 def ramp(value: Floats, ends: tuple[float, float]) -> Floats:

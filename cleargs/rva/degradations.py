@@ -40,13 +40,13 @@ def noise_level(luminance: Plane, valid: Mask) -> float:
 
 
 def blocking(luminance: Plane) -> float:
-    """How much stronger the steps on a grid of 8 px are than between its lines; 0 for none, 1 for twice as
-    strong.
+    """Excess of the steps on an 8 px grid over those between its lines; 0 for none, 1 for twice as strong.
 
     After Wang, Bovik and Evans ("Blind measurement of blocking artifacts", ICIP 2000), in the pixel domain:
-    the mean absolute second difference of columns (and rows) by their phase modulo 8, the largest phase over
-    the median one. Measured on the image as given. Failure mode: undistortion and resizing bend the grid
-    away, so that blocks in a resampled frame go unseen; a regular pattern of the same period reads as blocks.
+    the median absolute third difference of each column (and row), averaged by phase modulo 8, the largest
+    phase over the median one. Measured on the image as given. Failure mode: undistortion and resizing bend
+    the grid away, so that blocks in a resampled frame go unseen; a regular pattern of the same period reads
+    as blocks.
     """
     strengths = []
     for plane in (luminance, luminance.T):

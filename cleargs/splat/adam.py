@@ -52,9 +52,13 @@ def adam_step(
         )
     beta1, beta2 = betas
     corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
+    flat = [tensor.detach().view(-1).numpy() for tensor in tensors]
     with launch.exclusive():
         adam.adam(
-            *(tensor.detach().view(-1).numpy() for tensor in tensors),
+            flat[0],
+            flat[1],
+            flat[2],
+            flat[3],
             np.tile(corrected, max(1, BLOCK // columns)),
             np.float32(beta1),
             np.float32(beta2),

@@ -8,7 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class TrainConfig(BaseModel):
-    """How a scene is optimised. Rates are those of 3DGS and gsplat, the schedule is for two CPU cores."""
+    """How a scene is optimised.
+
+    Rates are those of 3DGS and gsplat but for the means, which get five times theirs (and a fifth of the noise
+    factor, so that the noise stays the same), since here a training has some thousand steps, not 30,000:
+    29.80 -> 30.55 dB on the held-out frame 0026 of fox at a quarter of its width after 800 steps.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -37,12 +42,14 @@ class TrainConfig(BaseModel):
     )
     min_opacity: float = Field(0.005, gt=0, lt=1, description="opacity at or below which a Gaussian is dead")
     noise: float = Field(
-        5e5, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5)"
+        1e5, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
     )
     opacity_reg: float = Field(0.01, ge=0, description="factor on the mean opacity in the loss")
     scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
 
-    lr_means: float = Field(1.6e-4, ge=0, description="rate of the means, at the first step")
+    lr_means: float = Field(
+        8e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4, over 15 times the steps)"
+    )
     lr_means_final: float = Field(
         0.01, gt=0, le=1, description="share of lr_means left at the last step, exponential decay"
     )
@@ -89,7 +96,7 @@ class G0Config(TrainConfig):
         (0.0, 0.0, 0.0), description="sRGB behind the scene, each in [0, 1]"
     )
     min_points: int = Field(
-        10_000,
+        20_000,
         ge=1,
         le=5_000_000,
         description="fewest Gaussians to start from; sparse points are added to reach it",
@@ -112,7 +119,7 @@ class DistilConfig(TrainConfig):
     )
     opacity_reg: float = Field(0.0, ge=0, description="factor on the mean opacity in the loss")
     scale_reg: float = Field(0.0, ge=0, description="factor on the mean scale in the loss")
-    lr_means: float = Field(1.6e-5, ge=0, description="rate of the means, at the first step")
+    lr_means: float = Field(8e-5, ge=0, description="rate of the means, at the first step")
     sh_interval: int = Field(
         0,
         ge=0,

@@ -76,7 +76,7 @@ def sh_rotation(rotation: Tensor, count: int) -> Tensor:
 
 
 def _multiply(first: Tensor, second: Tensor) -> Tensor:
-    """Hamilton product of one quaternion w x y z with many: turn by ``second`` [N, 4], then by ``first`` [4]."""
+    """Hamilton product of one quaternion w x y z with many: by ``second`` [N, 4], then by ``first`` [4]."""
     w, x, y, z = first
     matrix = torch.stack(
         [

@@ -115,7 +115,8 @@ def _points_of_view(
         _, nearest = cKDTree(projected).query(pixels, k=[*range(1, near + 1)])
         log_depth = np.log(depth[:, 0])[nearest].mean(axis=1) + DEPTH_JITTER * rng.standard_normal(count)
     else:
-        log_depth = rng.uniform(*(float(np.log(depth)) for depth in BLIND_DEPTHS), size=count)
+        nearest_depth, farthest_depth = BLIND_DEPTHS
+        log_depth = rng.uniform(np.log(nearest_depth), np.log(farthest_depth), size=count)
 
     rays = np.stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(count)],

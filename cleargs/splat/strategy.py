@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,8 @@ def sample(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int
     """``count`` indices with replacement, in proportion to ``weights`` [N] >= 0 (sum > 0)."""
     cumulative = np.cumsum(weights, dtype=np.float64)
     drawn = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
-    return np.minimum(drawn, len(weights) - 1)
+    indices: NDArray[np.int64] = np.minimum(drawn, len(weights) - 1)
+    return indices
 
 
 def split_opacity(opacity: F64, copies: NDArray[np.int64]) -> tuple[F64, F64]:
@@ -92,8 +94,8 @@ def grow(
 ) -> tuple[Arrays, list[Arrays]]:
     """Add copies, drawn by opacity: at most a share ``rate``, never beyond ``budget``.
 
-    Returns new arrays and moments. ``arrays`` and ``moments`` as in `relocate`; those given are changed and must
-    not be used again.
+    Returns new arrays and moments. ``arrays`` and ``moments`` as in `relocate`; those given are changed and
+    must not be used again.
     """
     count = len(arrays["logit_opacities"])
     extra = min(budget, int((1.0 + rate) * count)) - count
@@ -168,10 +170,12 @@ def rotation_matrices(quaternions: F32) -> F32:
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
-def sigmoid(x: NDArray[np.floating]) -> NDArray[np.floating]:
+def sigmoid(x: NDArray[Any]) -> NDArray[Any]:
     """1 / (1 + exp(-x)), in the type of ``x``; the input is kept within +-80, where exp stays finite."""
-    return 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+    result: NDArray[Any] = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+    return result
 
 
 def _dot3(a: F32, b: F32) -> F32:
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    result: F32 = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    return result

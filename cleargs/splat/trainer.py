@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.errors import InputError, StageError
+from cleargs.errors import StageError
 from cleargs.progress import Reporter, Task
 from cleargs.splat import strategy
 from cleargs.splat.compensation import Exposure
@@ -34,7 +34,7 @@ from cleargs.splat.optimiser import ExposureOptimiser, Moments, Rates, step_gaus
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.views import ImageCache, View
+from cleargs.splat.views import ImageCache, View, require_views
 
 _REAL, _PSEUDO, _REFINE, _NOISE = range(4)
 """Purposes of random numbers."""
@@ -143,11 +143,7 @@ class Trainer:
         weighted = [view for view in views if view.weight > 0.0]
         self._real = [view for view in weighted if view.kind == "real"]
         self._pseudo = [view for view in weighted if view.kind == "pseudo"]
-        if not weighted:
-            raise InputError(
-                "no frame is left to train on: every weight is 0",
-                hint="lower rva.tau_R, or use every frame with --set rva.enabled=false",
-            )
+        require_views(weighted)
         self._share = pseudo_share if self._real and self._pseudo else float(bool(self._pseudo))
         self._pseudo_weight = pseudo_weight
         self._config = config
@@ -424,7 +420,7 @@ def _fingerprint(
     seen = [(view.frame_id, view.kind, view.weight, view.camera.width, view.camera.height) for view in views]
     digest = hashlib.sha256(json.dumps([settings, seen, list(numbers)], sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
-        digest.update(tensor.detach().contiguous().numpy())
+        digest.update(tensor.detach().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
 
 

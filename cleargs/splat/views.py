@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -14,10 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.errors import StageError
+from cleargs.errors import InputError, StageError
 from cleargs.splat.camera import Camera
 
-Pixels = NDArray[np.uint8] | NDArray[np.float32]
+Pixels = NDArray[Any]
+"""An image [H, W, 3]: uint8, or float32 sRGB in [0, 1]."""
 Mask = NDArray[np.bool_]
 
 
@@ -105,6 +106,15 @@ def real_views(frames: Iterable[FrameRow], weights: Mapping[int, float], folder:
     return [
         view_of(frame, folder, weights[frame.frame_id]) for frame in sorted(active, key=lambda f: f.frame_id)
     ]
+
+
+def require_views(views: Sequence[View]) -> None:
+    """Raise InputError when there is nothing to train on."""
+    if not views:
+        raise InputError(
+            "no frame is left to train on: every weight is 0",
+            hint="lower rva.tau_R, or use every frame with --set rva.enabled=false",
+        )
 
 
 class ImageCache:

@@ -56,14 +56,14 @@ def test_a_named_error_arrives(module: Path) -> None:
 
 def test_prints_do_not_disturb_the_reports(module: Path) -> None:
     module.write_text(
-        PREAMBLE + "print('hello'); channel.phase('x', 2); os.system('echo hi'); channel.done(2)"
+        PREAMBLE + "print('hello')\nchannel.phase('x', 2)\nos.system('echo hi')\nchannel.done(2)"
     )
     run(module)
     assert "hello" in module.with_suffix(".log").read_text()
 
 
 def gone(pid: int) -> bool:
-    """Whether the process ends within ten seconds (a zombie without a parent to wait for it counts as ended)."""
+    """Whether the process ends within ten seconds (a zombie that nobody waits for counts as ended)."""
     for _ in range(200):
         try:
             state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
@@ -97,7 +97,8 @@ while True:
             "-c",
             "import sys; from pathlib import Path; from cleargs.capture.child import run_child; "
             "from cleargs.progress import SilentReporter; "
-            f"run_child('{module.stem}', Path({str(note)!r}), Path({str(note) + '.log'!r}), 1, SilentReporter())",
+            f"note = {str(note)!r}; "
+            f"run_child({module.stem!r}, Path(note), Path(note + '.log'), 1, SilentReporter())",
         ],
         stderr=subprocess.DEVNULL,
     )

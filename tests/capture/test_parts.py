@@ -19,6 +19,7 @@ from cleargs.capture.holdout import held_out, sharpness
 from cleargs.capture.layout import externals
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sources import choose_times, natural_key, open_capture, spread
 from cleargs.capture.transforms import read_transforms
 from cleargs.capture.undistort import undistorter
@@ -283,3 +284,29 @@ def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     (posed / "notes").mkdir()
     assert externals(posed, config)["masks"] == posed / "masks"
     assert set(externals(posed, config)) == {"transforms", "images", "masks"}
+    # The folder of images alone has the same masks beside it.
+    beside = {"capture": posed / "images", "masks": posed / "masks"}
+    assert externals(posed / "images", config) == beside
+
+
+def test_exif_focal_length_is_the_starting_guess(tmp_path: Path) -> None:
+    ok, jpeg = cv2.imencode(".jpg", np.zeros((40, 60, 3), np.uint8))
+    assert ok
+    # IFD0 -> Exif IFD at 26: FocalLengthIn35mmFilm = 28 mm.
+    tiff = (
+        b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0"
+        b"\0\x01\xa4\x05\0\x03\0\0\0\x01\0\x1c\0\0\0\0\0\0"
+    )
+    body = b"Exif\0\0" + tiff
+    data = jpeg.tobytes()
+    path = tmp_path / "phone.jpg"
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 720.0, 600, 400)
+    apply_exif_focal([camera], path)
+    # A 35 mm film frame is 36 mm wide; COLMAP takes 35.
+    assert camera.has_prior_focal_length and 0.97 < camera.params[0] / (600 * 28 / 36) < 1.04
+    # Without EXIF the guess stays.
+    cv2.imwrite(str(tmp_path / "plain.png"), np.zeros((40, 60, 3), np.uint8))
+    other = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 720.0, 600, 400)
+    apply_exif_focal([other], tmp_path / "plain.png")
+    assert not other.has_prior_focal_length and other.params[0] == 720

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -151,6 +152,15 @@ def test_wrong_usage(shell: Shell, arguments: list[str], code: int, cause: str, 
     assert lines[1].startswith("hint: ") and hint in lines[1]
 
 
+def test_damaged_run_file_is_written_anew(shell: Shell) -> None:
+    shell.run()
+    (shell.bench.folder / "run.toml").write_text("[half")
+    assert shell("explain", str(shell.bench.folder))[0] == 2
+    code, out, _ = shell.run()
+    assert code == 0 and out.count("already there") == 3
+    assert shell("explain", str(shell.bench.folder))[0] == 0
+
+
 def test_bad_setting_creates_nothing(shell: Shell) -> None:
     code, _, err = shell.run("--set", "square.power=30")
     assert code == 2 and "at most 4" in err and not shell.bench.folder.exists()
@@ -200,7 +210,8 @@ def test_installed_stages_load_light() -> None:
     """Planning loads every stage module; a run with nothing to do must not pay for what `run` needs."""
     heavy = {"torch", "numba", "pycolmap", "cv2", "onnxruntime", "scipy"}
     program = (
-        "import sys; from cleargs.pipeline.dag import installed; from cleargs.pipeline.config import load_config\n"
+        "import sys; from cleargs.pipeline.dag import installed\n"
+        "from cleargs.pipeline.config import load_config\n"
         f"load_config(installed()); print(sorted({heavy!r} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -214,6 +225,7 @@ def test_tables_in_figures() -> None:
             column("weight", pa.float32(), "weight in [0, 1]", nullable=True),
             column("reliable", pa.bool_(), "trusted"),
             column("step", pa.int32(), "step"),
+            column("name", pa.string(), "its own in every row"),
         ]
     )
     rows = {
@@ -221,13 +233,44 @@ def test_tables_in_figures() -> None:
         "weight": [0.5, None, 1.0],
         "reliable": [True, True, False],
         "step": [1, 2, 3],
+        "name": ["x", "y", "z"],
     }
     table = pa.table(rows, schema=schema)
     facts = describe_table(table)
     assert facts["role"]["counts"] == {"b": 2, "a": 1}
     assert facts["reliable"]["counts"] == {"true": 2, "false": 1}
+    assert facts["name"]["distinct"] == 3 and "counts" not in facts["name"]
     assert facts["weight"]["nulls"] == 1 and facts["weight"]["median"] == 0.75
     assert facts["weight"]["meaning"] == "weight in [0, 1]"
     assert [row["step"] for row in sampled_rows(table, 2)] == [1, 3]
     assert [row["step"] for row in sampled_rows(table, 9)] == [1, 2, 3]
     assert describe_table(table.slice(0, 0))["weight"]["distinct"] == 0
+
+
+def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
+    """Python cannot raise KeyboardInterrupt in the call below, which would take hours."""
+    program = (
+        "import hashlib; from cleargs.cli.interrupt import answer_signals; answer_signals()\n"
+        "print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'x', b'y', 2**31 - 1)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and "the same command goes on" in errors
+    assert len(errors.splitlines()) == 1
+
+
+def test_ending_a_forked_child_does_not_end_its_parent() -> None:
+    program = (
+        "import os, signal, time; from cleargs.cli.interrupt import GRACE, answer_signals; answer_signals()\n"
+        "child = os.fork()\n"
+        "if child == 0: time.sleep(60); os._exit(0)\n"
+        "time.sleep(0.2); os.kill(child, signal.SIGTERM); os.waitpid(child, 0)\n"
+        "time.sleep(GRACE + 0.5); print('alive')"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == "alive\n", done.stderr

@@ -49,7 +49,7 @@ def test_killed_at_any_moment_the_same_command_ends_with_the_same_digests(bench:
         process.kill()
         process.communicate()
     process = start(bench, "square.delay_s=0.02")
-    output, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     done = bench.work_done()
     assert done.count("square 0.txt") <= 2, "the checkpoint was used"
@@ -61,11 +61,15 @@ def test_killed_at_any_moment_the_same_command_ends_with_the_same_digests(bench:
 def test_two_runs_at_once_do_each_stage_once(bench: Bench) -> None:
     first = start(bench, "square.delay_s=0.2")
     wait_for(bench, "square 0.txt")
+    first.send_signal(signal.SIGSTOP)  # until the second has met it
     second = start(bench, "square.delay_s=0.2")
+    assert second.stderr is not None
+    met = any("square: another run is at work on it; waiting" in line for line in second.stderr)
+    first.send_signal(signal.SIGCONT)
+    assert met
     for process in (first, second):
-        output, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
-    assert "another run is at work on it; waiting" in errors
     done = bench.work_done()
     assert [done.count(stage) for stage in ("count", "square", "total")] == [1, 1, 1]
 
@@ -75,7 +79,7 @@ def test_interrupted_run_says_so_and_goes_on(bench: Bench, number: signal.Signal
     process = start(bench, "square.delay_s=0.5")
     wait_for(bench, "square 1.txt")
     os.kill(process.pid, number)
-    output, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "the same command goes on" in errors and "Traceback" not in errors
     bench.work_done()

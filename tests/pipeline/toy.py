@@ -1,7 +1,7 @@
-"""A pipeline of toy stages: count numbers, square them, add them up. Also a program, so that it can be killed.
+"""A pipeline of toy stages: count numbers, square them, add them up. Also a program that can be killed.
 
-``python toy.py JOURNAL ARGUMENTS...`` is ``cleargs ARGUMENTS...`` with these stages. JOURNAL gets one line for
-each piece of work that is really done.
+``python toy.py JOURNAL ARGUMENTS...`` is ``cleargs ARGUMENTS...`` with these stages. JOURNAL gets one line
+for each piece of work that is really done.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.runner import Outcome, Runner
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Estimate, Stage, StageContext, StageResult
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 
@@ -40,7 +40,7 @@ class CountConfig(BaseModel):
     limit: int = Field(100, ge=1, le=1000, description="at most so many numbers")
     mode: Literal["plain", "padded"] = "plain"
     weights: str = Field("", description="a file", json_schema_extra={"key": False})
-    inner: Inner = Inner()
+    inner: Inner = Inner(depth=3)
 
 
 class SquareConfig(BaseModel):
@@ -167,7 +167,7 @@ def note(journal: Path, line: str) -> None:
 
 
 def toy_dag(journal: Path) -> Dag:
-    stages = {"count": Count(journal), "square": Square(journal), "total": Total(journal)}
+    stages: dict[str, Stage] = {"count": Count(journal), "square": Square(journal), "total": Total(journal)}
     return Dag(tuple(stages), stages.__getitem__)
 
 

@@ -238,7 +238,9 @@ def dying(after: int, function: Callable[..., Any]) -> Callable[..., Any]:
 def run_both(capture: Capture, *, threads: int) -> dict[str, dict[str, str]]:
     """Run both stages; the digests of their files."""
     found = {}
-    for name, stage, config in (("rivr", rivr, tiny_rivr()), ("consolidate", consolidate, tiny_consolidate())):
+    configs = {rivr: tiny_rivr(), consolidate: tiny_consolidate()}
+    for stage, config in configs.items():
+        name = stage.__name__.rpartition(".")[2]
         context = capture.context(name, config, threads=threads)
         stage.run(context)
         found[name] = digests(context.out)

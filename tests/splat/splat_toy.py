@@ -63,7 +63,9 @@ def views(pictures: list[Image], *, weights: list[float] | None = None) -> list[
     ]
 
 
-def keep(picture: Image, mask: NDArray[np.bool_] | None = None) -> Callable[[], tuple[Image, NDArray[np.bool_] | None]]:
+def keep(
+    picture: Image, mask: NDArray[np.bool_] | None = None
+) -> Callable[[], tuple[Image, NDArray[np.bool_] | None]]:
     """A loader that gives a picture from memory."""
     return lambda: (picture, mask)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -72,7 +74,7 @@ def test_sh_rotation_is_orthogonal_and_composes() -> None:
     assert torch.allclose(one @ one.T, torch.eye(16, dtype=torch.float64), atol=1e-12)
     assert torch.allclose(two @ one, both, atol=1e-12)
     degree_ends = (0, 1, 4, 9, 16)
-    for begin, end in zip(degree_ends, degree_ends[1:], strict=False):
+    for begin, end in pairwise(degree_ends):
         outside = one[begin:end].clone()
         outside[:, begin:end] = 0
         assert outside.abs().max() < 1e-12, "degrees do not mix"

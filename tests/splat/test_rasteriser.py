@@ -124,7 +124,8 @@ def test_huge_and_tiny_scales():
     gaussians.log_scales[0] = 30.0
     gaussians.log_scales[1] = -30.0
     gaussians.log_scales[2] = torch.tensor([10.0, -10.0, 0.0])
-    assert_close(compare(gaussians, camera))
+    # An aspect of 5e8 leaves the float64 oracle itself, which does cancel, eight digits less.
+    assert_close(compare(gaussians, camera), gradient=1e-4)
 
 
 def test_zero_and_unnormalised_quaternions():

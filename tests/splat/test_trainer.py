@@ -24,7 +24,13 @@ from cleargs.splat.trainer import Trained, Trainer, evaluate_views, render_view,
 from cleargs.splat.views import ImageCache, View
 
 CONFIG = TrainConfig(
-    steps=40, refine_interval=5, refine_start=0.1, budget=80, checkpoint_interval=7, sh_interval=10, lr_means=2e-3
+    steps=40,
+    refine_interval=5,
+    refine_start=0.1,
+    budget=80,
+    checkpoint_interval=7,
+    sh_interval=10,
+    lr_means=2e-3,
 )
 
 

@@ -1,9 +1,10 @@
 """Artefacts of sharpening, restoration and splatting, imitated on photographs.
 
-They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer: what it is asked to
-tell apart are renders of a Gaussian scene, restored frames and fusions of the two.
+They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer: what it is asked
+to tell apart are renders of a Gaussian scene, restored frames and fusions of the two.
 
-Images are [H, W, 3] float32 sRGB in [0, 1], in and out; every random choice comes from the generator passed in.
+Images are [H, W, 3] float32 sRGB in [0, 1], in and out; every random choice comes from the generator passed
+in.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from cleargs.models.training.degrade import (
     Degradation,
     Image,
     Kernel,
-    convolve,
     degrade,
     disc_kernel,
     jpeg,
@@ -65,8 +65,9 @@ def ghost(image: Image, dx: float, dy: float, share: float) -> Image:
 def splat(image: Image, rng: np.random.Generator, spacing: float, stretch: float) -> Image:
     """The image as about one anisotropic Gaussian per ``spacing``² pixels can show it.
 
-    Gaussians lie along local edges, elongated by up to ``stretch``, with random footprints; a second pass splats what
-    the first one left over, as optimisation would. High frequencies are lost unevenly, edges become brush strokes.
+    Gaussians lie along local edges, elongated by up to ``stretch``, with random footprints; a second pass
+    splats what the first one left over, as optimisation would. High frequencies are lost unevenly, edges
+    become brush strokes.
     """
     tensor = [_gaussian(t, 1.5) for t in _structure(image)]
     height, width = image.shape[:2]
@@ -98,7 +99,9 @@ def floaters(image: Image, rng: np.random.Generator, count: int, needle_share: f
         else:
             major = rng.uniform(2.0, 14.0)
             minor = major * rng.uniform(0.3, 1.0)
-        footprint = np.array([rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, np.pi), major, minor])
+        footprint = np.array(
+            [rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, np.pi), major, minor]
+        )
         source = image[rng.integers(height), rng.integers(width)]
         colour = np.clip(source + rng.normal(0.0, 0.15, 3), 0.0, 1.0).astype(np.float32)
         window, weight = _footprint(footprint, height, width)
@@ -140,7 +143,11 @@ def ringing(image: Image, rng: np.random.Generator) -> Image:
     """Gibbs ringing, or deconvolution of a sharp image by a kernel that never blurred it."""
     if rng.random() < 0.5:
         return gibbs(image, rng.uniform(0.12, 0.4), rng.uniform(1.0, 2.5))
-    kernel = motion_kernel(rng, rng.uniform(2.0, 9.0)) if rng.random() < 0.5 else disc_kernel(rng.uniform(0.8, 3.0))
+    kernel = (
+        motion_kernel(rng, rng.uniform(2.0, 9.0))
+        if rng.random() < 0.5
+        else disc_kernel(rng.uniform(0.8, 3.0))
+    )
     return wiener(image, kernel, _log_uniform(rng, 0.01, 0.3))
 
 
@@ -163,7 +170,8 @@ def blocks(image: Image, rng: np.random.Generator) -> Image:
 
 
 def rendered(image: Image, rng: np.random.Generator) -> Image:
-    """What a splat render may look like: too few Gaussians, patches of different density, stray ones in front."""
+    """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
+    front."""
     out = splat(image, rng, _log_uniform(rng, 2.2, 7.0), rng.uniform(1.5, 8.0))
     if rng.random() < 0.5:
         share = patches(image.shape[0], image.shape[1], rng)
@@ -230,7 +238,7 @@ KINDS: dict[str, Callable[[Image, np.random.Generator], Image]] = {
 
 
 def _clip(image: NDArray[np.floating]) -> Image:
-    return np.clip(image, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip(image, 0.0, 1.0), np.float32)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -242,7 +250,7 @@ def _gaussian(image: Image, sigma: float) -> Image:
 
 
 def _frequency(height: int, width: int) -> NDArray[np.float64]:
-    return np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    return np.asarray(np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]), np.float64)
 
 
 def _filter(image: Image, response: NDArray[np.floating] | NDArray[np.complexfloating]) -> Image:
@@ -267,11 +275,14 @@ def patches(height: int, width: int, rng: np.random.Generator) -> Image:
 
 
 def _footprint(
-    gaussian: NDArray[np.float64],  # [5] x, y, angle of the major axis, its deviation, the minor axis' deviation
+    gaussian: NDArray[
+        np.float64
+    ],  # [5] x, y, angle of the major axis, its deviation, the minor axis' deviation
     height: int,
     width: int,
 ) -> tuple[tuple[slice, slice], NDArray[np.float64]]:
-    """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the centre."""
+    """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the
+    centre."""
     x, y, angle, major, minor = gaussian
     c, s = np.cos(angle), np.sin(angle)
     reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)
@@ -283,7 +294,7 @@ def _footprint(
     return (rows, columns), np.exp(-0.5 * (u * u + v * v))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]  # numba is untyped; numpy takes half a second a patch
+@njit(cache=True)  # numpy takes half a second a patch
 def _splat_mean(
     gaussians: NDArray[np.float64],  # [N, 5] as in _footprint
     colours: Image,  # [N, 3]
@@ -305,4 +316,5 @@ def _splat_mean(
                 weights[row, column, 0] += weight
                 for channel in range(3):
                     total[row, column, channel] += weight * colours[n, channel]
-    return (total / weights).astype(np.float32)
+    mean: Image = (total / weights).astype(np.float32)
+    return mean

@@ -7,7 +7,7 @@ Light adds up before a camera encodes it, so blur acts on scene-linear values:
 Noise is added to the *encoded* values: its level then means the same in shadows and highlights, and "at most
 1/255" really is one code value (in linear light it would be thirteen of them in the shadows).
 
-Images are [H, W, 3] float32 sRGB in [0, 1]. Everything random takes a ``numpy.random.Generator``; nothing holds state.
+Images are [H, W, 3] float32 sRGB in [0, 1]. Everything random takes a ``numpy.random.Generator``.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def line_path(rng: np.random.Generator) -> NDArray[np.float64]:
 def handheld_path(rng: np.random.Generator) -> NDArray[np.float64]:
     """A smooth trajectory of a shaking hand: points [N, 2] evenly spaced in time.
 
-    A drift (constant velocity) plus three harmonics of tremor with falling amplitude; speed varies along the path,
-    so the kernel is denser where the hand turns, as in Boracchi & Foi, "Modeling the performance of image
-    restoration from motion blur" (2012).
+    A drift (constant velocity) plus three harmonics of tremor with falling amplitude; speed varies along the
+    path, so the kernel is denser where the hand turns, as in Boracchi & Foi, "Modeling the performance of
+    image restoration from motion blur" (2012).
     """
     t = np.linspace(0.0, 1.0, 257)[:, None]
     path = t * rng.normal(size=2)
@@ -63,8 +63,8 @@ def handheld_path(rng: np.random.Generator) -> NDArray[np.float64]:
 def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
     """The blur kernel of a path [N, 2] scaled so that its two farthest points lie ``length`` pixels apart.
 
-    The kernel is odd, square, sums to one, and has its centre of mass at its centre, so that blurring does not shift
-    the image. Points are splatted bilinearly.
+    The kernel is odd, square, sums to one, and has its centre of mass at its centre, so that blurring does
+    not shift the image. Points are splatted bilinearly.
     """
     coarse = path[::4]
     diameter = float(np.linalg.norm(coarse[:, None] - coarse[None], axis=-1).max())
@@ -78,7 +78,7 @@ def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
         for dx in (0, 1):
             weight = np.abs(1 - dx - frac[:, 0]) * np.abs(1 - dy - frac[:, 1])
             np.add.at(kernel, (corner[:, 1] + dy + radius, corner[:, 0] + dx + radius), weight)
-    return (kernel / kernel.sum()).astype(np.float32)
+    return np.asarray(kernel / kernel.sum(), np.float32)
 
 
 def motion_kernel(rng: np.random.Generator, length: float, line_share: float = 0.4) -> Kernel:
@@ -98,13 +98,13 @@ def disc_kernel(radius: float) -> Kernel:
     inside = (axis[:, None] ** 2 + axis[None, :] ** 2 <= radius**2).astype(np.float64)
     kernel = inside.reshape(2 * reach + 1, sub, 2 * reach + 1, sub).mean(axis=(1, 3))
     total = kernel.sum()
-    return (kernel / total).astype(np.float32) if total > 0 else IDENTITY
+    return np.asarray(kernel / total, np.float32) if total > 0.0 else IDENTITY
 
 
 def convolve(linear: Image, kernel: Kernel) -> Image:
     """Convolution of an image [H, W, 3] with a kernel, borders reflected."""
     if kernel.shape == (1, 1):
-        return linear * kernel[0, 0]
+        return linear
     flipped = np.ascontiguousarray(kernel[::-1, ::-1])  # filter2D correlates
     return np.asarray(cv2.filter2D(linear, -1, flipped, borderType=cv2.BORDER_REFLECT_101), np.float32)
 
@@ -113,7 +113,8 @@ def jpeg(image: Image, quality: int) -> Image:
     """The image after one JPEG round trip at the given quality (4:2:0 chroma, OpenCV's default)."""
     code = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     _, data = cv2.imencode(".jpg", code[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / np.float32(255.0)
+    decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.float32)
+    return decoded[..., ::-1] / np.float32(255.0)
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,8 @@ class Degradation:
     """One degradation of one image.
 
     kernel: blur kernel; the identity leaves the image sharp.
-    second: where given, blur changes across the image from ``kernel`` to ``second`` along ``direction``, as under
-        camera rotation or depth.
+    second: where given, blur changes across the image from ``kernel`` to ``second`` along ``direction``, as
+        under camera rotation or depth.
     direction: angle in radians of that change.
     noise: standard deviation of Gaussian noise on encoded values in [0, 1].
     quantise: round to 8 bits.
@@ -150,9 +151,9 @@ def degrade(image: Image, degradation: Degradation, rng: np.random.Generator) ->
         out = linear_to_srgb(np.clip(blurred, 0.0, 1.0))
     if degradation.noise > 0.0:
         out = out + np.float32(degradation.noise) * rng.standard_normal(image.shape, np.float32)
-    out = np.clip(out, 0.0, 1.0)
+    out = np.clip(out, np.float32(0.0), np.float32(1.0))
     if degradation.quantise:
-        out = np.round(out * 255.0) / np.float32(255.0)
+        out = (np.round(out * 255.0) / 255.0).astype(np.float32)
     if degradation.jpeg_quality is not None:
         out = jpeg(out, degradation.jpeg_quality)
     return np.ascontiguousarray(out, np.float32)
@@ -168,9 +169,9 @@ def _ramp(height: int, width: int, direction: float) -> Image:
 
 
 def handheld_degradation(rng: np.random.Generator) -> Degradation:
-    """What a frame of a handheld video may look like: the distribution the restoration expert is trained on.
+    """What a frame of a handheld video may look like: what the restoration expert is trained on.
 
-    Sharp 10 %, motion shorter than 7 px 12 %, defocus 8 %, motion of 7-22 px 70 %; a fifth of the blurred ones vary
+    Sharp 10 %, motion shorter than 7 px 12 %, defocus 8 %, motion of 7-22 px 70 %, of which a fifth vary
     across the image. Noise up to 1/255 in most, up to 3/255 in a quarter; JPEG of quality 60-95 in a quarter.
     """
     kind = rng.random()

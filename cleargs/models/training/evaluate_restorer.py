@@ -1,13 +1,15 @@
 """The table of the restoration expert on photo sources that its training never saw.
 
-    python -m cleargs.models.training.evaluate_restorer --photos DIR [--expert FILE.onnx ...] [--crop 256] [--every 4]
+    python -m cleargs.models.training.evaluate_restorer --photos DIR [--expert FILE.onnx] [--crop 256]
 
-prints markdown: mean PSNR over the held-out photographs for each band of motion lengths, beside the untouched blurred
-image, unsharp masking and Wiener deconvolution. Noise is at most 1/255, so that no gain comes from denoising.
+prints markdown: mean PSNR over the held-out photographs for each band of motion lengths, beside the blurred
+image itself, unsharp masking and Wiener deconvolution. Noise is at most 1/255,
+so that no gain comes from denoising.
 
-What the baselines know: unsharp masking and the blind Wiener filter are tuned for each band on photographs of the
-training sources (which the expert is not told either). The blind Wiener filter deconvolves the mean kernel of the
-band, since no single direction is known; the oracle one is given the true kernel and is no rival but a reference.
+What the baselines know: unsharp masking and the blind Wiener filter are tuned for each band on photographs of
+the training sources, which tells them the band; the expert is told nothing. The blind Wiener filter
+deconvolves the mean kernel of the band, since the direction is unknown; the other one is given the true
+kernel and is no rival but a reference.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ Method = Callable[[Case], Image]
 
 
 def psnr(image: Image, reference: Image) -> float:
-    """PSNR in dB of sRGB values in [0, 1] without the border of `MARGIN` pixels; infinite for equal images."""
+    """PSNR in dB of sRGB values in [0, 1] without a border of `MARGIN` pixels; infinite for equal images."""
     inner = slice(MARGIN, -MARGIN)
     error = image[inner, inner].astype(np.float64) - reference[inner, inner]
     mean = float(np.mean(np.square(error)))
@@ -104,13 +106,13 @@ def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:
     used = np.flatnonzero(total.sum(axis=0))
     inner = slice(used[0], used[-1] + 1)
     mean = total[inner, inner]
-    return (mean / mean.sum()).astype(np.float32)
+    return np.asarray(mean / mean.sum(), np.float32)
 
 
 def make_cases(
     photos: Sequence[Path], band: tuple[int, int] | None, *, crop: int | None, seed: int, purpose: int
 ) -> list[Case]:
-    """One case a photograph: blurred by a motion of the band with noise, or left sharp where there is no band.
+    """One case a photograph: blurred by a motion of the band, with noise, or sharp without a band.
 
     crop: side of the central square to take; None for the whole photograph.
     """
@@ -141,7 +143,7 @@ def _best(candidates: Sequence[Method], cases: Sequence[Case]) -> Method:
 
 
 def tuned_baselines(photos: Sequence[Path], band: tuple[int, int], seed: int) -> dict[str, Method]:
-    """Unsharp masking and both Wiener filters with the settings that do best on photographs of training sources."""
+    """Unsharp masking and both Wiener filters with the settings that do best on training photographs."""
     chosen = photos[:: max(1, len(photos) // TUNING_PHOTOS)][:TUNING_PHOTOS]
     cases = make_cases(chosen, band, crop=TUNING_CROP, seed=seed, purpose=_PURPOSE_TUNING)
     average = mean_kernel(band, seed)

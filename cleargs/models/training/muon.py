@@ -1,8 +1,8 @@
 """Muon: momentum whose matrix updates are orthogonalised before they are applied.
 
-Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024), with the update scaled to
-the size of an Adam update as in Liu et al., "Muon is scalable for LLM training" (2025). A convolution's weight
-[out, in, h, w] counts as the matrix [out, in h w].
+Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024), with the update
+scaled to the size of an Adam update as in Liu et al., "Muon is scalable for LLM training" (2025). A
+convolution's weight [out, in, h, w] counts as the matrix [out, in h w].
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def orthogonalise(matrix: Tensor, iterations: int = 5) -> Tensor:
     """The nearest matrix with singular values of about one, by Newton-Schulz iterations: [rows, columns]."""
     a, b, c = NEWTON_SCHULZ
     tall = matrix.shape[0] > matrix.shape[1]
-    x = matrix.T if tall else matrix
+    x: Tensor = matrix.T if tall else matrix
     x = x / (x.norm() + 1e-7)
     for _ in range(iterations):
         gram = x @ x.T

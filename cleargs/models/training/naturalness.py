@@ -2,8 +2,9 @@
 
     python -m cleargs.models.training.naturalness --work DIR --out cleargs/models/naturalness.toml
 
-Ridge regression of LPIPS on the quadratic's terms, where the differences to the clean version of the same content
-count beside the values: RIVR compares versions of one content only. Takes minutes (the features), then seconds.
+Ridge regression of LPIPS on the quadratic's terms, where the differences to the clean version of the same
+content count beside the values: RIVR compares versions of one content only. Takes minutes (the features),
+then seconds.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def fit(
     return Quadratic(mean=_rounded(mean), deviation=_rounded(deviation), weights=_rounded(weights))
 
 
-def _rounded(values: NDArray[np.float64]) -> tuple[float, ...]:
+def _rounded(values: NDArray[np.floating]) -> tuple[float, ...]:
     return tuple(float(f"{value:.7g}") for value in values)
 
 
@@ -58,7 +59,9 @@ def main(work: Path, out: Path) -> None:
     model = fit(pair_features(pairs), pairs.targets)
     predicted = np.apply_along_axis(model, -1, pair_features(test)).astype(np.float32)
     click.echo("\n".join(report(predicted, test)))
-    out.write_text("# Written by cleargs.models.training.naturalness.\n" + tomli_w.dumps(model.model_dump()), "utf-8")
+    out.write_text(
+        "# Written by cleargs.models.training.naturalness.\n" + tomli_w.dumps(model.model_dump()), "utf-8"
+    )
 
 
 if __name__ == "__main__":

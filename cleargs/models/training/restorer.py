@@ -2,9 +2,9 @@
 
     python -m cleargs.models.training.restorer --photos DIR --out restorer.onnx
 
-trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, and writes the
-ONNX model. A killed run goes on from its checkpoint; a finished one only exports. The export needs the ``onnx``
-package. `evaluate_restorer` prints the table of the held-out sources.
+trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, and writes
+the ONNX model. A killed run goes on from its checkpoint; a finished one only exports. The export needs the
+``onnx`` package. `evaluate_restorer` prints the table of the held-out sources.
 
 Cost of the default recipe: see ``cleargs/models/weights/README.md``.
 """
@@ -55,7 +55,10 @@ _PURPOSE_SAMPLES = 1
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions around a leaky ReLU, added to the input. No normalisation: it would tie tiles together."""
+    """Two 3x3 convolutions around a leaky ReLU, added to the input.
+
+    No normalisation: it would make a pixel depend on its whole tile.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -76,8 +79,9 @@ def _blocks(channels: int, count: int) -> nn.Sequential:
 class Restorer(nn.Module):
     """Blurred sRGB image to sharp one, [N, 3, H, W] in [0, 1], sides multiples of `STRIDE`.
 
-    A residual U-Net on pixel-unshuffled input at 1/2, 1/4 and 1/8 of the size, every level at equal cost; it predicts
-    the difference to its input. It sees only a neighbourhood (no global pooling), so that tiles agree.
+    A residual U-Net on pixel-unshuffled input at 1/2, 1/4 and 1/8 of the size, every level at similar cost;
+    it predicts the difference to its input. It sees only a neighbourhood
+    (no global pooling), so that tiles agree.
     """
 
     def __init__(self, widths: Sequence[int] = (32, 64, 128), blocks: Sequence[int] = (1, 2, 4)) -> None:
@@ -119,7 +123,7 @@ def list_photos(folder: Path, *, held_out: bool) -> list[Path]:
     if not photos:
         raise InputError(
             f"no {'held-out ' if held_out else ''}photographs in {folder}",
-            hint=f"--photos names a folder of files SOURCE_NNN.jpg; held-out sources are {', '.join(HELD_OUT)}",
+            hint=f"--photos names a folder of SOURCE_NNN.jpg; held-out sources are {', '.join(HELD_OUT)}",
         )
     return photos
 
@@ -135,8 +139,8 @@ def read_photo(path: Path) -> NDArray[np.uint8]:
 def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -> tuple[Image, Image]:
     """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each.
 
-    Half of the patches are shrunk by up to two, which makes them crisper than the photographs are; of two random
-    places the one with more detail is taken.
+    Half of the patches are shrunk by up to two, which makes them crisper than the photographs are; of two
+    random places the one with more detail is taken.
     """
     photo = photos[int(rng.integers(len(photos)))]
     size = PATCH + 2 * MARGIN
@@ -159,7 +163,7 @@ def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -
 
 
 def draw_batch(photos: Sequence[NDArray[np.uint8]], seed: int, step: int) -> tuple[Tensor, Tensor]:
-    """The degraded and sharp batch [BATCH, 3, PATCH, PATCH] of one step, a function of seed and step alone."""
+    """The degraded and sharp batch [BATCH, 3, PATCH, PATCH] of a step, a function of seed and step alone."""
     pairs = [
         draw_sample(photos, np.random.default_rng([seed, _PURPOSE_SAMPLES, step, index]))
         for index in range(BATCH)
@@ -175,7 +179,8 @@ def restoration_loss(restored: Tensor, sharp: Tensor) -> Tensor:
     difference = restored - sharp
     pixels = torch.sqrt(difference.square() + 1e-6).mean()
     spectrum = torch.fft.rfft2(difference, norm="ortho").abs().mean()
-    return pixels + SPECTRUM_WEIGHT * spectrum
+    loss: Tensor = pixels + SPECTRUM_WEIGHT * spectrum
+    return loss
 
 
 def learning_rate(step: int, steps: int) -> float:
@@ -187,10 +192,10 @@ def learning_rate(step: int, steps: int) -> float:
 
 
 def train(photo_folder: Path, checkpoint: Path, *, steps: int, seed: int, bfloat16: bool) -> Restorer:
-    """Train from the checkpoint, where there is one, up to ``steps``; return the network with averaged weights."""
+    """Train from the checkpoint, where there is one, up to ``steps``; return the averaged network."""
     photos = [read_photo(p) for p in list_photos(photo_folder, held_out=False)]
     torch.manual_seed(seed)
-    model = Restorer().to(memory_format=torch.channels_last)
+    model = Restorer()
     average = Restorer()
     average.load_state_dict(model.state_dict())
     optimisers = _optimisers(model)
@@ -260,7 +265,7 @@ def _save(
 
 
 def export_onnx(model: Restorer, path: Path) -> None:
-    """Write the network as ONNX: input ``image`` and output ``restored``, [N, 3, H, W] float32, sizes free."""
+    """Write the network as ONNX: ``image`` in, ``restored`` out, [N, 3, H, W] float32, sizes free."""
     axes = {0: "n", 2: "height", 3: "width"}
     torch.onnx.export(
         model,

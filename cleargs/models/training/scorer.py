@@ -1,11 +1,12 @@
-"""Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one alone.
+"""Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one
+alone.
 
     python -m cleargs.models.training.scorer --photos DIR --work DIR --out scorer.onnx
 
-The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times as much
-and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models install lpips`)
-and the packages onnx and onnxscript for the export, which ClearGS itself does not need. It is seeded and runs on one
-thread by default.
+The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times
+as much and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models
+install lpips`) and the packages onnx and onnxscript for the export, which ClearGS itself does not need. It is
+seeded and runs on one thread by default.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 from cleargs.models.lpips import load_network, weights_file
 from cleargs.models.registry import model_dir
@@ -37,10 +38,10 @@ _TOLERANCE = 0.005  # versions whose LPIPS differ by less are not asked to be in
 class QualityNet(nn.Module):
     """Predicts LPIPS-to-clean of sRGB images [N, 3, H, W] in [0, 1]; [N], at least 0.
 
-    LPIPS compares feature vectors of unit length, so it hardly sees local brightness and contrast. Neither does this
-    network: it gets luminance normalised in a fine and a coarse window, chroma relative to the local contrast, and
-    that contrast's logarithm. Four strided convolutions follow; the mean and deviation of every stage's channels go
-    to a small perceptron.
+    LPIPS compares feature vectors of unit length, so it hardly sees local brightness and contrast. Neither
+    does this network: it gets luminance normalised in a fine and a coarse window, chroma relative to the
+    local contrast, and that contrast's logarithm. Four strided convolutions follow; the mean and deviation of
+    every stage's channels go to a small perceptron.
     """
 
     colour: Tensor
@@ -75,16 +76,18 @@ class QualityNet(nn.Module):
             centre = x.mean(dim=(2, 3))
             spread = ((x - centre[:, :, None, None]).square().mean(dim=(2, 3)) + 1e-6).sqrt()
             statistics += [centre, spread]
-        return F.softplus(self.head(torch.cat(statistics, dim=1))[:, 0] - 1.5)
+        return functional.softplus(self.head(torch.cat(statistics, dim=1))[:, 0] - 1.5)
 
     def _normalised(self, images: Tensor) -> Tensor:
-        ycc = F.conv2d(images, self.colour)
+        ycc = functional.conv2d(images, self.colour)
         luma, squared = ycc[:, :1], ycc[:, :1].square()
         fine, coarse = _box(ycc, 7), _box(luma, 25)
         fine_contrast = _deviation(squared, fine[:, :1], 7)
         coarse_contrast = _deviation(squared, coarse, 25)
         high = (ycc - fine) / (fine_contrast + 0.01)
-        return torch.cat([high, (luma - coarse) / (coarse_contrast + 0.01), 0.5 * fine_contrast.log() + 2.0], dim=1)
+        return torch.cat(
+            [high, (luma - coarse) / (coarse_contrast + 0.01), 0.5 * fine_contrast.log() + 2.0], dim=1
+        )
 
 
 class _Residual(nn.Module):
@@ -99,13 +102,13 @@ class _Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(x + self.body(x))
+        return functional.relu(x + self.body(x))
 
 
 def _box(x: Tensor, side: int) -> Tensor:
     """The mean over a square window; in two passes, which costs a tenth of one for the coarse window."""
-    rows = F.avg_pool2d(x, (side, 1), stride=1, padding=(side // 2, 0), count_include_pad=False)
-    return F.avg_pool2d(rows, (1, side), stride=1, padding=(0, side // 2), count_include_pad=False)
+    rows = functional.avg_pool2d(x, (side, 1), stride=1, padding=(side // 2, 0), count_include_pad=False)
+    return functional.avg_pool2d(rows, (1, side), stride=1, padding=(0, side // 2), count_include_pad=False)
 
 
 def _deviation(squared: Tensor, mean: Tensor, side: int) -> Tensor:
@@ -115,7 +118,8 @@ def _deviation(squared: Tensor, mean: Tensor, side: int) -> Tensor:
 def train(pairs: Pairs, *, seconds: float, epochs: int, seed: int, checkpoint: Path) -> QualityNet:
     """AdamW with a one-cycle rate; ends after ``epochs``, or earlier when ``seconds`` are over.
 
-    Returns the running average of the weights, ready for inference; now and then it is saved to ``checkpoint``.
+    Returns the running average of the weights, ready for inference; now and then it is saved to
+    ``checkpoint``.
     """
     torch.manual_seed(seed)
     net = QualityNet()
@@ -132,7 +136,7 @@ def train(pairs: Pairs, *, seconds: float, epochs: int, seed: int, checkpoint: P
         images, targets = batch
         loss = _loss(net(images.flatten(0, 1)).view_as(targets), targets)
         optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         optimiser.step()
         _update_average(average, net, decay=min(0.995, (step + 1) / (step + 10)))
         if step % 100 == 0:
@@ -152,11 +156,11 @@ def _loss(
     targets: Tensor,  # [G, V]
 ) -> Tensor:
     """Smooth L1, and a logistic loss on the order of every two versions of one content."""
-    regression = F.smooth_l1_loss(predicted, targets, beta=0.05)
+    regression = functional.smooth_l1_loss(predicted, targets, beta=0.05)
     wanted = targets[:, :, None] - targets[:, None, :]
     got = predicted[:, :, None] - predicted[:, None, :]
     clear = (wanted > _TOLERANCE).float()
-    order = (F.softplus(-got / 0.03) * clear).sum() / clear.sum().clamp_min(1.0)
+    order = (functional.softplus(-got / 0.03) * clear).sum() / clear.sum().clamp_min(1.0)
     return 4.0 * regression + 0.5 * order
 
 
@@ -192,7 +196,10 @@ def _update_average(average: nn.Module, net: nn.Module, decay: float) -> None:
 def predict(net: QualityNet, pairs: Pairs) -> NDArray[np.float32]:
     """The predicted LPIPS of every version. [G, V]"""
     with torch.inference_mode():
-        rows = [net(torch.from_numpy(g).permute(0, 3, 1, 2).float() / 255.0).numpy() for g in pairs.images]
+        rows = [
+            net(torch.from_numpy(np.array(g)).permute(0, 3, 1, 2).float() / 255.0).numpy()
+            for g in pairs.images
+        ]
     return np.stack(rows)
 
 
@@ -232,7 +239,8 @@ class _Score(nn.Module):
         self.net = net
 
     def forward(self, images: Tensor) -> Tensor:
-        return 100.0 - 100.0 * self.net(images)
+        distance: Tensor = self.net(images)
+        return 100.0 - 100.0 * distance
 
 
 def export(net: QualityNet, path: Path) -> None:
@@ -251,16 +259,22 @@ def export(net: QualityNet, path: Path) -> None:
 
 @click.command()
 @click.option("--photos", type=click.Path(exists=True, file_okay=False, path_type=Path), required=True)
-@click.option("--work", type=click.Path(file_okay=False, path_type=Path), required=True, help="Folder for the pairs.")
+@click.option(
+    "--work", type=click.Path(file_okay=False, path_type=Path), required=True, help="Folder for the pairs."
+)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
-@click.option("--hold-out", multiple=True, default=HELD_OUT, show_default=True, help="Photo sources (file prefixes).")
+@click.option(
+    "--hold-out", multiple=True, default=HELD_OUT, show_default=True, help="Photo sources (file prefixes)."
+)
 @click.option("--contents", default=16, show_default=True, help="Patches a training photo.")
 @click.option("--versions", default=8, show_default=True, help="Versions of each, the clean one included.")
 @click.option("--epochs", default=6, show_default=True)
 @click.option("--minutes", default=60.0, show_default=True, help="Training ends after so long at the latest.")
 @click.option("--threads", default=1, show_default=True)
 @click.option("--seed", default=1, show_default=True)
-@click.option("--models", type=click.Path(path_type=Path), default=None, help="Model folder with the LPIPS weights.")
+@click.option(
+    "--models", type=click.Path(path_type=Path), default=None, help="Model folder with the LPIPS weights."
+)
 def main(
     photos: Path,
     work: Path,
@@ -283,12 +297,12 @@ def main(
     seen = [p for p in files if p not in unseen]
     test = make_pairs(unseen, lpips, work / "held", contents=5, versions=None, seed=seed + 1000)
     pairs = make_pairs(seen, lpips, work / "train", contents=contents, versions=versions, seed=seed)
-    net = train(
-        pairs, seconds=60.0 * minutes, epochs=epochs, seed=seed, checkpoint=work / "scorer.pt"
-    )
+    net = train(pairs, seconds=60.0 * minutes, epochs=epochs, seed=seed, checkpoint=work / "scorer.pt")
     click.echo("\n".join(report(predict(net, test), test)))
     export(net, out)
-    click.echo(f"{out}: {out.stat().st_size} bytes, {sum(p.numel() for p in net.parameters())} weights", err=True)
+    click.echo(
+        f"{out}: {out.stat().st_size} bytes, {sum(p.numel() for p in net.parameters())} weights", err=True
+    )
 
 
 if __name__ == "__main__":

@@ -43,9 +43,9 @@ def make_pairs(
 ) -> Pairs:
     """Cut ``contents`` random patches from every photo and degrade each; the arrays lie in ``folder``.
 
-    For training, ``versions`` (the clean one included) draws that many kinds with repetition and varies the look of
-    the content. For testing, None makes every kind once, of the content as it is.
-    Groups that are there already are kept, so that an interrupted preparation goes on where it stopped.
+    For training, ``versions`` (the clean one included) draws that many kinds with repetition and varies the
+    look of the content. For testing, None makes every kind once, of the content as it is. Groups that are
+    there already are kept, so that an interrupted preparation goes on where it stopped.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = [p for _ in range(contents) for p in photos]
@@ -72,7 +72,9 @@ def make_pairs(
 
 def load_pairs(folder: Path) -> Pairs:
     """The pairs that ``make_pairs`` has left in ``folder``, memory-mapped."""
-    images, targets, kinds = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("images", "targets", "kinds"))
+    images, targets, kinds = (
+        np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("images", "targets", "kinds")
+    )
     return Pairs(images, targets, kinds)
 
 
@@ -102,8 +104,8 @@ def _content(photo: Path, rng: np.random.Generator) -> Image:
 def _vary(image: Image, rng: np.random.Generator) -> Image:
     """Another photo of the same thing: other colours, exposure and contrast, often with a part out of focus.
 
-    A handful of photo sources look alike in these respects; without this the network learns the look of a source,
-    and takes the soft background of a close-up for a fault.
+    A handful of photo sources look alike in these respects; without this the network learns the look of a
+    source, and takes the soft background of a close-up for a fault.
     """
     out = image[..., rng.permutation(3)]
     grey = out.mean(axis=2, keepdims=True)
@@ -112,9 +114,11 @@ def _vary(image: Image, rng: np.random.Generator) -> Image:
     contrast = rng.uniform(0.4, 1.0)
     out = (contrast * out + rng.uniform(0.0, 1.0 - contrast)).astype(np.float32)
     if rng.random() < 0.4:
-        soft = linear_to_srgb(np.clip(convolve(srgb_to_linear(out), disc_kernel(rng.uniform(1.0, 5.0))), 0.0, 1.0))
+        soft = linear_to_srgb(
+            np.clip(convolve(srgb_to_linear(out), disc_kernel(rng.uniform(1.0, 5.0))), 0.0, 1.0)
+        )
         out = out + patches(out.shape[0], out.shape[1], rng) * (soft - out)
-    return out
+    return np.asarray(out, np.float32)
 
 
 def _inner(image: Image) -> Image:

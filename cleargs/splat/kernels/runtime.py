@@ -56,8 +56,10 @@ def configure_numba() -> None:
     """
     from numba import config
 
-    config.CACHE_DIR = str(cache_folder())
-    config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+    # By setattr, because Numba makes these settings from the environment and declares none of them.
+    settings = {"CACHE_DIR": str(cache_folder()), "THREADING_LAYER_PRIORITY": ["omp", "tbb", "workqueue"]}
+    for name, value in settings.items():
+        setattr(config, name, value)
 
 
 def set_threads(n: int) -> None:

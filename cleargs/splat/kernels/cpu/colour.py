@@ -23,7 +23,7 @@ def apply_affine(image: Floats, affine: Floats, output: Floats) -> None:
 def affine_backward(
     image: Floats, affine: Floats, grad_output: Floats, grad_image: Floats, row_sums: Array
 ) -> None:
-    """grad_image = affine[:, :3]ᵀ grad_output, and each image row's share of dL/d(affine) [H, 3, 4] float64."""
+    """grad_image = affine[:, :3]ᵀ grad_output, and each row's share of dL/d(affine) [H, 3, 4] float64."""
     height, width, _ = image.shape
     for y in prange(height):
         row_sums[y] = 0.0

@@ -9,7 +9,7 @@ its neighbours in the loop, which makes results bitwise independent of the numbe
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,31 +25,26 @@ FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
 
 def kernel(function: F) -> F:
     """A parallel entry point: called from Python, cached on disk, runs without the GIL."""
-    compiled: F = njit(cache=True, parallel=True, nogil=True, fastmath=set(FAST), error_model="numpy")(
-        function
+    return cast(
+        F, njit(cache=True, parallel=True, nogil=True, fastmath=set(FAST), error_model="numpy")(function)
     )
-    return compiled
 
 
 def serial_kernel(function: F) -> F:
     """An entry point that runs on the calling thread alone."""
-    compiled: F = njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def device(function: F) -> F:
     """A function that kernels call; compiled into them."""
-    compiled: F = njit(fastmath=set(FAST), error_model="numpy")(function)
-    return compiled
+    return cast(F, njit(fastmath=set(FAST), error_model="numpy")(function))
 
 
 def inlined(function: F) -> F:
     """A small function that LLVM must inline, so that SIMD values stay in registers."""
-    compiled: F = njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function)
-    return compiled
+    return cast(F, njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function))
 
 
 def exact(function: F) -> F:
     """Plain IEEE arithmetic: bitwise the same wherever it is compiled into."""
-    compiled: F = njit(error_model="numpy")(function)
-    return compiled
+    return cast(F, njit(error_model="numpy")(function))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numba
 
@@ -34,7 +35,8 @@ def set_threads(n: int) -> None:
     """See ``runtime.set_threads``."""
     if n < 1:
         raise ValueError(f"{n} threads")
-    numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
+    settings: Any = numba.config
+    numba.set_num_threads(min(n, settings.NUMBA_NUM_THREADS))
 
 
 def threads() -> int:

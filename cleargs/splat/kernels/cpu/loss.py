@@ -45,7 +45,8 @@ BY_MEAN, BY_SQUARE, BY_PRODUCT = range(3)
 def ssim_window() -> Floats:
     """The normalised one-dimensional window, [11]."""
     weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * constants.SSIM_SIGMA**2))
-    return (weights / weights.sum()).astype(np.float32)
+    window: Floats = (weights / weights.sum()).astype(np.float32)
+    return window
 
 
 def padded_length(width: int) -> int:

@@ -22,7 +22,7 @@ rho = sqrt(det(U Uᵀ) / det Σ), where det(U Uᵀ) = |w x u1|².
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -107,18 +107,17 @@ def view_of(camera: Camera) -> View:
     pose = camera.world_to_camera
     beyond_x = constants.VIEW_CLAMP * 0.5 * camera.width / camera.fx
     beyond_y = constants.VIEW_CLAMP * 0.5 * camera.height / camera.fy
-    return View(
-        *(float(value) for value in pose[:3, :3].ravel()),
-        *(float(value) for value in pose[:3, 3]),
-        *(float(value) for value in camera.centre),
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        left=-camera.cx / camera.fx - beyond_x,
-        right=(camera.width - camera.cx) / camera.fx + beyond_x,
-        top=-camera.cy / camera.fy - beyond_y,
-        bottom=(camera.height - camera.cy) / camera.fy + beyond_y,
+    return View._make(
+        [
+            *pose[:3, :3].ravel().tolist(),
+            *pose[:3, 3].tolist(),
+            *camera.centre.tolist(),
+            *(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)),
+            float(-camera.cx / camera.fx - beyond_x),
+            float((camera.width - camera.cx) / camera.fx + beyond_x),
+            float(-camera.cy / camera.fy - beyond_y),
+            float((camera.height - camera.cy) / camera.fy + beyond_y),
+        ]
     )
 
 
@@ -141,9 +140,10 @@ def residual(
 
 
 @device
-def is_finite(x: float) -> bool:
+def is_finite(x: Any) -> bool:
     """Within the range of float32. A comparison, as reassociation may cancel the x - x of math.isfinite."""
-    return abs(x) <= FLOAT32_MAX
+    finite: bool = abs(x) <= FLOAT32_MAX
+    return finite
 
 
 @device

@@ -16,12 +16,21 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.core.typing import templates
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
-from numba.np.arrayobj import make_array
+from numba.np import arrayobj
 
 LANES = 8
+
+# Numba's functions for extensions are not annotated.
+_signature: Any = templates.signature
+_infer_global: Any = templates.infer_global
+_register_model: Any = register_model
+_lower_builtin: Any = lower_builtin
+_make_array: Any = arrayobj.make_array
+_initialise_storage: Any = models.PrimitiveModel.__init__
+_declare: Any = cgutils.get_or_insert_function
 
 # As in jit.FAST: no nnan, no ninf.
 _FLAGS = ("contract", "nsz", "arcp", "reassoc")
@@ -37,26 +46,24 @@ _MASK = ir.VectorType(_I1, LANES)
 _UNDEFINED = ir.Constant(_VECTOR, ir.Undefined)
 
 
-class _VectorType(types.Type):  # type: ignore[misc]  # numba has no type information
-    def __init__(self) -> None:
-        super().__init__(name="f32x8")
+class _VectorType(types.Type):
+    """The type of eight float32 lanes."""
 
 
-class _MaskType(types.Type):  # type: ignore[misc]  # numba has no type information
-    def __init__(self) -> None:
-        super().__init__(name="mask8")
+class _MaskType(types.Type):
+    """The type of eight comparison results."""
 
 
-f32x8 = _VectorType()
-mask8 = _MaskType()
+f32x8 = _VectorType("f32x8")
+mask8 = _MaskType("mask8")
 
 
 def _register_storage(numba_type: type, llvm_type: ir.Type) -> None:
-    class Model(models.PrimitiveModel):  # type: ignore[misc]  # numba has no type information
+    class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, front_end_type: Any) -> None:
-            super().__init__(manager, front_end_type, llvm_type)
+            _initialise_storage(self, manager, front_end_type, llvm_type)
 
-    register_model(numba_type)(Model)
+    _register_model(numba_type)(Model)
 
 
 _register_storage(_VectorType, _VECTOR)
@@ -71,7 +78,7 @@ def _broadcast(builder: Any, scalar: Any) -> Any:
 def _register_operator(
     function: Callable[..., Any], cases: list[Any], emit: Callable[[Any, Any, Any], Any]
 ) -> None:
-    infer_global(function)(type("SimdOperator", (ConcreteTemplate,), {"cases": cases}))
+    _infer_global(function)(type("SimdOperator", (templates.ConcreteTemplate,), {"cases": cases}))
     for case in cases:
 
         def lower(context: Any, builder: Any, case: Any, values: Any) -> Any:
@@ -81,7 +88,7 @@ def _register_operator(
             ]
             return emit(builder, *wide)
 
-        lower_builtin(function, *case.args)(lower)
+        _lower_builtin(function, *case.args)(lower)
 
 
 def _register_operators() -> None:
@@ -97,7 +104,7 @@ def _register_operators() -> None:
         def calculate(builder: Any, x: Any, y: Any, name: str = name) -> Any:
             return getattr(builder, name)(x, y, flags=_FLAGS)
 
-        _register_operator(function, [signature(f32x8, *pair) for pair in pairs], calculate)
+        _register_operator(function, [_signature(f32x8, *pair) for pair in pairs], calculate)
 
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, symbol in comparisons.items():
@@ -105,7 +112,7 @@ def _register_operators() -> None:
         def compare(builder: Any, x: Any, y: Any, symbol: str = symbol) -> Any:
             return builder.fcmp_ordered(symbol, x, y)
 
-        _register_operator(function, [signature(mask8, *pair) for pair in pairs], compare)
+        _register_operator(function, [_signature(mask8, *pair) for pair in pairs], compare)
 
 
 _register_operators()
@@ -118,7 +125,7 @@ def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any) -> Any:
     offset = context.cast(builder, index, index_type, types.intp)
-    data = make_array(array_type)(context, builder, array).data
+    data = _make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
 
 
@@ -168,7 +175,7 @@ def select8(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
 def _call(name: str, n: int, flags: tuple[str, ...]) -> Callable[..., Any]:
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         function_type = ir.FunctionType(_VECTOR, [_VECTOR] * n)
-        function = cgutils.get_or_insert_function(builder.module, function_type, name)
+        function = _declare(builder.module, function_type, name)
         return builder.call(function, args, fastmath=flags)
 
     return generate
@@ -247,9 +254,7 @@ def lane_sum(typing_context: Any, x: Any) -> Any:
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
-        function = cgutils.get_or_insert_function(
-            builder.module, function_type, "llvm.vector.reduce.fadd.v8f32"
-        )
+        function = _declare(builder.module, function_type, "llvm.vector.reduce.fadd.v8f32")
         return builder.call(function, [ir.Constant(_F32, 0.0), args[0]], fastmath=_FLAGS)
 
     return types.float32(f32x8), generate

@@ -1,0 +1,245 @@
+"""The no-reference scorers, their tiles, and how they are trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+from cleargs.models.lpips import LpipsNetwork
+from cleargs.models.naturalness import Quadratic, StatisticsScorer, features, terms
+from cleargs.models.scorer import CLARITY, NATURALNESS, LearnedScorer, Scorer, load_scorer
+from cleargs.models.tile_mean import mean_over_tiles
+from cleargs.models.training import artefacts
+from cleargs.models.training.degrade import disc_kernel, motion_kernel
+from cleargs.models.training.naturalness import fit
+from cleargs.models.training.scorer import QualityNet, predict, train
+from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, load_pairs, make_pairs
+
+Image = NDArray[np.float32]
+
+
+def dead_leaves(seed: int, height: int = 200, width: int = 320) -> Image:
+    """Opaque discs of all sizes, each with a fine texture of its own: the classical stand-in for a
+    photograph."""
+    rng = np.random.default_rng(seed)
+    scale = 3  # drawn larger and reduced, so that edges are as soft as a camera's
+    canvas = np.full((scale * height, scale * width, 3), 0.5, np.float32)
+    texture = cv2.GaussianBlur(rng.standard_normal(canvas.shape[:2], np.float32), (0, 0), 2.0)
+    texture /= texture.std()
+    for _ in range(900):
+        radius = int(scale * 3.0 * (1.0 - rng.random()) ** -0.6)
+        centre = (int(rng.integers(0, canvas.shape[1])), int(rng.integers(0, canvas.shape[0])))
+        mask = np.zeros(canvas.shape[:2], np.uint8)
+        cv2.circle(mask, centre, min(radius, 300), 1, -1)
+        inside = mask.astype(bool)
+        canvas[inside] = rng.random(3) * 0.8 + 0.1 + (rng.uniform(0.0, 0.06) * texture[inside])[:, None]
+    reduced = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
+    return np.clip(reduced, 0.0, 1.0).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def leaves() -> Image:
+    return dead_leaves(0)
+
+
+@pytest.fixture(scope="module", params=[CLARITY, NATURALNESS])
+def scorer(request: pytest.FixtureRequest) -> Scorer:
+    return load_scorer(request.param)
+
+
+def test_faults_cost_points(scorer: Scorer, leaves: Image) -> None:
+    rng = np.random.default_rng(5)
+    clean = scorer.score(leaves)
+    blurred = cv2.GaussianBlur(leaves, (0, 0), 2.5)
+    faulty = {
+        "blur": blurred,
+        "noise": np.clip(leaves + 0.1 * rng.standard_normal(leaves.shape, np.float32), 0, 1),
+        "splats": artefacts.splat(leaves, rng, spacing=5.0, stretch=4.0),
+    }
+    # One point is the margin at which RIVR stops asking the other scorer; these faults are far beyond it.
+    for name, image in faulty.items():
+        assert scorer.score(image) < clean - 3.0, name
+
+
+def test_more_blur_scores_lower(scorer: Scorer, leaves: Image) -> None:
+    scores = [scorer.score(cv2.GaussianBlur(leaves, (0, 0), sigma)) for sigma in (0.8, 1.6, 3.2)]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_same_bits_for_any_thread_count(scorer: Scorer, leaves: Image) -> None:
+    assert scorer.score(leaves, threads=1) == scorer.score(leaves, threads=3)
+    assert load_scorer(scorer.name).score(leaves) == scorer.score(leaves)
+
+
+def test_names_and_digests(scorer: Scorer) -> None:
+    assert scorer.name in (CLARITY, NATURALNESS)
+    assert len(scorer.digest) == 64
+    assert load_scorer(CLARITY).digest != load_scorer(NATURALNESS).digest
+
+
+def test_score_hardly_depends_on_the_size_of_the_image(scorer: Scorer, leaves: Image) -> None:
+    """Four copies side by side hold the same texture (the seams add a little)."""
+    mirrored = np.concatenate([leaves, leaves[:, ::-1]], axis=1)
+    mirrored = np.concatenate([mirrored, mirrored[::-1]], axis=0)
+    assert scorer.score(mirrored) == pytest.approx(scorer.score(leaves), abs=2.0)
+
+
+@pytest.mark.parametrize("height, width", [(32, 32), (33, 130), (129, 47)])
+def test_small_and_odd_sizes(scorer: Scorer, leaves: Image, height: int, width: int) -> None:
+    assert np.isfinite(scorer.score(leaves[:height, :width]))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_flat_images_have_a_score(scorer: Scorer, value: float) -> None:
+    assert np.isfinite(scorer.score(np.full((64, 64, 3), value, np.float32)))
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (31, 64, 3), (64, 64, 4)])
+def test_refuses_other_shapes(scorer: Scorer, shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="cannot be scored"):
+        scorer.score(np.zeros(shape, np.float32))
+
+
+def test_unknown_scorers(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="musiq") as caught:
+        load_scorer("musiq")
+    assert CLARITY in caught.value.hint
+    with pytest.raises(InputError, match="does not exist"):
+        load_scorer(str(tmp_path / "none.onnx"))
+    (tmp_path / "broken.onnx").write_bytes(b"not a model")
+    with pytest.raises(InputError, match="not an ONNX model"):
+        load_scorer(str(tmp_path / "broken.onnx"))
+
+
+def test_a_restorer_is_no_scorer() -> None:
+    weights = Path(__file__).parents[1] / "cleargs" / "models" / "weights" / "restorer.onnx"
+    with pytest.raises(InputError, match="one score"):
+        LearnedScorer(weights)
+
+
+def test_tiles_cover_the_image_and_keep_their_order() -> None:
+    image = np.zeros((100, 250, 3), np.float32)
+    image[-1, -1] = 1.0  # seen only if the last tile reaches the corner
+    assert mean_over_tiles(lambda tile: float(tile.max()), image, (100, 100)) == pytest.approx(1 / 3)
+    assert mean_over_tiles(lambda tile: float(tile.max()), image, (None, None)) == 1.0
+    shapes: list[tuple[int, ...]] = []
+    mean_over_tiles(lambda tile: shapes.append(tile.shape) or 0.0, image, (64, 128))  # type: ignore[func-returns-value]
+    assert shapes == [(64, 128, 3)] * 4
+
+
+def test_quadratic_terms() -> None:
+    found = terms(np.array([3.0, 1.0]), mean=np.array([1.0, 1.0]), deviation=np.array([1.0, 2.0]))
+    assert found.tolist() == [1.0, 2.0, 0.0, 4.0, 0.0, 0.0]
+    capped = terms(np.array([1e9]), mean=np.zeros(1), deviation=np.ones(1))
+    assert capped.tolist() == [1.0, 4.0, 16.0]
+    assert Quadratic(mean=(1.0,), deviation=(1.0,), weights=(1.0, 2.0, 3.0))(np.array([2.0])) == 6.0
+
+
+def test_features_tell_direction_of_change(leaves: Image) -> None:
+    """Blur raises the correlation of neighbours, noise lowers it."""
+    tile = leaves[:128, :128]
+    neighbour = 2  # the larger of the correlations one pixel on
+    rng = np.random.default_rng(0)
+    noisy = np.clip(tile + 0.05 * rng.standard_normal(tile.shape, np.float32), 0, 1)
+    blurred = cv2.GaussianBlur(tile, (0, 0), 1.5)
+    assert features(noisy)[neighbour] < features(tile)[neighbour] < features(blurred)[neighbour]
+
+
+def test_ridge_fit_finds_a_quadratic() -> None:
+    rng = np.random.default_rng(0)
+    figures = rng.standard_normal((400, 4, 3))
+    truth = 0.3 * figures[..., 0] - 0.2 * figures[..., 1] * figures[..., 2] + 0.1
+    model = fit(figures, truth.astype(np.float32))
+    found = np.apply_along_axis(model, -1, figures)
+    # The ridge shrinks a little, and features are cut at four deviations.
+    assert np.abs(found - truth).mean() < 0.05 * np.abs(truth).mean()
+
+
+def test_the_shipped_statistics_load() -> None:
+    assert StatisticsScorer().name == NATURALNESS
+
+
+# --- artefacts
+
+
+@pytest.mark.parametrize("kind", KIND_NAMES)
+def test_artefacts_are_seeded_images(leaves: Image, kind: str) -> None:
+    patch = leaves[:96, :96]
+    made = [artefacts.KINDS[kind](patch, np.random.default_rng(7)) for _ in range(2)]
+    assert np.array_equal(*made)
+    assert made[0].shape == patch.shape and made[0].dtype == np.float32
+    assert made[0].min() >= 0.0 and made[0].max() <= 1.0
+    assert np.array_equal(made[0], patch) == (kind == "clean")
+
+
+def test_fuse_is_the_paper_s_third_candidate(leaves: Image) -> None:
+    soft = cv2.GaussianBlur(leaves, (0, 0), 2.0)
+    expected = np.clip(soft + leaves - cv2.GaussianBlur(leaves, (0, 0), 2.0), 0, 1)
+    assert np.abs(artefacts.fuse(soft, leaves, 2.0) - expected).max() < 1e-5
+
+
+def test_wiener_undoes_a_known_blur(leaves: Image) -> None:
+    kernel = disc_kernel(1.5)
+    grey = np.repeat(leaves.mean(axis=2, keepdims=True), 3, axis=2)
+    blurred = cv2.filter2D(grey, -1, kernel, borderType=cv2.BORDER_REFLECT)
+    back = artefacts.wiener(blurred, kernel, 1e-4)
+    assert np.abs(back - grey).mean() < 0.3 * np.abs(blurred - grey).mean()
+
+
+def test_ghost_shifts_the_second_exposure() -> None:
+    image = np.zeros((40, 60, 3), np.float32)
+    image[20, 30] = 1.0
+    seen = artefacts.ghost(image, 5.0, -3.0, 0.25)
+    assert set(zip(*np.nonzero(seen[..., 0]), strict=True)) == {(20, 30), (17, 35)}
+    assert seen[20, 30, 0] > seen[17, 35, 0] > 0.0
+
+
+def test_motion_kernel_is_shared_with_the_restorer() -> None:
+    assert motion_kernel(np.random.default_rng(0), 9.0).sum() == pytest.approx(1.0, abs=1e-5)
+
+
+# --- training
+
+
+@pytest.fixture(scope="module")
+def pairs_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pairs")
+    torch.manual_seed(0)
+    photos = []
+    for seed in range(2):
+        photos.append(folder / f"leaves_{seed}.png")
+        cv2.imwrite(str(photos[-1]), (dead_leaves(seed, 240, 320)[..., ::-1] * 255).astype(np.uint8))
+    network = LpipsNetwork(
+        "alex"
+    ).eval()  # random weights measure some distance, which is all that is needed here
+    for head in network.heads.parameters():
+        head.data.abs_()
+    make_pairs(photos, network, folder / "train", contents=4, versions=4, seed=0)
+    return folder
+
+
+def test_pairs(pairs_folder: Path) -> None:
+    pairs = load_pairs(pairs_folder / "train")
+    assert pairs.images.shape == (8, 4, PATCH, PATCH, 3)
+    assert (pairs.targets[:, 0] == 0.0).all() and (pairs.kinds[:, 0] == 0).all()
+    assert (pairs.targets[:, 1:] > 0.0).all() and (pairs.kinds[:, 1:] > 0).all()
+    assert len({image.tobytes() for image in pairs.images[:, 0]}) == 8  # no content twice
+
+
+def test_training_steps_and_resumes_nothing_by_chance(pairs_folder: Path, tmp_path: Path) -> None:
+    pairs = load_pairs(pairs_folder / "train")
+    nets = [train(pairs, seconds=600.0, epochs=2, seed=3, checkpoint=tmp_path / "net.pt") for _ in range(2)]
+    first, second = (predict(net, pairs) for net in nets)
+    assert first.shape == pairs.targets.shape and (first >= 0.0).all()
+    # Seeded; the rate follows the clock only where time runs out first.
+    assert np.allclose(first, second, atol=1e-3)
+    untrained = QualityNet().eval()
+    assert not np.allclose(first, predict(untrained, pairs), atol=1e-4)
+    saved = torch.load(tmp_path / "net.pt", weights_only=True)
+    assert torch.equal(saved["head.1.weight"], nets[1].state_dict()["head.1.weight"])
