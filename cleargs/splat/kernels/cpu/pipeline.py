@@ -12,7 +12,7 @@ from torch import Tensor
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import binning, launch, projection, rasterise
+from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
 from cleargs.splat.kernels.cpu.jit import Array, Floats
 from cleargs.splat.kernels.cpu.layout import MAX_PAIRS, PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH, TILE
 
@@ -131,7 +131,7 @@ class CpuRasteriser:
         pair_sums = self._buffers.take("pair_sums", (len(frame.pair_ids), columns))
         parameters = read_parameters(frame.gaussians)
         names = ("grad_means", "grad_log_scales", "grad_rotations", "grad_logits", "grad_sh")
-        gradients = [
+        outputs = [
             self._buffers.take(name, array.shape) for name, array in zip(names, parameters, strict=True)
         ]
         with launch.exclusive():
@@ -151,7 +151,7 @@ class CpuRasteriser:
                     None if grad_depth is None else read(grad_depth),
                     pair_sums,
                 )
-            projection.backpropagate(
+            gradients.backpropagate(
                 *parameters,
                 frame.sh_count,
                 frame.view,
@@ -159,9 +159,9 @@ class CpuRasteriser:
                 frame.splats,
                 frame.pair_offsets,
                 pair_sums,
-                *gradients,
+                *outputs,
             )
-        return Gaussians(*(torch.from_numpy(gradient) for gradient in gradients))
+        return Gaussians(*(torch.from_numpy(output) for output in outputs))
 
     def _project_and_bin(
         self,

@@ -12,7 +12,7 @@ and S the part of g · pixel that lies behind the splat,
     v = dL/d(ln alpha) = w (g · c) - S alpha / (1 - alpha),   0 where alpha is clamped.
 
 Only the sums of v times 1, u, dy, u², u dy, dy² and of w g are needed of a (tile, splat) pair
-(layout.SUM_*); projection.backpropagate turns them into gradients once per Gaussian. Each pair owns a row
+(layout.SUM_*); gradients.backpropagate turns them into gradients once per Gaussian. Each pair owns a row
 of scratch, so there are no atomics, no races and no dependence on the number of threads.
 
 A tile's pixels live in a small buffer in "half-major" order: vector j = 16 h + r is row r of the tile's

@@ -1,0 +1,321 @@
+"""From the rasteriser's pixel sums back to gradients of the raw parameters.
+
+The chain rule of ``projection`` written out; the symbols are those of its docstring.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from cleargs.splat.kernels.cpu.harmonics import sh_basis, sh_direction_gradient
+from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.layout import (
+    BLUE,
+    GREEN,
+    PAIR_COLUMNS,
+    RED,
+    SUM_BLUE,
+    SUM_DEPTH,
+    SUM_GREEN,
+    SUM_RED,
+    SUM_V,
+    SUM_VU,
+    SUM_VUU,
+    SUM_VUY,
+    SUM_VY,
+    SUM_VYY,
+)
+from cleargs.splat.kernels.cpu.projection import (
+    BLOCK,
+    DILATION,
+    QUATERNION_EPSILON,
+    ZERO,
+    View,
+    camera_position,
+    cross,
+    dot,
+    projection_rows,
+    residual,
+    scaled_axes,
+    unit_quaternion,
+)
+
+
+@device
+def quaternion_gradient(
+    w: float,
+    x: float,
+    y: float,
+    z: float,
+    c0: tuple[float, float, float],
+    c1: tuple[float, float, float],
+    c2: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
+    return (
+        2 * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
+        2 * (w * (c1[2] - c2[1]) + y * (c0[1] + c1[0]) + z * (c0[2] + c2[0]) - 2 * x * (c1[1] + c2[2])),
+        2 * (w * (c2[0] - c0[2]) + x * (c0[1] + c1[0]) + z * (c1[2] + c2[1]) - 2 * y * (c0[0] + c2[2])),
+        2 * (w * (c0[1] - c1[0]) + x * (c0[2] + c2[0]) + y * (c1[2] + c2[1]) - 2 * z * (c0[0] + c1[1])),
+    )
+
+
+@device
+def colour_gradient(
+    g: int,
+    sh: Floats,
+    sh_count: int,
+    splat: Floats,
+    direction: tuple[float, float, float],
+    sums: Array,
+    grad_sh: Floats,
+    basis: Floats,
+    weights: Floats,
+) -> tuple[float, float, float]:
+    """Write dL/dSH of one Gaussian and return dL/d(direction). No gradient where the colour is clamped."""
+    red = np.float32(sums[SUM_RED]) if splat[RED] > ZERO else ZERO
+    green = np.float32(sums[SUM_GREEN]) if splat[GREEN] > ZERO else ZERO
+    blue = np.float32(sums[SUM_BLUE]) if splat[BLUE] > ZERO else ZERO
+    x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
+    sh_basis(sh_count, x, y, z, basis)
+    for k in range(sh_count):
+        grad_sh[g, k, 0] = basis[k] * red
+        grad_sh[g, k, 1] = basis[k] * green
+        grad_sh[g, k, 2] = basis[k] * blue
+        weights[k] = sh[g, k, 0] * red + sh[g, k, 1] * green + sh[g, k, 2] * blue
+    for k in range(sh_count, sh.shape[1]):
+        grad_sh[g, k, 0] = ZERO
+        grad_sh[g, k, 1] = ZERO
+        grad_sh[g, k, 2] = ZERO
+    gx, gy, gz = sh_direction_gradient(sh_count, x, y, z, weights)
+    return np.float64(gx), np.float64(gy), np.float64(gz)
+
+
+@device
+def backpropagate_one(
+    g: int,
+    means: Floats,
+    log_scales: Floats,
+    rotations: Floats,
+    logits: Floats,
+    sh: Floats,
+    sh_count: int,
+    view: View,
+    antialias: bool,
+    splats: Floats,
+    sums: Array,
+    grad_means: Floats,
+    grad_log_scales: Floats,
+    grad_rotations: Floats,
+    grad_logits: Floats,
+    grad_sh: Floats,
+    basis: Floats,
+    weights: Floats,
+) -> None:
+    """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see layout.SUM_*)."""
+    x, y, z = camera_position(means[g], view)
+    qw, qx, qy, qz, norm = unit_quaternion(rotations[g])
+    sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
+    axis0, axis1, axis2 = scaled_axes(qw, qx, qy, qz, sx, sy, sz)
+    row0, row1 = projection_rows(x, y, z, view)
+    u0 = (dot(row0, axis0), dot(row0, axis1), dot(row0, axis2))
+    u1 = (dot(row1, axis0), dot(row1, axis1), dot(row1, axis2))
+    yy = dot(u1, u1) + DILATION
+    e = 1.0 / yy
+    k = dot(u0, u1) * e
+    w = residual(u0, u1, k)
+    a = 1.0 / (dot(w, w) + DILATION * (1.0 + k * k))
+
+    # ln alpha = ln opacity - ½ a u² - ½ e dy²,  u = dx - k dy
+    grad_mean_x = a * sums[SUM_VU]
+    grad_mean_y = e * sums[SUM_VY] - k * grad_mean_x
+    grad_logits[g] = sums[SUM_V] / (1.0 + math.exp(np.float64(logits[g])))
+    # d(ln alpha)/dk = a u dy,   dk = e [u1 · du0 + (w - k u1) · du1]
+    by_k = e * a * sums[SUM_VUY]
+    # d(ln alpha)/ds = ½ a² u²,  ds = 2 w · (du0 - k du1)
+    by_w = a * a * sums[SUM_VUU]
+    # d(ln alpha)/de = -½ dy²,   de = -2 e² u1 · du1
+    by_yy = e * e * sums[SUM_VYY]
+    normal = (0.0, 0.0, 0.0)
+    by_area = 0.0
+    if antialias:
+        # ln rho = ½ (ln |n|² - ln s - ln Σyy),  n = w x u1 = u0 x u1,
+        # d ln |n|² = 2 [(u1 x n) · du0 + (n x u0) · du1] / |n|²
+        by_w -= a * sums[SUM_V]
+        by_yy -= e * sums[SUM_V]
+        normal = cross(w, u1)
+        by_area = sums[SUM_V] / dot(normal, normal)
+    side0, side1 = cross(u1, normal), cross(normal, u0)
+    v0 = (
+        by_w * w[0] + by_k * u1[0] + by_area * side0[0],
+        by_w * w[1] + by_k * u1[1] + by_area * side0[1],
+        by_w * w[2] + by_k * u1[2] + by_area * side0[2],
+    )
+    v1 = (
+        (by_k - k * by_w) * w[0] + (by_yy - k * by_k) * u1[0] + by_area * side1[0],
+        (by_k - k * by_w) * w[1] + (by_yy - k * by_k) * u1[1] + by_area * side1[1],
+        (by_k - k * by_w) * w[2] + (by_yy - k * by_k) * u1[2] + by_area * side1[2],
+    )
+    # u0[i] = row0 · axis_i, axis_i = s_i R[:, i]
+    m0 = (
+        v0[0] * row0[0] + v1[0] * row1[0],
+        v0[0] * row0[1] + v1[0] * row1[1],
+        v0[0] * row0[2] + v1[0] * row1[2],
+    )
+    m1 = (
+        v0[1] * row0[0] + v1[1] * row1[0],
+        v0[1] * row0[1] + v1[1] * row1[1],
+        v0[1] * row0[2] + v1[1] * row1[2],
+    )
+    m2 = (
+        v0[2] * row0[0] + v1[2] * row1[0],
+        v0[2] * row0[1] + v1[2] * row1[1],
+        v0[2] * row0[2] + v1[2] * row1[2],
+    )
+    grad_log_scales[g, 0] = dot(m0, axis0)
+    grad_log_scales[g, 1] = dot(m1, axis1)
+    grad_log_scales[g, 2] = dot(m2, axis2)
+
+    gw, gx, gy, gz = quaternion_gradient(
+        qw,
+        qx,
+        qy,
+        qz,
+        (sx * m0[0], sx * m0[1], sx * m0[2]),
+        (sy * m1[0], sy * m1[1], sy * m1[2]),
+        (sz * m2[0], sz * m2[1], sz * m2[2]),
+    )
+    # Normalisation removes the component along the quaternion, unless the norm was bounded from below.
+    along = gw * qw + gx * qx + gy * qy + gz * qz if norm > QUATERNION_EPSILON else 0.0
+    grad_rotations[g, 0] = (gw - along * qw) / norm
+    grad_rotations[g, 1] = (gx - along * qx) / norm
+    grad_rotations[g, 2] = (gy - along * qy) / norm
+    grad_rotations[g, 3] = (gz - along * qz) / norm
+
+    # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 alike
+    r0 = (
+        v0[0] * axis0[0] + v0[1] * axis1[0] + v0[2] * axis2[0],
+        v0[0] * axis0[1] + v0[1] * axis1[1] + v0[2] * axis2[1],
+        v0[0] * axis0[2] + v0[1] * axis1[2] + v0[2] * axis2[2],
+    )
+    r1 = (
+        v1[0] * axis0[0] + v1[1] * axis1[0] + v1[2] * axis2[0],
+        v1[0] * axis0[1] + v1[1] * axis1[1] + v1[2] * axis2[1],
+        v1[0] * axis0[2] + v1[1] * axis1[2] + v1[2] * axis2[2],
+    )
+    grad_jx = r0[0] * view.w00 + r0[1] * view.w01 + r0[2] * view.w02
+    grad_jxz = r0[0] * view.w20 + r0[1] * view.w21 + r0[2] * view.w22
+    grad_jy = r1[0] * view.w10 + r1[1] * view.w11 + r1[2] * view.w12
+    grad_jyz = r1[0] * view.w20 + r1[1] * view.w21 + r1[2] * view.w22
+    jx, jy, tangent_x, tangent_y = view.fx / z, view.fy / z, x / z, y / z
+    bounded_x = min(max(tangent_x, view.left), view.right)
+    bounded_y = min(max(tangent_y, view.top), view.bottom)
+    grad_tangent_x = grad_mean_x * view.fx - (grad_jxz * jx if bounded_x == tangent_x else 0.0)
+    grad_tangent_y = grad_mean_y * view.fy - (grad_jyz * jy if bounded_y == tangent_y else 0.0)
+    grad_z = (
+        sums[SUM_DEPTH]
+        - (grad_tangent_x * tangent_x + grad_tangent_y * tangent_y) / z
+        - (grad_jx - grad_jxz * bounded_x) * jx / z
+        - (grad_jy - grad_jyz * bounded_y) * jy / z
+    )
+    camera_gradient = (grad_tangent_x / z, grad_tangent_y / z, grad_z)
+
+    dx = np.float64(means[g, 0]) - view.centre_x
+    dy = np.float64(means[g, 1]) - view.centre_y
+    dz = np.float64(means[g, 2]) - view.centre_z
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    direction = (dx / distance, dy / distance, dz / distance)
+    towards = colour_gradient(g, sh, sh_count, splats[g], direction, sums, grad_sh, basis, weights)
+    radial = dot(towards, direction)
+    grad_means[g, 0] = (
+        dot((view.w00, view.w10, view.w20), camera_gradient) + (towards[0] - radial * direction[0]) / distance
+    )
+    grad_means[g, 1] = (
+        dot((view.w01, view.w11, view.w21), camera_gradient) + (towards[1] - radial * direction[1]) / distance
+    )
+    grad_means[g, 2] = (
+        dot((view.w02, view.w12, view.w22), camera_gradient) + (towards[2] - radial * direction[2]) / distance
+    )
+
+
+@device
+def clear_gradients(
+    g: int,
+    grad_means: Floats,
+    grad_log_scales: Floats,
+    grad_rotations: Floats,
+    grad_logits: Floats,
+    grad_sh: Floats,
+) -> None:
+    """Zero gradient for a Gaussian that touches no tile."""
+    grad_means[g, :] = ZERO
+    grad_log_scales[g, :] = ZERO
+    grad_rotations[g, :] = ZERO
+    grad_logits[g] = ZERO
+    for k in range(grad_sh.shape[1]):
+        grad_sh[g, k, 0] = ZERO
+        grad_sh[g, k, 1] = ZERO
+        grad_sh[g, k, 2] = ZERO
+
+
+@kernel
+def backpropagate(
+    means: Floats,
+    log_scales: Floats,
+    rotations: Floats,
+    logits: Floats,
+    sh: Floats,
+    sh_count: int,
+    view: View,
+    antialias: bool,
+    splats: Floats,
+    pair_offsets: Array,
+    pair_sums: Floats,
+    grad_means: Floats,
+    grad_log_scales: Floats,
+    grad_rotations: Floats,
+    grad_logits: Floats,
+    grad_sh: Floats,
+) -> None:
+    """Gradients of the five parameters from the (tile, splat) sums of the rasteriser's backward pass.
+
+    The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``;
+    they are added in their order in float64, so nothing races and nothing depends on the threads.
+    """
+    n = means.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        basis = np.empty(16, np.float32)
+        weights = np.empty(16, np.float32)
+        sums = np.empty(PAIR_COLUMNS, np.float64)
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            begin, end = pair_offsets[g], pair_offsets[g + 1]
+            if begin == end:
+                clear_gradients(g, grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh)
+                continue
+            sums[:] = 0.0
+            for pair in range(begin, end):
+                for column in range(pair_sums.shape[1]):
+                    sums[column] += pair_sums[pair, column]
+            backpropagate_one(
+                g,
+                means,
+                log_scales,
+                rotations,
+                logits,
+                sh,
+                sh_count,
+                view,
+                antialias,
+                splats,
+                sums,
+                grad_means,
+                grad_log_scales,
+                grad_rotations,
+                grad_logits,
+                grad_sh,
+                basis,
+                weights,
+            )
