@@ -63,4 +63,6 @@ def disk_error(error: OSError, path: Path) -> StoreError:
         return StoreError(
             f"cannot write to {path.parent}: {error.strerror}", hint="choose a folder that you may write to"
         )
-    return StoreError(f"cannot write {path}: {error.strerror or error}", hint="check the disk and its permissions")
+    return StoreError(
+        f"cannot write {path}: {error.strerror or error}", hint="check the disk and its permissions"
+    )

@@ -61,7 +61,7 @@ class Assessment:
     stand_in: Bools
     C: Floats
     D: Floats
-    O: Floats  # noqa: E741 - the paper's O
+    O: Floats
     G: Floats
     bin: npt.NDArray[np.int32]
     Z: Floats

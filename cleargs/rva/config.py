@@ -1,4 +1,3 @@
-# ruff: noqa: N815 - tau_R, lambda_G and the like are the paper's symbols and the names in run.toml
 """Settings of the RVA stage: every number of the paper's table tab:rva_params, and what the paper leaves
 open.
 """

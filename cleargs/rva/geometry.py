@@ -128,7 +128,7 @@ def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [
     return largest
 
 
-def geometric_utility(C: Floats, D: Floats, O: Floats, config: RvaConfig) -> Floats:  # noqa: E741 - the paper's O
+def geometric_utility(C: Floats, D: Floats, O: Floats, config: RvaConfig) -> Floats:
     """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 

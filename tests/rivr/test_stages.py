@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from cleargs.stages import consolidate, rivr
 from tiny_capture import (
     MASKED_FRAME,
     ROLES,
@@ -28,6 +27,7 @@ from tiny_capture import (
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.rivr.candidates import fuse
 from cleargs.rivr.tables import REPAIRS, SELECTION, Selection, read_selection, write_selection
+from cleargs.stages import consolidate, rivr
 
 HELD_BACK = 3
 """The middle one of the strong frames 0, 3 and 5."""

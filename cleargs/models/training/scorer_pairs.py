@@ -78,6 +78,15 @@ def load_pairs(folder: Path) -> Pairs:
     return Pairs(images, targets, kinds)
 
 
+def joined(parts: Sequence[Pairs]) -> Pairs:
+    """All groups of ``parts``, in memory."""
+    return Pairs(
+        np.concatenate([part.images for part in parts]),
+        np.concatenate([part.targets for part in parts]),
+        np.concatenate([part.kinds for part in parts]),
+    )
+
+
 def _choose(rng: np.random.Generator, versions: int | None) -> NDArray[np.int64]:
     if versions is None:
         return np.arange(len(KIND_NAMES))
