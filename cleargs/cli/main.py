@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
+    "bench": ("cleargs.cli.bench", "Measure the splatting core on this machine."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
     "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
 }

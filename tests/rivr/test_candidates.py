@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from cleargs.rivr.candidates import fuse, gaussian_blur
+from cleargs.rivr.candidates import Image, fuse, gaussian_blur
 
 
-def noise(seed: int, shape: tuple[int, int, int] = (24, 31, 3)) -> np.ndarray:
-    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+def noise(seed: int) -> Image:
+    return np.random.default_rng(seed).random((24, 31, 3), dtype=np.float32)
 
 
 @given(level=st.floats(0, 1, width=32), sigma=st.floats(0.2, 6))
@@ -24,7 +24,7 @@ def test_a_flat_restoration_adds_nothing(level: float, sigma: float) -> None:
 
 def test_detail_comes_from_the_restoration_and_base_from_the_render() -> None:
     """A render that is the blurred restoration gets exactly its detail back."""
-    restored = 0.25 + 0.5 * noise(1)
+    restored = np.float32(0.25) + np.float32(0.5) * noise(1)
     render = gaussian_blur(restored, 2.0).astype(np.float32)
     np.testing.assert_allclose(fuse(render, restored, 2.0), restored, atol=2e-7)
 

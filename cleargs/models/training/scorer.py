@@ -27,9 +27,9 @@ from torch.nn import functional
 
 from cleargs.models.lpips import load_network, weights_file
 from cleargs.models.registry import model_dir
-from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, Pairs, joined, make_pairs
+from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
 
-HELD_OUT = ("elementary", "mate")
+HELD_OUT = ("budgie", "elementary", "mate")
 _GROUPS_PER_BATCH = 8
 _SHOWN = 4  # versions of a group in one batch
 _HARD = {"oversharp": 4.0, "ringing": 3.0}  # shown more often: they look sharper than the clean version
@@ -315,15 +315,7 @@ def main(
     unseen = [p for p in files if p.name.split("_")[0] in hold_out]
     seen = [p for p in files if p not in unseen]
     test = make_pairs(unseen, lpips, work / "held", contents=5, versions=None, seed=seed + 1000)
-    sources = sorted({p.name.split("_")[0] for p in seen})
-    parts = []
-    for source in sources:
-        own = [p for p in seen if p.name.split("_")[0] == source]
-        # A small source brings a look of its own: up to three times as many patches of each of its photos.
-        share = min(3, max(1, round(len(seen) / len(sources) / len(own))))
-        folder = work / "train" / source
-        parts.append(make_pairs(own, lpips, folder, contents=share * contents, versions=versions, seed=seed))
-    pairs = joined(parts)
+    pairs = make_pairs(seen, lpips, work / "train", contents=contents, versions=versions, seed=seed)
     net = train(
         pairs, seconds=60.0 * minutes, epochs=epochs, seed=seed, checkpoint=work / "scorer.pt", start=start
     )

@@ -78,15 +78,6 @@ def load_pairs(folder: Path) -> Pairs:
     return Pairs(images, targets, kinds)
 
 
-def joined(parts: Sequence[Pairs]) -> Pairs:
-    """All groups of ``parts``, in memory."""
-    return Pairs(
-        np.concatenate([part.images for part in parts]),
-        np.concatenate([part.targets for part in parts]),
-        np.concatenate([part.kinds for part in parts]),
-    )
-
-
 def _choose(rng: np.random.Generator, versions: int | None) -> NDArray[np.int64]:
     if versions is None:
         return np.arange(len(KIND_NAMES))
@@ -114,19 +105,20 @@ def _vary(image: Image, rng: np.random.Generator) -> Image:
     """Another photo of the same thing: other colours, exposure and contrast, often with a part out of focus.
 
     A handful of photo sources look alike in these respects; without this the network learns the look of a
-    source, and takes the soft background of a close-up for a fault.
+    source, and takes the soft background of a close-up, a sky or a plain wall for a fault.
     """
     out = image[..., rng.permutation(3)]
     grey = out.mean(axis=2, keepdims=True)
     out = grey + rng.uniform(0.0, 1.2) * (out - grey)
     out = np.clip(out, 0.0, 1.0) ** np.exp(rng.normal(0.0, 0.35))
-    contrast = rng.uniform(0.4, 1.0)
+    contrast = np.exp(rng.uniform(np.log(0.12), 0.0))
     out = (contrast * out + rng.uniform(0.0, 1.0 - contrast)).astype(np.float32)
-    if rng.random() < 0.4:
-        soft = linear_to_srgb(
-            np.clip(convolve(srgb_to_linear(out), disc_kernel(rng.uniform(1.0, 5.0))), 0.0, 1.0)
-        )
-        out = out + patches(out.shape[0], out.shape[1], rng) * (soft - out)
+    kind = rng.random()
+    if kind < 0.5:
+        radius = rng.uniform(1.0, 5.0) if kind < 0.3 else rng.uniform(3.0, 16.0)
+        soft = convolve(srgb_to_linear(out), disc_kernel(radius))
+        share = patches(out.shape[0], out.shape[1], rng) if kind < 0.3 else np.float32(rng.uniform(0.8, 1.0))
+        out = out + share * (linear_to_srgb(np.clip(soft, 0.0, 1.0)) - out)
     return np.asarray(out, np.float32)
 
 
