@@ -395,7 +395,7 @@ def evaluate_views(
 
 
 class _Progress:
-    """Iterations a second and time left, for the progress bar alone."""
+    """Iterations a second, PSNR and Gaussians, for the progress bar alone (which adds the time left)."""
 
     def __init__(self, task: Task, trainer: Trainer) -> None:
         self._task, self._trainer = task, trainer
@@ -404,11 +404,8 @@ class _Progress:
     def show(self) -> None:
         trainer, elapsed = self._trainer, time.perf_counter() - self._start
         rate = (trainer.done - self._first) / max(elapsed, 1e-9)
-        left = (trainer.total - trainer.done) / max(rate, 1e-9)
-        note = (
-            f"{rate:.1f} it/s, PSNR {trainer.last_psnr:.2f} dB, {trainer.scene.gaussians.num} Gaussians, "
-            f"{left / 60:.1f} min left"
-        )
+        count = trainer.scene.gaussians.num
+        note = f"{rate:.1f} it/s, PSNR {trainer.last_psnr:.2f} dB, {count} Gaussians"
         self._task.update(done=trainer.done, note=note)
 
 
