@@ -176,11 +176,6 @@ class Trainer:
         return None if self._exposure is None else self._exposure.exposure
 
     @property
-    def total(self) -> int:
-        """Steps of the whole training."""
-        return self._config.steps
-
-    @property
     def last_psnr(self) -> float:
         """Mean PSNR over the last 50 steps, dB."""
         recent = self._log["psnr"][max(0, self.done - 50) : self.done]
