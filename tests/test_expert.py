@@ -162,7 +162,7 @@ def test_motion_blur_is_reduced(length: float) -> None:
         blurred = degrade(sharp, Degradation(kernel=motion_kernel(rng, length), noise=0.5 / 255), rng)
         restored = expert.restore(blurred)
         gains.append(psnr(restored[inner], sharp[inner]) - psnr(blurred[inner], sharp[inner]))
-    # Drawings are far from the photographs of the training; measured means over these seeds: 0.61, 0.47, 0.31 dB.
+    # Drawings are unlike the photographs of the training; measured means: 0.61, 0.47 and 0.31 dB.
     assert min(gains) > 0.0
     assert np.mean(gains) > 0.2
 

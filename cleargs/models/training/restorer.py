@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cleargs.errors import InputError
-from cleargs.models.training.degrade import Image, degrade, handheld_degradation
+from cleargs.models.training.degrade import Image, degrade, handheld_degradation, shallow_focus
 from cleargs.models.training.muon import Muon
 
 HELD_OUT = ("budgie", "elementary", "mate")
@@ -39,6 +39,10 @@ STRIDE = 8
 PATCH = 128
 MARGIN = 20
 """Pixels around a patch that only the blur sees: its borders are then true neighbours, not reflections."""
+
+SHALLOW_SHARE = 0.25
+"""Share of the patches that are put out of focus before they count as the truth: the photographs hardly have
+any shallow depth of field, and a network that never saw it takes it for blur."""
 
 BATCH = 8
 LEARNING_RATE = 1e-3
@@ -140,7 +144,7 @@ def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -
     """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each.
 
     Half of the patches are shrunk by up to two, which makes them crisper than the photographs are; of two
-    random places the one with more detail is taken.
+    random places the one with more detail is taken. Defocus is part of the truth (`SHALLOW_SHARE`).
     """
     photo = photos[int(rng.integers(len(photos)))]
     size = PATCH + 2 * MARGIN
@@ -157,6 +161,8 @@ def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -
     if rng.random() < 0.5:
         crop = crop[:, ::-1]
     sharp = crop.astype(np.float32) / np.float32(255.0)
+    if rng.random() < SHALLOW_SHARE:
+        sharp = shallow_focus(sharp, rng)
     blurred = degrade(sharp, handheld_degradation(rng), rng)
     inner = slice(MARGIN, MARGIN + PATCH)
     return blurred[inner, inner], sharp[inner, inner]

@@ -186,7 +186,10 @@ def _batches(pairs: Pairs, epochs: int, seed: int) -> Iterator[tuple[Tensor, Ten
         for start in range(0, len(order) - _GROUPS_PER_BATCH + 1, _GROUPS_PER_BATCH):
             chosen = order[start : start + _GROUPS_PER_BATCH, None]
             # The hard kinds are shown first (exponential races with their weights as rates).
-            races = rng.exponential(size=(_GROUPS_PER_BATCH, versions - 1)) / weights[pairs.kinds[chosen[:, 0], 1:]]
+            races = (
+                rng.exponential(size=(_GROUPS_PER_BATCH, versions - 1))
+                / weights[pairs.kinds[chosen[:, 0], 1:]]
+            )
             shown = np.argsort(races, axis=1)[:, : _SHOWN - 1] + 1
             shown = np.concatenate([np.zeros_like(shown[:, :1]), shown], axis=1)
             images = torch.from_numpy(pairs.images[chosen, shown]).permute(0, 1, 4, 2, 3).float() / 255.0
