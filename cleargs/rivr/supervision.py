@@ -15,7 +15,8 @@ from cleargs.rva.tables import FRAMES
 from cleargs.splat.views import View, view_of
 from cleargs.tables import read_table
 
-_APPRAISED = pa.schema([FRAMES.field(name) for name in ("frame_id", "R", "B", "role", "stand_in", "weight")])
+_COLUMNS = ("frame_id", "R", "B", "role", "reliable", "stand_in", "weight")
+_APPRAISED = pa.schema([FRAMES.field(name) for name in _COLUMNS])
 
 
 @dataclass(frozen=True)
@@ -61,5 +62,5 @@ def load_supervision(ingest: Path, rva: Path) -> Supervision:
     views = {a.frame_id: view_of(frames[a.frame_id], ingest, weights[a.frame_id]) for a in appraisals}
     held_back = held_back_frames(appraisals)
     if not held_back:
-        raise StageError("no frame is strong and none stands in", hint="run rva again with --force rva")
+        raise StageError("no frame is reliable and none stands in", hint="run rva again with --force rva")
     return Supervision(views, appraisals, held_back)

@@ -17,6 +17,8 @@ class Appraisal:
     R: float
     B: float
     role: str
+    reliable: bool
+    """With RVA on, the strong frames; in the all-view ablation, where all are strong, the sharp ones."""
     stand_in: bool
     """No frame is reliable, and this one is among the best by R - B."""
 
@@ -35,12 +37,12 @@ def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collec
 
 
 def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
-    """A fixed eighth (at least one) of the strong frames, spread evenly over them; in order.
+    """A fixed eighth (at least one) of the reliable frames, spread evenly over them; in order.
 
-    Where no frame is strong, the stand-in set takes their place. These frames are kept from distillation, raw
-    and repaired, and judge its result. Empty when RVA names neither.
+    Where no frame is reliable, the stand-in set takes their place. These frames are kept from distillation,
+    raw and repaired, and judge its result. Empty when RVA names neither.
     """
-    references = [frame.frame_id for frame in frames if frame.role == "strong"]
+    references = [frame.frame_id for frame in frames if frame.reliable]
     if not references:
         references = [frame.frame_id for frame in frames if frame.stand_in]
     if not references:

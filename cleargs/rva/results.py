@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.rva.allocation import Role, effective_sample_size
 from cleargs.rva.assessment import Assessment, Poses
-from cleargs.rva.scores import Bools, Floats
+from cleargs.rva.scores import Floats
 from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
 
 _WEIGHT_STEPS = 10
@@ -101,16 +101,6 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
         },
         schema=BINS,
     )
-
-
-def reference_frames(table: pa.Table) -> npt.NDArray[np.int32]:  # rows of FRAMES -> frame ids
-    """The frames on which do-no-harm is measured: the reliable ones, or their stand-ins where there are none.
-
-    With RVA enabled the reliable frames are exactly the strong ones; in the all-view ablation, where every
-    frame is strong, they remain the ones that can be trusted.
-    """
-    chosen: Bools = table.column("reliable").to_numpy() | table.column("stand_in").to_numpy()
-    return np.asarray(table.column("frame_id").to_numpy()[chosen])
 
 
 def summary(result: Assessment, evaluator: str) -> dict[str, Any]:

@@ -10,7 +10,9 @@ from cleargs.rivr.targets import Appraisal, held_back_frames, target_frames
 def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[Appraisal]:
     """One frame a role, with ids 10, 11, ..."""
     return [
-        Appraisal(10 + k, R=0.5, B=0.5, role=role, stand_in=10 + k in (stand_in or set()))
+        Appraisal(
+            10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", stand_in=10 + k in (stand_in or set())
+        )
         for k, role in enumerate(roles)
     ]
 

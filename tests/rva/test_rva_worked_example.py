@@ -9,7 +9,7 @@ from rva_scenes import BACKWARD, FORWARD, along_x, observations_of, poses_at, un
 from cleargs.rva.allocation import effective_sample_size
 from cleargs.rva.assessment import Assessment, assess
 from cleargs.rva.config import RvaConfig
-from cleargs.rva.results import bins_table, frames_table, reference_frames, summary
+from cleargs.rva.results import bins_table, frames_table, summary
 from cleargs.rva.tables import CUE_COLUMNS
 
 FRAME_ID = np.arange(5, dtype=np.int32)
@@ -121,7 +121,6 @@ def test_tables(result: Assessment) -> None:
     frames = frames_table(FRAME_ID, [f"{k}.png" for k in FRAME_ID], "hand-1", cues(), result)
     assert tuple(frames.column_names[3:14]) == CUE_COLUMNS
     assert frames.column("weight").to_pylist() == result.weight.tolist()
-    assert reference_frames(frames).tolist() == [0]
     bins = bins_table(FRAME_ID, result).to_pylist()
     assert [row["n_frames"] for row in bins] == [3, 2]
     assert [row["n_active"] for row in bins] == [3, 1]
