@@ -225,6 +225,7 @@ def test_heads_equal_those_of_the_lpips_package(net: Any) -> None:
         pytest.skip("LPIPS is not installed (cleargs models install lpips)")
     spec = find_spec("lpips")
     assert spec is not None and spec.origin is not None
-    original = torch.load(Path(spec.origin).parent / "weights" / "v0.1" / f"{net}.pth", weights_only=True)
+    file = Path(spec.origin).parent / "weights" / "v0.1" / f"{net}.pth"
+    original = torch.load(file, map_location="cpu", weights_only=True)
     for index, head in enumerate(load_network(net, path).heads):
         assert torch.equal(head.get_parameter("weight"), original[f"lin{index}.model.1.weight"])
