@@ -47,7 +47,7 @@ _STREAM = 6
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
     """The scorer's model file, whose content enters the key."""
-    from cleargs.rivr.model_files import scorer_path
+    from cleargs.models.scorer import scorer_path
 
     path = scorer_path(config.scorer)
     return {} if path is None else {"scorer": path}

@@ -41,7 +41,7 @@ _STREAM = 5
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
     """The model files, whose content enters the key."""
     from cleargs.models.expert import expert_path
-    from cleargs.rivr.model_files import scorer_path
+    from cleargs.models.scorer import scorer_path
 
     files = {
         "expert": expert_path(config.expert),

@@ -23,7 +23,7 @@ def refusal(mask: NDArray[np.bool_] | None) -> str | None:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How well a scene explains the frames that were held back from distillation."""
+    """How well a scene explains the frames that were held back from repair."""
 
     psnr: tuple[float, ...]
     """Of each frame's render against its raw observation, dB."""

@@ -26,12 +26,12 @@ class Supervision:
     views: dict[int, View]
     appraisals: list[Appraisal]
     held_back: list[int]
-    """Frames kept from distillation, raw and repaired, to measure harm."""
+    """Frames that get no repairs, to measure whether those of the others do harm."""
 
     @property
     def real(self) -> list[View]:
-        """The raw frames that supervise distillation: D_real, active and not held back."""
-        return [v for v in self.views.values() if v.weight > 0.0 and v.frame_id not in self.held_back]
+        """The active raw frames: D_real, the held-back ones among them, as for G0."""
+        return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
     def judges(self) -> list[View]:

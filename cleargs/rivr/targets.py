@@ -39,8 +39,8 @@ def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collec
 def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
     """A fixed eighth (at least one) of the reliable frames, spread evenly over them; in order.
 
-    Where no frame is reliable, the stand-in set takes their place. These frames are kept from distillation,
-    raw and repaired, and judge its result. Empty when RVA names neither.
+    Where no frame is reliable, the stand-in set takes their place. These frames get no repairs, and judge
+    the scene distilled from those of the others. Empty when RVA names neither.
     """
     references = [frame.frame_id for frame in frames if frame.reliable]
     if not references:
