@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 
 SINGLE_FOCAL = frozenset(

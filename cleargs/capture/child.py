@@ -88,7 +88,8 @@ def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporte
             failure = _follow(child, reporter)
             status = child.wait()
         except BaseException:
-            os.killpg(child.pid, signal.SIGKILL)
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)
             raise
     if failure is not None:
         raise failure

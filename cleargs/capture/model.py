@@ -68,8 +68,9 @@ def read_model(folder: Path) -> SparseModel:
             return _read_binary(folder)
         return _read_text(folder)
     except (OSError, struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
+        reason = "a file breaks off" if isinstance(error, struct.error) else error
         raise InputError(
-            f"cannot read the COLMAP model in {folder}: {error}",
+            f"cannot read the COLMAP model in {folder}: {reason}",
             hint="export cameras, images and points3D again, all binary or all text, or set ingest.poses=sfm",
         ) from error
 

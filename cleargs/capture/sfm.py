@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.child import run_child
+from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import IngestConfig
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from cleargs.capture.child import ChildChannel
+from cleargs.capture.colmap import pycolmap
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
 
 _PAIRS_PER_BLOCK = 100
@@ -34,6 +34,14 @@ def main() -> int:
     database = folder / "database.db"
     _import(job, database)
     _extract(job, database, channel)
+    with pycolmap.Database.open(database) as opened:
+        featureless = opened.num_keypoints() == 0
+    if featureless:
+        channel.error(
+            "no features were found in any frame",
+            "the frames need texture and light, and masks must leave some of them",
+        )
+        return 3
     _match(job, database, channel)
     partial = folder / "model.partial"
     shutil.rmtree(partial, ignore_errors=True)

@@ -38,10 +38,15 @@ def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, dict) or "frames" not in data:
+            raise ValueError("it has no 'frames'")
         entries = data["frames"]
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise ValueError("'frames' is not a list of objects")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        unnamed = [number for number, entry in enumerate(entries) if "file_path" not in entry]
+        if unnamed:
+            raise ValueError(f"frames[{unnamed[0]}] has no file_path")
+    except (OSError, ValueError) as error:
         raise InputError(
             f"cannot read {path}: {error}",
             hint="it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it",

@@ -9,6 +9,7 @@ import click
 
 from cleargs.cli.common import run_argument
 from cleargs.errors import InputError
+from cleargs.files import disk_error
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.manifest import linked_manifest
 
@@ -57,7 +58,10 @@ def export(dag: Dag, run: Path, kind: Literal["ply"], world: str, chosen: str | 
             rotation=np.array(similarity["rotation"], dtype=np.float64),
             translation=np.array(similarity["translation"], dtype=np.float64),
         )
-    output.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(error, output) from error
     write_ply(output, scene)
     click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {world} world")
 

@@ -8,7 +8,7 @@ import threading
 import time
 from types import FrameType
 
-GRACE = 1.5
+GRACE = 1.0
 """Seconds that the ordinary way out may take."""
 
 MESSAGE = b"interrupted; what is done is kept, and the same command goes on from there\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -80,7 +81,13 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None
 
     given = list(sys.argv[1:] if arguments is None else arguments)
     answer_signals()
-    sys.exit(invoke(given, dag))
+    code = invoke(given, dag)
+    if code == INTERRUPTED:
+        # Taking torch and Numba down in order may take seconds, and nothing waits for it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def invoke(arguments: list[str], dag: Dag | None = None) -> int:

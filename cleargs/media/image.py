@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from cleargs.files import write_bytes
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 """File endings (lower case) taken for images."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -67,10 +70,11 @@ def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
         ) from error
     if data.size == 0:
         raise InputError(f"{path} is empty (zero bytes)", hint="remove the file, or copy it again")
-    try:
-        image = cv2.imdecode(data, flags)
-    except cv2.error:
-        image = None
+    image = None
+    # libpng would tell of a file that breaks off on stderr.
+    if not (data[:8].tobytes() == _PNG and b"IEND" not in data.tobytes()):
+        with suppress(cv2.error):
+            image = cv2.imdecode(data, flags)
     if image is None:
         raise InputError(
             f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"

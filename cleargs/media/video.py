@@ -27,6 +27,8 @@ from cleargs.media.image import to_uint8
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}
 _FULL_RANGE = 2
+_SLACK_S, _SLACK = 0.5, 0.02
+"""By how much a video may end before its container says, s and as a share: frame durations are rounded."""
 _HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
 
 
@@ -53,18 +55,23 @@ def read_timeline(path: Path) -> Timeline:
     """
     with _open(path) as (container, stream):
         pts: list[int] = []
+        end = 0
         for packet in container.demux(stream):
             if packet.is_corrupt:
                 raise _broken(path, len(pts), stream)
             # Discarded packets (before an edit list's start) are decoded but never shown.
             if packet.pts is not None and packet.size and not packet.is_discard:
                 pts.append(packet.pts)
+                end = max(end, packet.pts + (packet.duration or 0))
         if not pts:
             raise InputError(f"{path.name} has no frames", hint=_HINT)
         if stream.frames > len(pts) + 1 and not _edited(stream):
             raise _broken(path, len(pts), stream)
-        transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
         assert stream.time_base is not None
+        stated = _stated_seconds(container, stream)
+        if stated - float(end * stream.time_base) > max(_SLACK_S, _SLACK * stated):
+            raise _broken(path, len(pts), stream)
+        transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
         return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
 
 
@@ -136,6 +143,16 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     except (av.error.FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path.name} cannot be read as a video: {reason}", hint=_HINT) from error
+
+
+def _stated_seconds(container: InputContainer, stream: VideoStream) -> float:
+    """Until when a Matroska video should last, s; 0 where the file does not say, or counts its frames anyway.
+
+    Its one length is that of the longest stream, so it speaks for the video only where that is alone.
+    """
+    if stream.frames or not container.format.name.startswith("matroska") or len(container.streams) > 1:
+        return 0.0
+    return float((container.duration or 0) / av.time_base)
 
 
 def _broken(path: Path, frames: int, stream: VideoStream) -> InputError:

@@ -173,9 +173,15 @@ def _setting_error(
         siblings = owner.model_fields if owner is not None else {}
         return _unknown(parts[-1], ".".join([section, *parts[:-1]]) + ".", siblings, models)
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "model_type":
+        return ConfigError(
+            f"{name} = {first['input']!r} cannot be used",
+            hint=f"{name} is a table of settings: name one of them, {name}.{_first_name(model, parts)} say",
+        )
     if not parts:
         return ConfigError(f"{section}: {message}", hint=f"change the settings of [{section}]")
-    allowed = _allowed(field) if field is not None else message
+    # A validator of ours says more than the type does.
+    allowed = _allowed(field) if field is not None and first["type"] != "value_error" else ""
     hint = f"allowed: {allowed}" if allowed else message[:1].lower() + message[1:]
     return ConfigError(f"{name} = {first['input']!r} cannot be used", hint=hint)
 
@@ -192,6 +198,13 @@ def _unknown(
         near = [by_last[found] for found in get_close_matches(name, by_last, n=1)]
     hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(prefix + known for known in siblings)}"
     return ConfigError(f"there is no setting {prefix}{name}", hint=hint)
+
+
+def _first_name(model: type[BaseModel], parts: Sequence[str]) -> str:
+    """The first setting of the table at ``parts`` below ``model``."""
+    _, field = _locate(model, parts)
+    inner = model if field is None else _inner_model(field) or model
+    return next(iter(inner.model_fields))
 
 
 def _names(model: type[BaseModel], prefix: str = "") -> Iterator[str]:

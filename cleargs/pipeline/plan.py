@@ -89,21 +89,14 @@ class Planner:
                 origins[f"{upstream}/{path}"] = files
                 inputs[upstream][path] = tree_digest(files) if files else None
         external_files = dict(stage.externals(config, self.run.source))
-        externals = {}
-        for role, place in external_files.items():
-            if self.run.folder.is_relative_to(place):
-                raise InputError(
-                    f"the run folder {self.run.folder} lies inside the input {place}",
-                    hint="choose a folder beside the input with -o",
-                )
-            origins[role] = self.store.memo.digests_of(place)
-            externals[role] = tree_digest(origins[role])
+        digests = self._external_digests(external_files)
+        origins.update(digests)
         parts = KeyParts(
             stage=name,
             version=stage.VERSION,
             config=key_config(config),
             inputs=inputs,
-            externals=externals,
+            externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device,
             libraries=library_versions(stage.LIBRARIES),
@@ -120,6 +113,16 @@ class Planner:
             )
         )
         return Recipe(parts, origins, external_files, folders, inherited)
+
+    def _external_digests(self, places: Mapping[str, Path]) -> dict[str, dict[str, str]]:
+        """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
+        hint = "choose a folder beside the input with -o"
+        if self.run.folder == self.run.source:
+            raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
+        for place in places.values():
+            if self.run.folder.is_relative_to(place):
+                raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
+        return {role: self.store.memo.digests_of(place) for role, place in places.items()}
 
     def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
@@ -167,12 +170,17 @@ class Planner:
         )
 
     def plan(self, until: str | None = None, force: tuple[str, ...] = ()) -> list[StagePlan]:
-        """The state of each stage up to ``until``."""
+        """The state of each stage up to ``until``.
+
+        Raises InputError when an external of any of them cannot be read: better now than after hours of work.
+        """
         plans: list[StagePlan] = []
         done: dict[str, Manifest] = {}
         for name in self.dag.until(until):
             waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
             if waits_for:
+                stage = self.dag.load(name)
+                self._external_digests(stage.externals(self.run.config.sections[name], self.run.source))
                 reason = f"waits for {', '.join(waits_for)}"
                 plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
                 continue

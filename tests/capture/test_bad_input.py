@@ -13,7 +13,10 @@ import pytest
 
 from cleargs.capture.config import IngestConfig
 from cleargs.capture.sources import open_capture
-from cleargs.errors import CleargsError, InputError
+from cleargs.errors import CleargsError, ConfigError, InputError, StageError
+from cleargs.media.image import read_rgb
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
 
 from .conftest import HEIGHT, WIDTH, Ingest, camera_to_world, write_transforms
 
@@ -42,7 +45,8 @@ def edit_transforms(folder: Path, change: Any) -> None:
         (lambda d: d["frames"][3].__setitem__("transform_matrix", "none"), "matrix of numbers"),
         (lambda d: d["frames"][3].__setitem__("transform_matrix", np.zeros((4, 4)).tolist()), "rotation"),
         (lambda d: d["frames"][3].__setitem__("file_path", "images/nowhere.png"), "images/nowhere.png"),
-        (lambda d: d.pop("frames"), "frames"),
+        (lambda d: d.pop("frames"), "it has no 'frames'"),
+        (lambda d: d["frames"][3].pop("file_path"), r"frames\[3\] has no file_path"),
         (lambda d: d.__setitem__("frames", 7), "frames"),
         (lambda d: d.__setitem__("fl_x", "long"), "camera"),
         (lambda d: d.__setitem__("fl_x", -5), "focal length"),
@@ -137,3 +141,38 @@ def test_inputs_stay_as_they_are(posed: Path, ingest: Ingest) -> None:
         path: (path.stat().st_mtime_ns, path.read_bytes()) for path in posed.rglob("*") if path.is_file()
     }
     assert before == after
+
+
+@pytest.mark.parametrize("shade", [0, 128])
+def test_textureless_frames(posed: Path, images: Path, ingest: Ingest, shade: int) -> None:
+    for folder in (posed / "images", images):
+        for path in folder.iterdir():
+            cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), shade, np.uint8))
+    for number, source in enumerate((posed, images)):
+        with pytest.raises(StageError, match="no features were found") as caught:
+            ingest(source, f"out{number}")
+        assert refused(caught)
+
+
+def test_png_that_breaks_off_is_told_once(images: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = images / "view3.png"
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(InputError, match="not an image that can be read"):
+        read_rgb(path)
+    assert capfd.readouterr().err == "", "libpng has its own complaint"
+
+
+def test_empty_colmap_files(posed: Path, ingest: Ingest) -> None:
+    (posed / "transforms.json").unlink()
+    model = posed / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras", "images", "points3D"):
+        (model / f"{name}.bin").write_bytes(b"")
+    with pytest.raises(InputError, match="a file breaks off"):
+        ingest(posed)
+
+
+def test_holdout_says_what_it_takes() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(installed(), overrides=["ingest.holdout=evry:3"])
+    assert "every:N" in caught.value.hint

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from cleargs.capture import child
 from cleargs.capture.child import run_child
 from cleargs.errors import StageError
 from cleargs.progress import SilentReporter
@@ -113,3 +114,31 @@ while True:
         assert gone(child)
     finally:
         parent.kill()
+
+
+def test_interrupted_when_the_child_has_just_ended(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is nobody left to kill: the interrupt must arrive, and no complaint about that."""
+
+    def follow(process: subprocess.Popen[str], reporter: object) -> None:
+        process.wait()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(child, "_follow", follow)
+    module.write_text(PREAMBLE)
+    with pytest.raises(KeyboardInterrupt):
+        run(module)
+
+
+@pytest.mark.parametrize("importer", ["cameras", "sfm", "sfm_worker"])
+def test_importing_colmap_leaves_signals_as_they_are(importer: str) -> None:
+    """pycolmap's glog would print a stack trace at SIGTERM and die of it."""
+    program = (
+        "import os, signal, time\n"
+        "def answer(number, frame): raise KeyboardInterrupt\n"
+        "signal.signal(signal.SIGTERM, answer)\n"
+        f"import cleargs.capture.{importer}\n"
+        "try: os.kill(os.getpid(), signal.SIGTERM); time.sleep(5)\n"
+        "except KeyboardInterrupt: print('answered')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "answered\n", "")

@@ -229,6 +229,17 @@ def test_truncated_video(tmp_path: Path, faststart: bool) -> None:
         read_timeline(cut)
 
 
+def test_truncated_matroska(tmp_path: Path) -> None:
+    """The demuxer ends quietly where the file does; only the stated length tells."""
+    whole, cut = tmp_path / "whole.mkv", tmp_path / "cut.mkv"
+    encode(whole, bar_planes("bt709", False), pts=tuple(range(0, 360, 3)))
+    assert len(read_timeline(whole).pts) == 120
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="breaks off after"):
+        read_timeline(cut)
+
+
 def test_not_a_video(tmp_path: Path) -> None:
     path = tmp_path / "notes.mp4"
     path.write_text("these are notes")

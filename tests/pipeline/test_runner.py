@@ -242,3 +242,15 @@ def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
     with pytest.raises(InputError, match="lies inside the input"):
         Planner(bench.dag, inside, store, 1, bench.remarks).plan()
+    at_it = replace(bench.settings(), folder=bench.capture, source=bench.capture)
+    with pytest.raises(InputError, match="is the input itself"):
+        Planner(bench.dag, at_it, store, 1, bench.remarks).plan()
+
+
+def test_missing_file_of_a_late_stage_is_noticed_before_work(bench: Bench, tmp_path: Path) -> None:
+    stages = {name: bench.dag.load(name) for name in bench.dag.names}
+    nowhere = {"weights": tmp_path / "nowhere.onnx"}
+    object.__setattr__(stages["total"], "externals", lambda config, source: nowhere)
+    with pytest.raises(InputError, match=r"nowhere\.onnx"):
+        bench.run()
+    assert bench.work_done() == [] and not bench.folder.exists()

@@ -73,7 +73,12 @@ def test_merge_keeps_what_is_not_named() -> None:
         ("count.inner.depth=0", "count.inner.depth = 0 cannot be used", "at least 1 and at most 9"),
         ("total.offset=many", "total.offset = 'many' cannot be used", "a number, at least -1"),
         ("count.mode=pad", "count.mode = 'pad' cannot be used", "allowed: plain or padded"),
-        ("count=3", "count", "change the settings of [count]"),
+        (
+            "count=3",
+            "count = 3 cannot be used",
+            "count is a table of settings: name one of them, count.limit",
+        ),
+        ("count.inner=3", "count.inner = 3 cannot be used", "name one of them, count.inner.depth"),
         ("seed=-1", "seed = -1 cannot be used", "a whole number from 0"),
         ("seed=true", "seed = True cannot be used", "a whole number from 0"),
     ],
