@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
+from cleargs.media.colour import linear_from_srgb
 from cleargs.models.expert import OnnxExpert, expert_path, load_expert
 from cleargs.models.onnx import OnnxModel
 from cleargs.models.tiling import apply_tiled, plan_axis
@@ -162,7 +163,7 @@ def test_motion_blur_is_reduced(length: float) -> None:
         blurred = degrade(sharp, Degradation(kernel=motion_kernel(rng, length), noise=0.5 / 255), rng)
         restored = expert.restore(blurred)
         gains.append(psnr(restored[inner], sharp[inner]) - psnr(blurred[inner], sharp[inner]))
-    # Drawings are unlike the photographs of the training; measured means: 0.61, 0.47 and 0.31 dB.
+    # Drawings are unlike the photographs of the training; measured means: 0.67, 0.56 and 0.37 dB.
     assert min(gains) > 0.0
     assert np.mean(gains) > 0.2
 
@@ -258,8 +259,8 @@ def test_blur_keeps_light() -> None:
     image[40:56, 40:56] = 0.9
     kernel = motion_kernel(np.random.default_rng(1), 15.0)
     blurred = degrade(image, Degradation(kernel=kernel, quantise=False), np.random.default_rng(2))
-    light = degradations.srgb_to_linear(image).mean(dtype=np.float64)
-    assert degradations.srgb_to_linear(blurred).mean(dtype=np.float64) == pytest.approx(light, rel=1e-4)
+    light = linear_from_srgb(image).mean(dtype=np.float64)
+    assert linear_from_srgb(blurred).mean(dtype=np.float64) == pytest.approx(light, rel=1e-4)
     assert blurred.mean() > image.mean() * 1.05
 
 

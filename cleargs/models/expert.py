@@ -98,10 +98,10 @@ class OnnxExpert:
 
 
 def expert_path(spec: str) -> Path:
-    """The ONNX file of an expert: ``embedded`` is the one that ships, anything else is a path."""
+    """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, anything else is a path."""
     if spec == EMBEDDED:
-        return Path(str(files("cleargs.models"))) / "weights" / "restorer.onnx"
-    return Path(spec)
+        return Path(str(files("cleargs.models"))).absolute() / "weights" / "restorer.onnx"
+    return Path(spec).absolute()
 
 
 def load_expert(spec: str) -> Expert:

@@ -4,7 +4,7 @@ RIVR asks two of them: the primary one decides between candidates, the other bre
 MUSIQ and CLIP-IQA). The two that ship with ClearGS were trained for it and bear their own names.
 
 Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a
-strongly blurred frame lies near 70, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
+frame with 4-12 px of blur lies near 87, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError
-from cleargs.models.naturalness import StatisticsScorer
+from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import OnnxModel
 from cleargs.models.tile_mean import Image, mean_over_tiles
 
@@ -84,18 +84,29 @@ class LearnedScorer:
         return float(self._model.run(planes)[0].ravel()[0])
 
 
+def scorer_path(spec: str) -> Path | None:
+    """The file, absolute, that holds the weights of the scorer that a setting names; None for no such name.
+
+    Its content stands for the scorer in the keys of the store. It need not exist.
+    """
+    models = Path(str(files("cleargs.models"))).absolute()
+    if spec == CLARITY:
+        return models / "weights" / "scorer.onnx"
+    if spec == NATURALNESS:
+        return models / COEFFICIENTS
+    return Path(spec).absolute() if spec.endswith(".onnx") else None
+
+
 def load_scorer(spec: str) -> Scorer:
     """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, or the path of an ONNX file.
 
     Raises InputError for any other name or an unusable file.
     """
-    if spec == CLARITY:
-        weights = files("cleargs.models") / "weights" / "scorer.onnx"
-        return LearnedScorer(Path(str(weights)), CLARITY, _TRAINED_ON)
+    path = scorer_path(spec)
     if spec == NATURALNESS:
         return StatisticsScorer(NATURALNESS)
-    if spec.endswith(".onnx"):
-        return LearnedScorer(Path(spec))
+    if path is not None:
+        return LearnedScorer(path, CLARITY, _TRAINED_ON) if spec == CLARITY else LearnedScorer(path)
     raise InputError(
         f"no scorer is called {spec!r}", hint=f"use {CLARITY}, {NATURALNESS} or the path of an .onnx file"
     )

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.training.degrade import (
     Degradation,
     Image,
@@ -23,9 +24,7 @@ from cleargs.models.training.degrade import (
     degrade,
     disc_kernel,
     jpeg,
-    linear_to_srgb,
     motion_kernel,
-    srgb_to_linear,
 )
 
 
@@ -55,11 +54,11 @@ def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
 
 def ghost(image: Image, dx: float, dy: float, share: float) -> Image:
     """A second exposure, shifted by (dx, dy) pixels, that takes ``share`` of the (linear) light."""
-    linear = srgb_to_linear(image)
+    linear = linear_from_srgb(image)
     shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
     size = (image.shape[1], image.shape[0])
     moved = cv2.warpAffine(linear, shift, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    return linear_to_srgb(_clip((1.0 - share) * linear + share * moved))
+    return srgb_from_linear(_clip((1.0 - share) * linear + share * moved))
 
 
 def splat(image: Image, rng: np.random.Generator, spacing: float, stretch: float) -> Image:

@@ -19,21 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+
 Image: TypeAlias = NDArray[np.float32]
 Kernel: TypeAlias = NDArray[np.float32]
 
 IDENTITY: Kernel = np.ones((1, 1), np.float32)
-
-
-def srgb_to_linear(image: Image) -> Image:
-    """IEC 61966-2-1 decoding of sRGB values in [0, 1], any shape."""
-    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(image: Image) -> Image:
-    """IEC 61966-2-1 encoding of linear values in [0, 1], any shape."""
-    curve = 1.055 * np.maximum(image, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(image <= 0.0031308, image * 12.92, curve).astype(np.float32)
 
 
 def line_path(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -143,12 +134,12 @@ def degrade(image: Image, degradation: Degradation, rng: np.random.Generator) ->
     if degradation.kernel.shape == (1, 1) and degradation.second is None:
         out = image
     else:
-        linear = srgb_to_linear(image)
+        linear = linear_from_srgb(image)
         blurred = convolve(linear, degradation.kernel)
         if degradation.second is not None:
             ramp = _ramp(image.shape[0], image.shape[1], degradation.direction)
             blurred = blurred + ramp[..., None] * (convolve(linear, degradation.second) - blurred)
-        out = linear_to_srgb(np.clip(blurred, 0.0, 1.0))
+        out = srgb_from_linear(np.clip(blurred, 0.0, 1.0))
     if degradation.noise > 0.0:
         out = out + np.float32(degradation.noise) * rng.standard_normal(image.shape, np.float32)
     out = np.clip(out, np.float32(0.0), np.float32(1.0))
@@ -175,7 +166,7 @@ def shallow_focus(image: Image, rng: np.random.Generator) -> Image:
     of depth to the outline of an object. Two discs in sequence, the first of 1-10 px radius and the second
     smaller, give profiles from a hard disc to a soft one.
     """
-    linear = srgb_to_linear(image)
+    linear = linear_from_srgb(image)
     radius = np.exp(rng.uniform(0.0, np.log(10.0)))
     blurred = convolve(convolve(linear, disc_kernel(radius)), disc_kernel(radius * rng.random()))
     if rng.random() < 0.5:
@@ -184,7 +175,7 @@ def shallow_focus(image: Image, rng: np.random.Generator) -> Image:
         steepness = np.float32(np.exp(rng.uniform(np.log(0.5), np.log(20.0))))
         mask = np.clip(0.5 + steepness * relief, 0.0, 1.0)[..., None]
         blurred = linear + mask * (blurred - linear)
-    return linear_to_srgb(np.clip(blurred, 0.0, 1.0))
+    return srgb_from_linear(np.clip(blurred, 0.0, 1.0))
 
 
 def handheld_degradation(rng: np.random.Generator) -> Degradation:

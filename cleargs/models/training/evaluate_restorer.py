@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.expert import EMBEDDED, load_expert
 from cleargs.models.training.degrade import (
     IDENTITY,
@@ -32,9 +33,7 @@ from cleargs.models.training.degrade import (
     Image,
     Kernel,
     degrade,
-    linear_to_srgb,
     motion_kernel,
-    srgb_to_linear,
 )
 from cleargs.models.training.restorer import list_photos, read_photo, source_of
 
@@ -82,7 +81,7 @@ def unsharp_mask(image: Image, sigma: float, amount: float) -> Image:
 def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
     """Wiener deconvolution in linear light: spectrum times conj(K) / (|K|² + noise_to_signal)."""
     reach = 2 * kernel.shape[0]
-    padded = np.pad(srgb_to_linear(image), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
+    padded = np.pad(linear_from_srgb(image), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
     shape = padded.shape[:2]
     centred = np.zeros(shape)
     centred[: kernel.shape[0], : kernel.shape[1]] = kernel
@@ -91,7 +90,7 @@ def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
     inverse = np.conj(spectrum) / (np.abs(spectrum) ** 2 + noise_to_signal)
     restored = np.fft.irfft2(np.fft.rfft2(padded, axes=(0, 1)) * inverse[..., None], s=shape, axes=(0, 1))
     inner = np.clip(restored[reach:-reach, reach:-reach], 0.0, 1.0).astype(np.float32)
-    return linear_to_srgb(inner)
+    return srgb_from_linear(inner)
 
 
 def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:

@@ -32,8 +32,10 @@ from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_
 HELD_OUT = ("budgie", "elementary", "mate")
 _GROUPS_PER_BATCH = 8
 _SHOWN = 4  # versions of a group in one batch
-_HARD = {"oversharp": 4.0, "ringing": 3.0}  # shown more often: they look sharper than the clean version
-_TOLERANCE = 0.005  # versions whose LPIPS differ by less are not asked to be in order
+_HARD = {"oversharp": 2.0, "ringing": 2.0}  # shown more often: they look sharper than the clean version
+_TOLERANCE = 0.003  # faulty versions whose LPIPS differ by less are not asked to be in order
+_CLEAN_FIRST = 3.0  # weight of the clean version's place, however small the other's fault
+_TEMPERATURE = 0.03  # of the logistic losses, in LPIPS
 
 
 class QualityNet(nn.Module):
@@ -70,6 +72,14 @@ class QualityNet(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
+        return self.judge(self.statistics(images))
+
+    def judge(self, statistics: Tensor) -> Tensor:
+        """The prediction [N] from the statistics of an image [N, F]."""
+        return functional.softplus(self.head(statistics)[:, 0] - 1.5)
+
+    def statistics(self, images: Tensor) -> Tensor:
+        """Mean and deviation of every stage's channels. [N, F]"""
         x = self._normalised(images)
         statistics = []
         for stage in self.stages:
@@ -77,7 +87,7 @@ class QualityNet(nn.Module):
             centre = x.mean(dim=(2, 3))
             spread = ((x - centre[:, :, None, None]).square().mean(dim=(2, 3)) + 1e-6).sqrt()
             statistics += [centre, spread]
-        return functional.softplus(self.head(torch.cat(statistics, dim=1))[:, 0] - 1.5)
+        return torch.cat(statistics, dim=1)
 
     def _normalised(self, images: Tensor) -> Tensor:
         ycc = functional.conv2d(images, self.colour)
@@ -124,10 +134,13 @@ def train(
     seed: int,
     checkpoint: Path,
     start: Path | None = None,
+    rate: float = 2e-3,
+    head_only: bool = False,
 ) -> QualityNet:
     """AdamW with a one-cycle rate; ends after ``epochs``, or earlier when ``seconds`` are over.
 
-    ``start`` is a checkpoint of an earlier training to go on from (with a rate cycle of its own).
+    ``start`` is a checkpoint of an earlier training to go on from (with a rate cycle of its own, which peaks
+    at ``rate``). ``head_only`` leaves the convolutions as they are.
     Returns the running average of the weights, ready for inference; now and then it is saved to
     ``checkpoint``.
     """
@@ -136,7 +149,10 @@ def train(
     if start is not None:
         net.load_state_dict(torch.load(start, weights_only=True))
     average = copy.deepcopy(net)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=1.0, weight_decay=0.03)
+    if head_only:
+        net.stages.eval().requires_grad_(False)
+    trained = [p for p in net.parameters() if p.requires_grad]
+    optimiser = torch.optim.AdamW(trained, lr=1.0, weight_decay=0.03)
     steps = epochs * (len(pairs.images) // _GROUPS_PER_BATCH)
     begin = time.monotonic()
     for step, batch in enumerate(_batches(pairs, epochs, seed)):
@@ -144,7 +160,7 @@ def train(
         if progress >= 1.0:
             break
         for group in optimiser.param_groups:
-            group["lr"] = _rate(progress)
+            group["lr"] = rate * _cycle(progress)
         images, targets = batch
         loss = _loss(net(images.flatten(0, 1)).view_as(targets), targets)
         optimiser.zero_grad()
@@ -158,22 +174,32 @@ def train(
     return average.eval()
 
 
-def _rate(progress: float) -> float:
+def _cycle(progress: float) -> float:
     warm = min(1.0, progress / 0.05)
-    return float(2e-3 * warm * 0.5 * (1.0 + np.cos(np.pi * progress)) + 1e-6)
+    return float(warm * 0.5 * (1.0 + np.cos(np.pi * progress)) + 1e-3)
 
 
 def _loss(
     predicted: Tensor,  # [G, V]
     targets: Tensor,  # [G, V]
 ) -> Tensor:
-    """Smooth L1, and a logistic loss on the order of every two versions of one content."""
+    """Smooth L1, a logistic loss on the order of every two versions of one content, and one on the order of
+    all images of the batch, by how far apart they should be."""
     regression = functional.smooth_l1_loss(predicted, targets, beta=0.05)
-    wanted = targets[:, :, None] - targets[:, None, :]
-    got = predicted[:, :, None] - predicted[:, None, :]
-    clear = (wanted > _TOLERANCE).float()
-    order = (functional.softplus(-got / 0.03) * clear).sum() / clear.sum().clamp_min(1.0)
-    return 4.0 * regression + 0.5 * order
+    within = (targets[:, :, None] - targets[:, None, :] > _TOLERANCE).float()
+    within[:, 1:, 0] = _CLEAN_FIRST
+    across = (targets.reshape(-1, 1) - targets.reshape(1, -1)).clamp_min(0.0)
+    return (
+        4.0 * regression + 0.5 * _disorder(predicted, within) + 2.0 * _disorder(predicted.flatten(), across)
+    )
+
+
+def _disorder(
+    predicted: Tensor,  # [..., V]
+    weights: Tensor,  # [..., V, V] how much it matters that the first lies above the second
+) -> Tensor:
+    gap = predicted[..., :, None] - predicted[..., None, :]
+    return (functional.softplus(-gap / _TEMPERATURE) * weights).sum() / weights.sum().clamp_min(1e-6)
 
 
 def _batches(pairs: Pairs, epochs: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -289,6 +315,11 @@ def export(net: QualityNet, path: Path) -> None:
 @click.option(
     "--start", type=click.Path(exists=True, path_type=Path), default=None, help="Checkpoint to go on from."
 )
+@click.option("--rate", default=2e-3, show_default=True, help="Peak learning rate.")
+@click.option("--head-only", is_flag=True, help="Leave the convolutions as they are.")
+@click.option(
+    "--graphics", default=0.25, show_default=True, help="Share of contents drawn instead of photographed."
+)
 @click.option("--epochs", default=6, show_default=True)
 @click.option("--minutes", default=60.0, show_default=True, help="Training ends after so long at the latest.")
 @click.option("--threads", default=1, show_default=True)
@@ -304,6 +335,9 @@ def main(
     contents: int,
     versions: int,
     start: Path | None,
+    rate: float,
+    head_only: bool,
+    graphics: float,
     epochs: int,
     minutes: float,
     threads: int,
@@ -318,9 +352,18 @@ def main(
     unseen = [p for p in files if p.name.split("_")[0] in hold_out]
     seen = [p for p in files if p not in unseen]
     test = make_pairs(unseen, lpips, work / "held", contents=5, versions=None, seed=seed + 1000)
-    pairs = make_pairs(seen, lpips, work / "train", contents=contents, versions=versions, seed=seed)
+    pairs = make_pairs(
+        seen, lpips, work / "train", contents=contents, versions=versions, seed=seed, graphics=graphics
+    )
     net = train(
-        pairs, seconds=60.0 * minutes, epochs=epochs, seed=seed, checkpoint=work / "scorer.pt", start=start
+        pairs,
+        seconds=60.0 * minutes,
+        epochs=epochs,
+        seed=seed,
+        checkpoint=work / "scorer.pt",
+        start=start,
+        rate=rate,
+        head_only=head_only,
     )
     click.echo("\n".join(report(predict(net, test), test)))
     export(net, out)
