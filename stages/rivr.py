@@ -52,14 +52,15 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Restoring takes about 6 s a megapixel, scoring 1 s, a training step 0.25 s (two cores)."""
+    """Restoring takes about 1 s a megapixel, making and scoring candidates 2 s, a training step 0.3 s (two
+    cores, the embedded models)."""
     from cleargs.rivr.cost import capture_size
 
     config = context.config
     frames, megapixels = capture_size(context.inputs.get("ingest"))
     restorings = 1 if config.use_observation else config.rounds
     seconds = megapixels * (
-        frames * (6.0 * restorings + 6.0 * config.rounds) + 0.25 * config.rounds * config.distil.steps
+        frames * (1.0 * restorings + 2.0 * config.rounds) + 0.3 * config.rounds * config.distil.steps
     )
     return Estimate(
         minutes=seconds / 60.0,

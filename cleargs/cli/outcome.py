@@ -34,6 +34,11 @@ def print_outcomes(outcomes: Sequence[Outcome], run: Path) -> None:
         click.echo("hint: the same command tries again; --allow-partial goes on without", err=True)
     scene = "scene.ply" in last.files
     click.echo(f"{'scene' if scene else 'results'}: {run / last.stage / ('scene.ply' if scene else '')}")
+    for outcome in outcomes:
+        for name in outcome.manifest.files:
+            if name.endswith(".parquet"):
+                click.echo(f"table: {run / outcome.stage / name}")
+    click.echo(f"look at them with: cleargs show {run}")
 
 
 def outcome_json(outcome: Outcome) -> dict[str, Any]:
