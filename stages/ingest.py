@@ -9,7 +9,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 
-VERSION = 1
+VERSION = 2
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
@@ -42,7 +42,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 
 def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, make them upright and small, find or take their poses, undistort, publish."""
-    from cleargs.capture.holdout import held_out
+    from cleargs.capture.holdout import held_out, holdout_hash
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
@@ -78,6 +78,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "frames_available": capture.n_available,
             "registered": len(model.images),
             "test": len(test),
+            "holdout_hash": holdout_hash(config.holdout, (frames[index].source.name for index in test)),
             "points": len(model.point_ids),
             "observations": sum(len(image.point_ids) for image in model.images.values()),
             "mean_reprojection_error_px": round(float(model.error.mean()), 6),

@@ -25,8 +25,8 @@ class IngestConfig(BaseModel):
     max_size: int = Field(960, ge=64, description="long side of the published images, px; never enlarged")
     holdout: str = Field(
         "none",
-        description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of each "
-        "of N equal stretches) | names or stems, separated by commas",
+        description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "
+        "N registered frames in a row) | names, stems or patterns such as eval_*, separated by commas",
     )
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
@@ -66,8 +66,8 @@ class IngestConfig(BaseModel):
     def _known_holdout(cls, value: str) -> str:
         if ":" in value and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
-        if value == "every:1":
-            raise ValueError("every:1 would hold out every frame")
+        if value in ("every:1", "sharpest:1"):
+            raise ValueError(f"{value} would hold out every frame")
         if not value.strip(" ,"):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
         return value

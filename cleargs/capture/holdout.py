@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import cv2
@@ -11,6 +14,8 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 
+_BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
+
 
 def held_out(
     rule: str, names: Sequence[str], read: Callable[[int], NDArray[np.uint8]], registered: Sequence[bool]
@@ -18,7 +23,9 @@ def held_out(
     """Indices of the test frames by ``ingest.holdout``; ``read`` gives frame i as RGB (for sharpest:N only).
 
     every:N holds out frames 0, N, 2N, ... (as Mip-NeRF 360 and 3DGS do with N = 8); sharpest:N the sharpest
-    registered frame of each of N equal stretches, so that tests are both clean and spread over the capture.
+    of every N registered frames in a row, also of the shorter rest (3dgs-deblur's
+    ``train_eval_split_by_blur_score.py`` with N = 8, which has its blur scores from the recording), so that
+    tests are both clean and spread over the capture; ties go to the earlier frame.
     Raises InputError for unknown names, and when no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
@@ -27,28 +34,48 @@ def held_out(
     if kind == "every":
         chosen = set(range(0, len(names), int(number)))
     elif kind == "sharpest":
+        period = int(number)
         candidates = [index for index in range(len(names)) if registered[index]]
-        stretches = np.array_split(np.array(candidates), min(int(number), len(candidates)))
-        chosen = {max(stretch.tolist(), key=lambda index: sharpness(read(index))) for stretch in stretches}
+        stretches = [candidates[start : start + period] for start in range(0, len(candidates), period)]
+        chosen = {max(stretch, key=lambda index: sharpness(read(index))) for stretch in stretches}
     else:
-        chosen = {_find(item.strip(), names) for item in rule.split(",") if item.strip()}
+        items = [item.strip() for item in rule.split(",") if item.strip()]
+        chosen = {index for item in items for index in _matching(item, names)}
     if not any(flag and index not in chosen for index, flag in enumerate(registered)):
         raise InputError(f"ingest.holdout={rule} leaves no frame to train on", hint="hold out fewer frames")
     return chosen
 
 
+def holdout_hash(rule: str, names: Iterable[str]) -> str:
+    """SHA-256 over the rule and the sorted names of the test frames: equal for equal splits by one rule."""
+    return hashlib.sha256(json.dumps([rule, sorted(names)]).encode()).hexdigest()
+
+
 def sharpness(rgb: NDArray[np.uint8]) -> float:  # [H, W, 3]
-    """Variance of the Laplacian of the grey image; sums of whole numbers, so exact."""
-    laplacian = np.asarray(cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_16S)).astype(np.int64)
+    """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
+
+    It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
+    rank noise first: of a frame and its blurred copy with noise of 4 levels, it takes the copy more often
+    than not. All values are whole numbers below 2^24, so the sums are exact.
+    """
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    smooth = cv2.sepFilter2D(grey, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
+    laplacian = np.asarray(cv2.Laplacian(smooth, cv2.CV_32F)).astype(np.int64)
     count = laplacian.size
-    return float(count * int((laplacian**2).sum()) - int(laplacian.sum()) ** 2) / count**2
+    # The filter's weights sum to 256.
+    return float(count * int((laplacian**2).sum()) - int(laplacian.sum()) ** 2) / count**2 / 256**2
 
 
-def _find(item: str, names: Sequence[str]) -> int:
+def _matching(item: str, names: Sequence[str]) -> list[int]:
+    """Frames of which path, file name or stem is ``item`` or fits it as a pattern (``*``, ``?``, ``[]``)."""
+    found = []
     for index, name in enumerate(names):
-        if item in (name, Path(name).name, Path(name).stem):
-            return index
-    raise InputError(
-        f"ingest.holdout names the frame {item}, which is not among the chosen frames",
-        hint="use names or stems of frames of the capture (cleargs show RUN ingest lists them)",
-    )
+        spellings = (name, Path(name).name, Path(name).stem)
+        if item in spellings or any(fnmatchcase(spelling, item) for spelling in spellings):
+            found.append(index)
+    if not found:
+        raise InputError(
+            f"ingest.holdout names the frame {item}, which is not among the chosen frames",
+            hint="use names or stems of frames of the capture (cleargs show RUN ingest lists them)",
+        )
+    return found

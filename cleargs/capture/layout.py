@@ -6,8 +6,34 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 from cleargs.capture.config import IngestConfig
+
+POSES_BOUNDS = "poses_bounds.npy"
+"""LLFF's file of poses."""
+
+
+def folder_kind(root: Path, *, poses: bool) -> Literal["transforms", "colmap", "llff", "images"]:
+    """What the folder ``root`` is taken for; without ``poses``, its poses count for nothing."""
+    if (root / "transforms.json").is_file():
+        return "transforms"
+    if poses and find_model(root) is not None:
+        return "colmap"
+    if poses and (root / POSES_BOUNDS).is_file():
+        return "llff"
+    return "images"
+
+
+def image_folders(root: Path) -> list[Path]:
+    """``images/`` and its reductions ``images_N/`` (N times smaller, as LLFF and nerfstudio name them),
+    largest images first; empty when ``root`` has none of them."""
+    found = [(0, root / "images")] if (root / "images").is_dir() else []
+    for folder in root.glob("images_*"):
+        factor = folder.name.removeprefix("images_")
+        if factor.isdecimal() and folder.is_dir():
+            found.append((int(factor), folder))
+    return [folder for _, folder in sorted(found)]
 
 
 def find_model(root: Path) -> Path | None:
@@ -30,14 +56,20 @@ def externals(source: Path, config: IngestConfig) -> Mapping[str, Path]:
     """What ingest reads of ``source``: role -> file or folder. A missing input is left to ingest to name."""
     if not source.is_dir():
         return {"capture": source}
-    images, masks, transforms = source / "images", mask_folder(source), source / "transforms.json"
-    whole = not images.is_dir() or (transforms.is_file() and _lists_outside(transforms))
-    found = {"capture": source} if whole else {"images": images}
-    if masks is not None:
+    kind = folder_kind(source, poses=config.poses == "auto")
+    images, transforms = source / "images", source / "transforms.json"
+    if kind == "llff":
+        found = {"poses_bounds": source / POSES_BOUNDS}
+        found.update((folder.name, folder) for folder in image_folders(source))
+    elif not images.is_dir() or (kind == "transforms" and _lists_outside(transforms)):
+        found = {"capture": source}
+    else:
+        found = {"images": images}
+    if (masks := mask_folder(source)) is not None:
         found["masks"] = masks
-    if transforms.is_file():
+    if kind == "transforms":
         found["transforms"] = transforms
-    elif config.poses == "auto" and (model := find_model(source)) is not None:
+    elif kind == "colmap" and (model := find_model(source)) is not None:
         found["sparse"] = model
     return found
 

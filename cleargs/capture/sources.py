@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import find_model, mask_folder
+from cleargs.capture.layout import find_model, folder_kind, image_folders, mask_folder
+from cleargs.capture.llff import read_llff
 from cleargs.capture.model import SparseModel, read_model
 from cleargs.capture.transforms import read_transforms
 from cleargs.errors import InputError
@@ -45,7 +46,7 @@ class SourceFrame:
 class Capture:
     """The chosen frames of an input, in trajectory order."""
 
-    kind: Literal["video", "images", "colmap", "transforms"]
+    kind: Literal["video", "images", "colmap", "llff", "transforms"]
     frames: tuple[SourceFrame, ...]
     n_available: int
     """Frames in the input, before choosing."""
@@ -63,18 +64,20 @@ def open_capture(source: Path, config: IngestConfig) -> Capture:
     """Find out what ``source`` is and choose its frames. Decodes no frame; changes nothing.
 
     A folder with transforms.json is taken for that; else one with a sparse model for a COLMAP project; else
-    its images (those in ``images/``, or its own) are taken in natural order. Raises InputError.
+    one with poses_bounds.npy for LLFF's; else its images (those in ``images/``, its own, or those in the
+    largest ``images_N/``) are taken in the order of `frame_key`. Raises InputError.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
     if not source.is_dir():
         return _open_video(source, config)
-    if (source / "transforms.json").is_file():
-        capture = _open_transforms(source, config)
-    elif config.poses == "auto" and (model := find_model(source)) is not None:
-        capture = _open_colmap(source, model, config)
-    else:
-        capture = _open_images(source, config)
+    opener = {
+        "transforms": _open_transforms,
+        "colmap": _open_colmap,
+        "llff": _open_llff,
+        "images": _open_images,
+    }[folder_kind(source, poses=config.poses == "auto")]
+    capture = opener(source, config)
     if len(capture.frames) < MIN_FRAMES:
         raise InputError(
             f"{source} has {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
@@ -87,6 +90,15 @@ def natural_key(text: str) -> list[tuple[int, int, str]]:
     """Sort key by which ``2.jpg`` comes before ``10.jpg``."""
     parts = re.split(r"(\d+)", text)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part.lower()) for part in parts]
+
+
+def frame_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Sort key of frames: `natural_key`, but ``train_`` and ``eval_`` before the file's name do not count.
+
+    3dgs-deblur marks its split so (train_frame_00001.png, eval_frame_00002.png); sorted with these prefixes,
+    the test frames would all come before the others, out of the order in which they were taken.
+    """
+    return natural_key(re.sub(r"(?<![^/])(train|eval)_(?=[^/]*$)", "", name)), name
 
 
 def spread(items: Sequence[T], at_most: int) -> list[T]:
@@ -136,7 +148,7 @@ def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[in
 
 def _open_transforms(source: Path, config: IngestConfig) -> Capture:
     listed = read_transforms(source / "transforms.json", poses=config.poses == "auto")
-    listed.sort(key=lambda frame: natural_key(frame.name))
+    listed.sort(key=lambda frame: frame_key(frame.name))
     masks = _masks(mask_folder(source))
     frames = tuple(
         SourceFrame(
@@ -151,9 +163,27 @@ def _open_transforms(source: Path, config: IngestConfig) -> Capture:
     return Capture("transforms", frames, len(listed))
 
 
+def _open_llff(source: Path, config: IngestConfig) -> Capture:
+    # In the order of the rows: the test views of these data sets are every N-th row.
+    views = read_llff(source)
+    masks = _masks(mask_folder(source))
+    frames = tuple(
+        SourceFrame(
+            view.path.name,
+            view.path,
+            mask=_mask_of(masks, view.path.name),
+            camera=view.camera,
+            pose=view.pose,
+        )
+        for view in spread(views, config.max_frames)
+    )
+    return Capture("llff", frames, len(views))
+
+
 def _open_images(source: Path, config: IngestConfig) -> Capture:
-    folder = source / "images" if (source / "images").is_dir() else source
-    files = _image_files(folder)
+    files = _image_files(source / "images" if (source / "images").is_dir() else source)
+    if not files and (folders := image_folders(source)):
+        files = _image_files(folders[0])
     if not files:
         raise InputError(
             f"{source} holds no images, no video and no transforms.json",
@@ -167,7 +197,9 @@ def _open_images(source: Path, config: IngestConfig) -> Capture:
     return Capture("images", frames, len(files))
 
 
-def _open_colmap(source: Path, folder: Path, config: IngestConfig) -> Capture:
+def _open_colmap(source: Path, config: IngestConfig) -> Capture:
+    folder = find_model(source)
+    assert folder is not None
     model = read_model(folder)
     root = source / "images"
     if not root.is_dir():
@@ -180,7 +212,7 @@ def _open_colmap(source: Path, folder: Path, config: IngestConfig) -> Capture:
             hint="put the images that the model was made from into images/, or set ingest.poses=sfm",
         )
     # Images that COLMAP could not register are frames too: they stay in the table, marked.
-    names = sorted(set(posed) | {path.name for path in _image_files(root)}, key=natural_key)
+    names = sorted(set(posed) | {path.name for path in _image_files(root)}, key=frame_key)
     masks = _masks(mask_folder(source))
     frames = []
     for name in spread(names, config.max_frames):
@@ -198,7 +230,7 @@ def _open_colmap(source: Path, folder: Path, config: IngestConfig) -> Capture:
 def _image_files(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
     return sorted(
-        (path for path in files if not path.name.startswith(".")), key=lambda path: natural_key(path.name)
+        (path for path in files if not path.name.startswith(".")), key=lambda path: frame_key(path.name)
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
 from cleargs.media.image import IMAGE_SUFFIXES, read_rgb
 
@@ -32,7 +33,10 @@ class TransformsFrame:
 
 
 def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
-    """The frames that ``path`` lists; without ``poses``, only their images.
+    """The frames that ``path`` lists, in its order; without ``poses``, only their images.
+
+    Further entries, such as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``,
+    are passed over.
 
     Raises InputError for damaged JSON, missing images, missing or NaN poses, unknown cameras.
     """
@@ -140,10 +144,6 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
         matrix = np.array(entry["transform_matrix"], np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"the pose of {name} is not a matrix of numbers", hint=hint) from error
-    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise InputError(f"the pose of {name} is not a finite 4x4 matrix", hint=hint)
-    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
-    if stretch[2] < 1e-9 or stretch[0] > 1.05 * stretch[2] or np.linalg.det(u @ vt) < 0:
-        raise InputError(f"the pose of {name} is not a rotation and a translation", hint=hint)
-    # Printed poses are orthonormal to a few digits only, and some writers leave a scale in: nearest rotation.
-    return Pose.from_opengl(np.column_stack([u @ vt, matrix[:3, 3]]))
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"the pose of {name} is not a 4x4 matrix", hint=hint)
+    return rigid_pose(matrix, name, hint)

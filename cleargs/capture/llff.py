@@ -1,0 +1,83 @@
+"""poses_bounds.npy beside images, as LLFF writes it and NeRF, Deblur-NeRF and BAD-NeRF read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from tokenize import TokenError
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.cameras import Camera, Pose, pinhole
+from cleargs.capture.layout import POSES_BOUNDS, image_folders
+from cleargs.capture.poses import rigid_pose
+from cleargs.errors import InputError
+from cleargs.media.image import IMAGE_SUFFIXES
+
+
+@dataclass(frozen=True)
+class LlffView:
+    """One row of poses_bounds.npy with its image."""
+
+    path: Path
+    camera: Camera
+    """Pinhole of the image's size when the poses were made; images may be smaller in the same proportions."""
+    pose: Pose
+
+
+def read_llff(root: Path) -> list[LlffView]:
+    """The images of ``root`` with their cameras, in the order of the rows.
+
+    Row i belongs to image i by sorted file name (not natural order), which is how LLFF writes the file and
+    how every reader of it counts its test views. The images are those of ``images/``, else of the largest
+    ``images_N/`` that has as many as there are rows: some releases keep test views in one of them only.
+    Raises InputError for a damaged file, a count that fits no folder, NaN and cameras that are none.
+    """
+    table = read_poses_bounds(root / POSES_BOUNDS)
+    folders = {folder: _images(folder) for folder in image_folders(root)}
+    paths = next((files for files in folders.values() if len(files) == len(table)), None)
+    if paths is None:
+        counts = ", ".join(f"{folder.name}/ {len(files)}" for folder, files in folders.items())
+        raise InputError(
+            f"{POSES_BOUNDS} has {len(table)} poses, which is not the number of images "
+            f"({counts or 'no images/ there'})",
+            hint="put back the images that the poses were made from, or set ingest.poses=sfm",
+        )
+    return [_view(row, path) for row, path in zip(table, paths, strict=True)]
+
+
+def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
+    """The rows of ``path``: a 3x5 pose, then nearest and farthest depth. Pickled arrays are not loaded.
+
+    Raises InputError when there is no such array in the file.
+    """
+    try:
+        # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
+        table = np.lib.format.open_memmap(path, mode="r")
+        if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
+            raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")
+        return np.array(table, np.float64)
+    except (OSError, ValueError, OverflowError, SyntaxError, TokenError) as error:
+        # NumPy lets errors of Python's tokenizer through where the header is damaged.
+        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"cannot read {path}: {cause}",
+            hint="write it again with LLFF's imgs2poses.py, or set ingest.poses=sfm",
+        ) from error
+
+
+def _images(folder: Path) -> list[Path]:
+    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted((path for path in files if not path.name.startswith(".")), key=lambda path: path.name)
+
+
+def _view(row: NDArray[np.float64], path: Path) -> LlffView:
+    hint = f"correct its row of {POSES_BOUNDS}, remove both row and image, or set ingest.poses=sfm"
+    # Columns: the camera's down, right and back axes in the world, its centre, and (height, width, focal).
+    down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+    if not np.isfinite(row[:15]).all() or min(height, width, focal) < 1:
+        raise InputError(f"the camera of {path.name} in {POSES_BOUNDS} is no finite camera", hint=hint)
+    pose = rigid_pose(np.column_stack([right, -down, back, centre]), path.name, hint)
+    size = round(float(width)), round(float(height))
+    return LlffView(path, pinhole(*size, float(focal), float(focal), size[0] / 2, size[1] / 2), pose)
