@@ -4,6 +4,7 @@ Compensation).
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 
 import numpy as np
@@ -77,6 +78,21 @@ def supervision_weights(roles: Roles, R: Floats, G: Floats, config: RvaConfig) -
         ],
     )
     return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
+
+
+def keep_sharp(R: Floats, B: Floats, share: float, config: RvaConfig) -> tuple[Roles, Floats]:  # [N] each
+    """Roles and weights of the baseline that drops blurry frames.
+
+    ``share`` of the frames (rounded up, so at least one), best by R - B, and every reliable frame beyond it
+    get weight 1, the others 0. Ties go to the earlier frame.
+    """
+    reliable = is_reliable(R, B, config)
+    kept = reliable.copy()
+    kept[np.argsort(B - R, kind="stable")[: math.ceil(share * len(R))]] = True
+    roles = np.select(
+        [reliable, kept], [Role.STRONG.value, Role.AUXILIARY.value], default=Role.SUPPRESSED.value
+    )
+    return roles, kept.astype(np.float64)
 
 
 def effective_sample_size(weight: Floats) -> float:

@@ -12,6 +12,7 @@ from scipy import sparse
 from cleargs.rva.allocation import (
     Role,
     Roles,
+    keep_sharp,
     reactivate,
     reactivation_gain,
     standard_roles,
@@ -82,7 +83,8 @@ def assess(
 
     Observations by other frames (held-out ones, say) and by unregistered frames are ignored: neither P_rel
     nor n_p knows of them. Permuting the rows of the arguments permutes the result. With ``config.enabled``
-    false every registered frame is strong with weight 1; all other columns stay what they are.
+    false every registered frame is strong with weight 1, with ``config.weighting`` "binary" the better ones
+    are; all other columns stay what they are.
     """
     R, B = appearance_scores(cues, config)
     by_id = np.argsort(frame_id, kind="stable")
@@ -102,10 +104,12 @@ def assess(
     bins = cut_into_bins(cumulative_motion(centres, directions, config), config.frames_per_bin)
     roles = standard_roles(r, b, G, config)
     covered = np.isin(np.arange(len(bins.edges) - 1), bins.index[roles != Role.SUPPRESSED])
-    if config.coverage:
+    if config.coverage and config.weighting == "graded":
         gain = reactivation_gain(r, b, G, bins.centrality, config)
         roles = np.where(reactivate(roles, bins.index, gain), Role.REACTIVATED.value, roles)
     weight = supervision_weights(roles, r, G, config)
+    if config.weighting == "binary":
+        roles, weight = keep_sharp(r, b, config.binary_share, config)
     if not config.enabled:
         roles, weight = np.full_like(roles, Role.STRONG.value), np.ones(len(rows))
 

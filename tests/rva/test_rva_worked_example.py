@@ -117,6 +117,30 @@ def test_all_view_weighs_every_frame_and_still_knows_the_reliable_one(result: As
     assert everything.G.tolist() == result.G.tolist()
 
 
+@pytest.mark.parametrize(
+    ("share", "weights"),
+    [
+        # R - B = 0.735, -0.3, -0.2, -0.8, -0.8
+        (0.2, [1, 0, 0, 0, 0]),  # ceil(0.2 x 5) = 1 frame
+        (0.5, [1, 1, 1, 0, 0]),  # ceil(0.5 x 5) = 3
+        (1.0, [1, 1, 1, 1, 1]),
+    ],
+)
+def test_dropping_blurry_frames_keeps_the_better_share_whole(share: float, weights: list[int]) -> None:
+    dropped = assess(
+        FRAME_ID,
+        cues(),
+        POSES,
+        observations_of(POINTS),
+        CONFIG.model_copy(update={"weighting": "binary", "binary_share": share}),
+    )
+    order = np.argsort(dropped.B - dropped.R, kind="stable")
+    assert set(np.flatnonzero(dropped.weight)) == set(order[: sum(weights)])
+    assert dropped.weight.tolist() == weights
+    assert dropped.role[0] == "strong"
+    assert "reactivated" not in dropped.role
+
+
 def test_tables(result: Assessment) -> None:
     frames = frames_table(FRAME_ID, [f"{k}.png" for k in FRAME_ID], "hand-1", cues(), result)
     assert tuple(frames.column_names[3:14]) == CUE_COLUMNS
