@@ -24,6 +24,18 @@ class RvaConfig(BaseModel):
         description="false: the all-view ablation. Every registered frame gets weight 1 and the role strong; "
         "cues, scores and geometry are still computed and reported",
     )
+    weighting: Literal["graded", "binary"] = Field(
+        "graded",
+        description="graded: the paper's roles and weights; binary: the baseline that drops blurry frames. "
+        "Weight 1 for the better frames by R - B, 0 for the others, without coverage compensation",
+    )
+    binary_share: float = Field(
+        0.5,
+        gt=0.0,
+        le=1.0,
+        description="binary: this share of the registered frames (at least one) is kept, and every reliable "
+        "frame beyond it",
+    )
     coverage: bool = Field(
         True, description="reactivate one suppressed frame in every uncovered trajectory bin"
     )
