@@ -1,0 +1,180 @@
+"""``cleargs compare``: variants, captures or runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cleargs.cli.common import (
+    DeviceChoice,
+    json_option,
+    opened_store,
+    print_json,
+    quiet_option,
+    resolve_device,
+    threads_or_all,
+    work_options,
+)
+from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import InputError
+from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
+from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.store import STORE_FOLDER
+
+if TYPE_CHECKING:
+    from cleargs.evaluate.cells import Cell
+    from cleargs.evaluate.comparison import Made, Sample
+
+
+def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, ...]:
+    try:
+        seeds = tuple(dict.fromkeys(int(part) for part in value.split(",")))
+    except ValueError:
+        seeds = ()
+    if not seeds or min(seeds) < 0:
+        raise click.BadParameter("write whole numbers from 0, separated by commas: 0,1,2 say")
+    return seeds
+
+
+def _nets(context: click.Context, parameter: click.Parameter, value: str) -> tuple[LpipsNet, ...]:
+    wanted = [part.strip() for part in value.split(",")]
+    nets = tuple(net for net in LPIPS_NETS if net in wanted)
+    if len(nets) != len(wanted):
+        raise click.BadParameter(f"choose among {', '.join(LPIPS_NETS)}")
+    return nets
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs compare data/mixed -o table                     all variants of one capture
+  cleargs compare data/mixed-* data/sharp -o table         several captures, grouped by protocol
+  cleargs compare data/mixed -o table --variants all-view,rva --seeds 0,1,2
+  cleargs compare data/kitchen -o table --set ingest.holdout=sharpest:8
+  cleargs compare runs/a runs/b -o table                  runs that exist already
+"""
+)
+@click.argument("sources", metavar="CAPTURE|RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    "out",
+    required=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of the runs, tables and pictures; an existing one goes on.",
+)
+@click.option(
+    "--variants",
+    default="",
+    metavar="NAME,...",
+    help=f"Which variants: {', '.join(variant.name for variant in VARIANTS)}.  [default: all]",
+)
+@click.option("--seeds", default="0", show_default=True, callback=_seeds, help="Seeds of the runs.")
+@click.option(
+    "--reference",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Sharp images to compare with.  [default: CAPTURE/truth, else the held-out frames]",
+)
+@click.option("--lpips", default="alex", show_default=True, callback=_nets, help="Networks of LPIPS.")
+@click.option(
+    "--workflow", default="default", show_default=True, metavar="NAME|FILE.toml", help="The recipe."
+)
+@click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@work_options
+@json_option
+@quiet_option
+@click.pass_obj
+def compare(
+    dag: Dag,
+    sources: tuple[Path, ...],
+    out: Path,
+    variants: str,
+    seeds: tuple[int, ...],
+    reference: Path | None,
+    lpips: tuple[LpipsNet, ...],
+    workflow: str,
+    overrides: tuple[str, ...],
+    device: DeviceChoice,
+    threads: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Train variants of the method on captures, or take finished runs, and print the paper's tables.
+
+    All-view training, dropping blurry frames, RVA with and without coverage, and RIVR without observation or
+    without fusion stand beside the whole method. Captures of one protocol are samples of one column; with
+    several, or several seeds, a difference smaller than its spread is called none. Stages that variants
+    share are made once, and the same command goes on where it stopped.
+    """
+    from cleargs.evaluate.cells import Cells
+    from cleargs.evaluate.comparison import Recipe, Sample, existing, judge, make_scenes
+    from cleargs.evaluate.tables import markdown
+    from cleargs.files import write_bytes, write_json
+    from cleargs.report.comparison import comparison_sheet, plot_comparison
+
+    runs = [source for source in sources if (source / RUN_FILE).is_file()]
+    if runs and len(runs) != len(sources):
+        raise InputError(
+            "some of these are runs and some captures", hint="give either runs or captures, not both"
+        )
+    for source in sources:
+        if not source.exists():
+            raise InputError(f"there is no {source}", hint="give captures or run folders")
+    chosen = find_variants([name.strip() for name in variants.split(",") if name.strip()])
+    out = out.absolute()
+    reporter = make_reporter(quiet)
+    options = EvalOptions(lpips=lpips, scorers=SCORERS)
+    recipe = Recipe(dag, workflow, overrides, resolve_device(device), threads_or_all(threads), options)
+    cells: list[Cell] = []
+    failures: list[str] = []
+    scenes = []
+    with opened_store(out / STORE_FOLDER) as store:
+        if runs:
+            made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])
+        else:
+            samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
+            _check_names(samples)
+            made = make_scenes(out, samples, chosen, recipe, store, reporter)
+        for scene in made:
+            if isinstance(scene, str):
+                reporter.warn(scene)
+                failures.append(scene)
+                continue
+            cells += judge(out, scene, recipe, store, reporter)
+            scenes.append(scene)
+    if not cells:
+        raise InputError("nothing could be compared", hint="the warnings above say why")
+    found = Cells(cells)
+    labels = {scene.variant.name: scene.variant.label for scene in scenes}
+    baselines = BASELINES if not runs else found.variants()[:1]
+    text = markdown(found, labels, baselines)
+    write_bytes(out / "comparison.md", text.encode())
+    document = {"cells": [cell.model_dump() for cell in cells], "failures": failures}
+    write_json(out / "comparison.json", document)
+    plot_comparison(out / "comparison.png", found, labels)
+    shown = (found.variants()[0], *(name for name in ("rva", "full") if name in labels))
+    captures = {scene.sample.name: scene.sample.capture for scene in scenes}
+    comparison_sheet(out / "sheet.png", out, found, labels, shown, captures)
+    if as_json:
+        print_json(document)
+    else:
+        click.echo(text)
+        click.echo(f"written: {out}/comparison.md, comparison.json, comparison.png, sheet.png")
+    return DONE_IN_PART if failures else 0
+
+
+def _check_names(samples: Sequence[Sample]) -> None:
+    """Two captures of one name would share a run folder."""
+    names = [sample.name for sample in samples]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"two captures are called {twice[0].rsplit('-', 1)[0]}",
+            hint="give the captures distinct folder names",
+        )

@@ -1,0 +1,276 @@
+"""``cleargs eval``: metrics of a run's scenes, a scene file, or any method's images, against sharp images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import InputError
+from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.run_file import RUN_FILE
+
+if TYPE_CHECKING:
+    from cleargs.evaluate.evaluate import Evaluation, Reference, Report
+
+SCENE = "scene.ply"
+
+_LABELS = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips_alex": "LPIPS\nalex",
+    "lpips_vgg": "LPIPS\nvgg",
+    "clarity-net": "clarity\n-net",
+    "naturalness-stats": "naturalness\n-stats",
+    "musiq": "MUSIQ",
+    "clip-iqa": "CLIP-\nIQA",
+}
+_DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
+
+
+def _scorers(context: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip() for part in value.split(",") if part.strip()))
+    return () if names == ("none",) else names
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs eval room --reference capture/truth/observed     the last scene, at the frames' poses
+  cleargs eval room --reference capture/truth/novel --stage all
+  cleargs eval room                                        on the frames held out (ingest.holdout)
+  cleargs eval scene.ply --reference DIR --json            a scene in the world of DIR
+  cleargs eval --renders DIFIX --reference DIR -o difix.json
+
+\b
+DIR holds images/ and transforms.json in the world of the capture. The result of a run is written into
+RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet beside it.
+"""
+)
+@click.argument("target", required=False, metavar="[RUN|SCENE.ply]", type=click.Path(path_type=Path))
+@click.option(
+    "--reference",
+    "directory",
+    type=click.Path(path_type=Path),
+    help="Folder of sharp images and poses.  [default: the frames that RUN held out]",
+)
+@click.option(
+    "--renders",
+    type=click.Path(path_type=Path),
+    help="Evaluate the images in this folder, matched by stem, instead of a scene.",
+)
+@click.option(
+    "--stage", "stages", multiple=True, help="Stage of RUN, or all.  [default: the last with a scene]"
+)
+@click.option(
+    "--poses",
+    type=click.Choice(["reference", "given"]),
+    default="reference",
+    show_default=True,
+    help="Render at the reference's poses, or at those that RUN was given (or found) for these frames.",
+)
+@click.option(
+    "--align",
+    type=click.Path(path_type=Path),
+    help="Folder whose camera centres align the worlds, where RUN's poses come from SfM.  "
+    "[default: --reference]",
+)
+@click.option(
+    "--lpips",
+    type=click.Choice([*LPIPS_NETS, "both", "none"]),
+    default="both",
+    show_default=True,
+    help="Backbones of LPIPS; vgg takes most of the time.",
+)
+@click.option(
+    "--scorers",
+    callback=_scorers,
+    default=",".join(SCORERS),
+    show_default=True,
+    help="No-reference scorers, separated by commas: names, paths of ONNX files, or none.",
+)
+@click.option(
+    "--align-colour", is_flag=True, help="Fit each image's colours to its reference (affine on sRGB) first."
+)
+@click.option(
+    "--refine-poses",
+    type=click.IntRange(0, 200),
+    default=0,
+    show_default=True,
+    help="Fit each rendered pose to its reference in so many steps first.",
+)
+@click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads; results do not depend on it.")
+@click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
+@json_option
+@quiet_option
+@click.pass_obj
+def eval(
+    dag: Dag,
+    target: Path | None,
+    directory: Path | None,
+    renders: Path | None,
+    stages: Sequence[str],
+    poses: Literal["reference", "given"],
+    align: Path | None,
+    lpips: Literal["alex", "vgg", "both", "none"],
+    scorers: tuple[str, ...],
+    align_colour: bool,
+    refine_poses: int,
+    save_renders: Path | None,
+    output: Path | None,
+    threads: int | None,
+    per_image: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Compare a scene with sharp images: PSNR, SSIM, LPIPS and no-reference scores.
+
+    Images are rendered at the reference's size without exposure compensation and compared as 8-bit sRGB.
+    """
+    run = target if target is not None and target.is_dir() else None
+    scenes = _scenes(dag, target, renders, stages)
+    if output is not None and output.suffix != ".json":
+        raise InputError(f"{output} does not end in .json", hint="name the result NAME.json")
+    if run is None and (poses == "given" or align is not None):
+        raise InputError("--poses given and --align need a run", hint="give the folder of `cleargs run -o`")
+    if directory is None and poses == "given":
+        raise InputError(
+            "--poses given needs --reference", hint="held-out frames are rendered at their own poses anyway"
+        )
+    nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
+    options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
+    from cleargs.evaluate.evaluate import Report, evaluate_images, evaluate_scene, reference_in, reference_of
+    from cleargs.evaluate.results import write_report
+
+    reporter, count = make_reporter(quiet), threads_or_all(threads)
+    reference: Reference
+    if run is not None:
+        reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
+    elif directory is not None:
+        reference = reference_in(directory)
+    else:
+        raise InputError("there is nothing to compare with", hint="give --reference DIR")
+
+    def keep(subject: str) -> Path | None:
+        return save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
+
+    evaluations = [
+        evaluate_scene(
+            scene,
+            reference,
+            options=options,
+            threads=count,
+            reporter=reporter,
+            subject=subject,
+            save=keep(subject),
+        )
+        for subject, scene in scenes.items()
+    ]
+    if renders is not None:
+        evaluations.append(
+            evaluate_images(
+                renders, reference, options=options, threads=count, reporter=reporter, save=save_renders
+            )
+        )
+    report = Report(evaluations=tuple(evaluations))
+    if output is None and run is not None and renders is None:
+        name = reference.name if poses == "reference" or directory is None else f"{reference.name}-given"
+        output = run / "eval" / name / "eval.json"
+    if output is not None:
+        write_report(output, report)
+    if as_json:
+        print_json(report.document())
+    else:
+        _print(report, per_image, output)
+
+
+def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequence[str]) -> dict[str, Path]:
+    """Name -> scene file of all that is to be rendered; empty where finished images are evaluated."""
+    if renders is not None:
+        if stages or (target is not None and not target.is_dir()):
+            raise InputError("--renders stands instead of a scene", hint="leave out --stage and SCENE.ply")
+        return {}
+    if target is None:
+        raise InputError("there is nothing to evaluate", hint="give a RUN, a SCENE.ply, or --renders DIR")
+    if not target.exists():
+        raise InputError(f"{target} does not exist", hint="give the folder of a run, or a scene.ply")
+    if not target.is_dir():
+        if stages:
+            raise InputError("--stage chooses among the scenes of a run", hint="leave it out for a file")
+        return {target.name: target}
+    if not (target / RUN_FILE).is_file():
+        raise InputError(
+            f"{target} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
+        )
+    done = [name for name in dag.names if (target / name / SCENE).is_file()]
+    if not done:
+        raise InputError(f"there is no scene in {target}", hint=f"see cleargs explain {target}")
+    chosen = done if "all" in stages else [dag.check(name) for name in dict.fromkeys(stages)] or done[-1:]
+    for name in chosen:
+        if name not in done:
+            raise InputError(
+                f"{name} has no scene in {target}", hint=f"the stages with a scene are {', '.join(done)}"
+            )
+    return {name: target / name / SCENE for name in chosen}
+
+
+# -- on the terminal ---------------------------------------------------------------------------------------
+
+
+def _print(report: Report, per_image: bool, output: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    first = report.evaluations[0]
+    metrics = [name for name in first.options.metrics if name not in first.unavailable]
+    table = Table("subject", "image", box=None, header_style="bold")
+    for metric in metrics:
+        table.add_column(_label(metric), justify="right")
+    for evaluation in report.evaluations:
+        if per_image:
+            for image in evaluation.images:
+                table.add_row(
+                    evaluation.subject,
+                    image.name,
+                    *(_figure(metric, image.values[metric]) for metric in metrics),
+                )
+        figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
+        table.add_row(evaluation.subject, f"mean of {len(evaluation.images)}", *figures)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(table)
+    console.print(_provenance(first), markup=False)
+    for metric, reason in first.unavailable.items():
+        console.print(f"{metric}: {reason}", markup=False)
+    if output is not None:
+        console.print(f"written: {output}", markup=False)
+
+
+def _provenance(evaluation: Evaluation) -> str:
+    """One line on what was compared, so that a table can be judged."""
+    words = [f"reference {evaluation.reference}, split {evaluation.split[:12]}"]
+    if evaluation.poses == "given":
+        words.append("at the run's own poses")
+    if evaluation.alignment.residual is not None:
+        words.append(f"worlds aligned, residual {evaluation.alignment.residual:.2%}")
+    if evaluation.options.align_colour:
+        words.append("colours aligned")
+    if evaluation.options.refine_poses:
+        words.append(f"poses refined in {evaluation.options.refine_poses} steps")
+    return "; ".join(words)
+
+
+def _label(metric: str) -> str:
+    from cleargs.evaluate.results import LOWER_IS_BETTER
+
+    return f"{_LABELS.get(metric, Path(metric).stem)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
+
+
+def _figure(metric: str, value: float | None) -> str:
+    return "-" if value is None else f"{value:.{_DIGITS.get(metric, 2)}f}"

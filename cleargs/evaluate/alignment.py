@@ -1,0 +1,58 @@
+"""Two worlds become one: the similarity that takes one set of camera centres to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.capture.world import Similarity
+from cleargs.errors import InputError
+
+LARGE_RESIDUAL = 0.02
+"""Above this share of the trajectory's extent the fit deserves a warning."""
+
+_ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they are one place
+_FLAT = 1e-3  # second-largest over largest extent of centres below which the turn about their line is open
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted similarity and how well it fits."""
+
+    similarity: Similarity
+    residual: float
+    """RMS distance between fitted and given centres, over the largest distance between two of the latter."""
+
+
+def umeyama(
+    source: NDArray[np.float64],  # [N, 3] centres in the world to leave
+    target: NDArray[np.float64],  # [N, 3] the same cameras' centres in the world to enter
+) -> Fit:
+    """The similarity of least squares from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
+
+    Raises InputError for fewer than three centres, or centres that lie on one line.
+    """
+    hint = "give at least three references, taken at places that do not lie on one line"
+    if len(source) < 3:
+        raise InputError(f"{len(source)} matched frames cannot align two worlds", hint=hint)
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - source_mean, target - target_mean
+    for places, centred in ((source, a), (target, b)):
+        spread = np.linalg.svd(centred, compute_uv=False)
+        if spread[0] <= _ROUNDING * np.abs(places).max() or spread[1] <= _FLAT * spread[0]:
+            raise InputError(
+                "the matched cameras stand at one place or on one line, which fixes no turn about it",
+                hint=hint,
+            )
+    u, stretch, vt = np.linalg.svd(np.einsum("ni,nj->ij", b, a) / len(a))
+    mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * mirror) @ vt
+    scale = float((stretch * mirror).sum() / ((a * a).sum() / len(a)))
+    # The similarity of ingest divides by its scale: x_target = rotation (x_source - origin) / (1 / scale).
+    origin = source_mean - rotation.T @ target_mean / scale
+    similarity = Similarity(rotation, origin, 1.0 / scale)
+    errors = np.linalg.norm(similarity.points(source) - target, axis=1)
+    extent = float(np.linalg.norm(target[:, None] - target[None], axis=2).max())
+    return Fit(similarity, float(np.sqrt((errors**2).mean())) / extent)

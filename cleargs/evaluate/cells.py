@@ -1,0 +1,121 @@
+"""Cells of a comparison and what is read off them: means, spreads, paired differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from cleargs.evaluate.results import LOWER_IS_BETTER
+
+ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
+"""Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the
+capture's are noisy), sharp truth off the path, test frames, or the user's own reference."""
+
+
+class Cell(BaseModel):
+    """One scene judged on one set of views."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    column: str
+    """What is compared across: the protocol of a synthetic capture, else the capture's name."""
+    sample: str
+    """Which capture and seed of the column; differences are taken within one sample."""
+    variant: str
+    views: ViewSet
+    means: dict[str, float | None]
+    """Metric -> mean over the images; None where it could not be measured."""
+    images: int
+    seconds: float
+    """Wall time of the stages that no earlier variant of the sample had made."""
+    shared_seconds: float
+    """Wall time of the stages that it shares with earlier variants."""
+    gaussians: int
+    evaluation: str
+    """Folder below that of the comparison: ``eval.json`` and the evaluated images."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and sample standard deviation; the deviation is None for a single value."""
+
+    mean: float
+    deviation: float | None
+    count: int
+
+    @property
+    def is_none(self) -> bool:
+        """Whether a mean difference is smaller than its spread over the samples."""
+        return self.deviation is not None and abs(self.mean) < self.deviation
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """The spread of one or more values; infinite ones (PSNR of equal images) make it infinite."""
+    mean = math.fsum(values) / len(values)
+    if len(values) < 2:
+        return Spread(mean, None, len(values))
+    variance = math.fsum((value - mean) ** 2 for value in values) / (len(values) - 1)
+    return Spread(mean, math.sqrt(variance), len(values))
+
+
+class Cells:
+    """Look-ups over a set of cells, in their order."""
+
+    def __init__(self, cells: Iterable[Cell]) -> None:
+        self.cells = tuple(cells)
+
+    def view_sets(self) -> list[ViewSet]:
+        return list(dict.fromkeys(cell.views for cell in self.cells))
+
+    def variants(self) -> list[str]:
+        return list(dict.fromkeys(cell.variant for cell in self.cells))
+
+    def columns(self, views: ViewSet) -> list[str]:
+        return list(dict.fromkeys(cell.column for cell in self.cells if cell.views == views))
+
+    def metrics(self) -> list[str]:
+        """Metrics that at least one cell has a value for."""
+        return list(
+            dict.fromkeys(
+                name for cell in self.cells for name, value in cell.means.items() if value is not None
+            )
+        )
+
+    def values(self, views: ViewSet, column: str, variant: str, metric: str) -> dict[str, float]:
+        """Sample -> value."""
+        found = {}
+        for cell in self.cells:
+            value = cell.means.get(metric)
+            if (cell.views, cell.column, cell.variant) == (views, column, variant) and value is not None:
+                found[cell.sample] = value
+        return found
+
+    def spread(self, views: ViewSet, column: str, variant: str, metric: str) -> Spread | None:
+        """Over the samples; None where there is no value."""
+        values = list(self.values(views, column, variant, metric).values())
+        return spread(values) if values else None
+
+    def difference(
+        self, views: ViewSet, column: str, variant: str, baseline: str, metric: str
+    ) -> Spread | None:
+        """``variant`` minus ``baseline``, paired within the samples that have both; None without one."""
+        ours = self.values(views, column, variant, metric)
+        theirs = self.values(views, column, baseline, metric)
+        pairs = [ours[sample] - theirs[sample] for sample in ours if sample in theirs]
+        return spread(pairs) if pairs else None
+
+    def best(self, views: ViewSet, column: str, metric: str) -> str | None:
+        """The variant with the best mean."""
+        means = {
+            variant: found.mean
+            for variant in self.variants()
+            if (found := self.spread(views, column, variant, metric)) is not None
+        }
+        if not means:
+            return None
+        pick = min if metric in LOWER_IS_BETTER else max
+        return pick(means, key=lambda variant: means[variant])

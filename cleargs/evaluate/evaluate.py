@@ -1,0 +1,271 @@
+"""Evaluate a scene, or any other method's images, against sharp ones."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError, StoreError
+from cleargs.evaluate.colour import apply_affine, fit_affine
+from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.judges import Judges, load_judges
+from cleargs.evaluate.metrics import Mask, Pixels
+from cleargs.evaluate.references import Reference, ReferenceView, reference_in, reference_of, require_match
+from cleargs.evaluate.refinement import refine_pose
+from cleargs.evaluate.results import Evaluation, ImageResult, Refinement, Report, mean_values, split_hash
+from cleargs.files import disk_error
+from cleargs.media.image import IMAGE_SUFFIXES, read_rgb, to_uint8, write_rgb
+from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.manifest import versions
+from cleargs.progress import Reporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.ply import read_ply
+from cleargs.splat.scene import Scene
+
+__all__ = [
+    "EvalOptions",
+    "Evaluation",
+    "Reference",
+    "Report",
+    "evaluate_images",
+    "evaluate_scene",
+    "reference_in",
+    "reference_of",
+]
+
+_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "onnxruntime")
+
+
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """What a method shows at a reference's view, before colour alignment."""
+
+    image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
+    refinement: Refinement | None = None
+
+
+Predict = Callable[[ReferenceView, Pixels, Mask | None], _Prediction]
+
+
+def evaluate_scene(
+    scene: Path,
+    reference: Reference,
+    *,
+    options: EvalOptions,
+    threads: int,
+    reporter: Reporter,
+    subject: str | None = None,
+    save: Path | None = None,
+) -> Evaluation:
+    """Render ``scene`` (a PLY file) at every view of ``reference``, without exposure affines, and measure.
+
+    ``subject`` names it in the result (default: the file's name); ``save`` is a folder for the evaluated
+    images. Results do not depend on ``threads``. Raises InputError for a file that is no scene.
+    """
+    try:
+        loaded = read_ply(scene)
+    except StoreError as error:
+        raise InputError(
+            f"{scene} is no scene of Gaussians: {str(error).split(': ', 1)[-1]}",
+            hint="give a scene.ply as `cleargs export` or the Inria code writes it",
+        ) from error
+    set_threads(threads)
+    renderer = _Renderer(loaded, options.refine_poses)
+    predictions = _Predictions(subject or scene.name, file_digest(scene), renderer)
+    return _evaluate(predictions, reference, options, threads, reporter, save)
+
+
+def evaluate_images(
+    folder: Path,
+    reference: Reference,
+    *,
+    options: EvalOptions,
+    threads: int,
+    reporter: Reporter,
+    save: Path | None = None,
+) -> Evaluation:
+    """Measure the images in ``folder`` (any method's), matched with the references by their stems.
+
+    Raises InputError when no stem matches, an image cannot be read, or has another size than its reference.
+    """
+    if options.refine_poses:
+        raise InputError("finished images have no pose to refine", hint="leave out --refine-poses")
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
+    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
+    matched = tuple(view for view in reference.views if view.name in files)
+    require_match(
+        len(matched), files, (view.name for view in reference.views), "name the images like the references"
+    )
+
+    def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
+        image = read_rgb(files[view.name])
+        if image.shape != target.shape:
+            raise InputError(
+                f"{files[view.name]} has {image.shape[1]}x{image.shape[0]} pixels, "
+                f"its reference {target.shape[1]}x{target.shape[0]}",
+                hint="render at the size of the references (undistorted, where they have distortion)",
+            )
+        return _Prediction(image / 255.0)
+
+    restricted = Reference(reference.name, matched, reference.poses, reference.alignment)
+    predictions = _Predictions(folder.resolve().name, None, predict)
+    found = _evaluate(predictions, restricted, options, threads, reporter, save)
+    if len(matched) < len(reference.views):
+        reporter.warn(
+            f"{folder} has images for {len(matched)} of {len(reference.views)} references: "
+            "the means are over these"
+        )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Predictions:
+    """A method to evaluate: its name, the digest of its scene, and how to get its images."""
+
+    subject: str
+    scene: str | None
+    predict: Predict
+
+
+class _Renderer:
+    """Renders a scene at references' views, at poses refined by so many steps."""
+
+    def __init__(self, scene: Scene, refine_steps: int) -> None:
+        self._scene = scene
+        self._engine = Engine(scene.gaussians.device)
+        self._steps = refine_steps
+
+    def __call__(self, view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
+        if not self._steps:
+            return _Prediction(self._render(view.camera))
+        camera, refinement = refine_pose(
+            self._render, view.camera, self._depth(view.camera), target, mask, self._steps
+        )
+        return _Prediction(self._render(camera), refinement)
+
+    def _render(self, camera: Camera) -> NDArray[np.float64]:
+        scene = self._scene
+        image = self._engine.forward(
+            scene.gaussians, camera, background=scene.background, antialias=scene.antialias
+        ).image
+        pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
+        return pixels
+
+    def _depth(self, camera: Camera) -> float:
+        """Median depth of what the view shows; 1 where it shows nothing."""
+        rendered = self._engine.forward(
+            self._scene.gaussians, camera, antialias=self._scene.antialias, depth=True
+        )
+        assert rendered.depth is not None  # asked for
+        alpha = rendered.alpha.numpy()
+        shown = alpha > 0.5
+        return float(np.median(rendered.depth.numpy()[shown] / alpha[shown])) if shown.any() else 1.0
+
+
+def _evaluate(
+    predictions: _Predictions,
+    reference: Reference,
+    options: EvalOptions,
+    threads: int,
+    reporter: Reporter,
+    save: Path | None,
+) -> Evaluation:
+    """Predictions are made one after the other (a render uses all threads) and measured in parallel."""
+    judges = load_judges(options)
+    if save is not None:
+        try:
+            save.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(error, save) from error
+    images: list[ImageResult] = []
+    waiting: deque[Future[ImageResult]] = deque()
+    with (
+        reporter.task(f"evaluating {predictions.subject}", len(reference.views)) as task,
+        _torch_on_one_thread(),
+        ThreadPoolExecutor(threads) as pool,
+    ):
+        for view in reference.views:
+            target, mask = view.load()
+            prediction = predictions.predict(view, target, mask)
+            waiting.append(pool.submit(_measure, judges, options, view.name, prediction, target, mask, save))
+            if len(waiting) > 2 * threads:  # so that memory does not grow with the number of images
+                images.append(waiting.popleft().result())
+                task.advance()
+        for future in waiting:
+            images.append(future.result())
+            task.advance()
+    return Evaluation(
+        subject=predictions.subject,
+        scene=predictions.scene,
+        reference=reference.name,
+        split=split_hash({image.name: image.reference for image in images}),
+        poses=reference.poses,
+        alignment=reference.alignment,
+        options=options,
+        means=mean_values(images, options.metrics),
+        unavailable=dict(judges.unavailable),
+        weights=dict(judges.weights),
+        versions={**versions(), **{name: version(name) for name in _LIBRARIES}},
+        images=tuple(images),
+    )
+
+
+def _measure(
+    judges: Judges,
+    options: EvalOptions,
+    name: str,
+    prediction: _Prediction,
+    target: Pixels,
+    mask: Mask | None,
+    save: Path | None,
+) -> ImageResult:
+    image, affine = prediction.image, None
+    if options.align_colour:
+        affine = fit_affine(image, target / 255.0, mask)
+        image = apply_affine(image, affine)
+    pixels = to_uint8(image)
+    if save is not None:
+        write_rgb(save / f"{name}.png", pixels)
+    return ImageResult(
+        name=name,
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        values=judges.measure(pixels, target, mask),
+        prediction=_digest(pixels),
+        reference=_digest(target, mask),
+        colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
+        refinement=prediction.refinement,
+    )
+
+
+def _digest(pixels: Pixels, mask: Mask | None = None) -> str:
+    """SHA-256 of decoded pixels: the same for every lossless way to store them."""
+    digest = hashlib.sha256(f"{pixels.shape}".encode())
+    digest.update(np.ascontiguousarray(pixels).tobytes())
+    if mask is not None:
+        digest.update(np.packbits(mask).tobytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def _torch_on_one_thread() -> Iterator[None]:
+    """LPIPS gives one result on one thread, and its parallelism here is that of the images."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,328 @@
+"""What an evaluation compares with: sharp images, and cameras in the scene's world to render them from."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cleargs.capture.cameras import Camera as Lens
+from cleargs.capture.cameras import Pose
+from cleargs.capture.layout import mask_folder
+from cleargs.capture.sources import natural_key
+from cleargs.capture.tables import Frame, load_frames
+from cleargs.capture.transforms import TransformsFrame, read_transforms
+from cleargs.capture.undistort import Undistorter, undistorter
+from cleargs.capture.world import Similarity
+from cleargs.errors import InputError
+from cleargs.evaluate.alignment import LARGE_RESIDUAL, umeyama
+from cleargs.evaluate.metrics import Mask, Pixels
+from cleargs.evaluate.refinement import rotation_between
+from cleargs.evaluate.results import Alignment, PosesFrom
+from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
+from cleargs.pipeline.manifest import linked_manifest
+from cleargs.progress import Reporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.views import view_of
+
+T = TypeVar("T")
+
+MIN_SIDE = 32
+"""Pixels that the learned metrics need on each side."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceView:
+    """One image to compare with."""
+
+    name: str
+    """Stem of its file: what it is matched by."""
+    camera: Camera
+    """Pinhole of the image, in the scene's world."""
+    load: Callable[[], tuple[Pixels, Mask | None]]
+    """Gives the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """All images to compare with, by name in natural order."""
+
+    name: str
+    views: tuple[ReferenceView, ...]
+    poses: PosesFrom
+    alignment: Alignment
+
+
+def reference_of(
+    run_folder: Path,
+    directory: Path | None,
+    *,
+    poses: PosesFrom = "reference",
+    align: Path | None = None,
+    reporter: Reporter,
+) -> Reference:
+    """What the scenes of a run are compared with.
+
+    ``directory`` holds ``images/`` and ``transforms.json`` in the world of the run's input; None takes the
+    frames that the run held out. ``poses`` says whether the reference's poses are rendered, or the run's own
+    of the frames with the same stem. Where the run's poses come from SfM, the worlds are aligned by the
+    camera centres of equal stems: those of the folder ``align``, or of ``directory`` without it.
+
+    Raises InputError when files are missing or damaged, when stems do not match, or nothing was held out.
+    """
+    ingest = run_folder / "ingest"
+    manifest = linked_manifest(run_folder, "ingest")
+    if manifest is None:
+        raise InputError(
+            f"{run_folder} has no finished ingest: nothing is known of its world",
+            hint=f"see cleargs explain {run_folder}",
+        )
+    frames = load_frames(ingest)
+    if directory is None:
+        return _held_out(ingest, frames)
+    listed = _listed(directory)
+    own = _by_stem((_stem(frame.name), frame) for frame in frames if frame.registered)
+    if poses == "given":
+        matched = sorted(listed.keys() & own.keys(), key=natural_key)
+        _require_match(matched, listed, own, run_folder)
+        if len(matched) < len(listed):
+            reporter.warn(
+                f"{len(listed) - len(matched)} of {len(listed)} references match no frame: left out"
+            )
+        views = [_view(stem, listed[stem], _own_pose(own[stem])) for stem in matched]
+        return _reference(directory, views, poses, Alignment(world="scene", matched=len(matched)))
+    if manifest.summary.get("poses") == "sfm":
+        similarity, alignment = _aligned(
+            listed if align is None else _listed(align), own, run_folder, align or directory, reporter
+        )
+    else:
+        similarity = _similarity(manifest.summary.get("similarity"), ingest)
+        alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
+    views = [_view(stem, image, similarity.pose(_pose(image))) for stem, image in listed.items()]
+    return _reference(directory, views, poses, alignment)
+
+
+def reference_in(directory: Path) -> Reference:
+    """The images of ``directory`` (``images/``, ``transforms.json``) for a scene of the same world.
+
+    Raises InputError when files are missing or damaged.
+    """
+    views = [_view(stem, image, _pose(image)) for stem, image in _listed(directory).items()]
+    return _reference(directory, views, "reference", Alignment(world="scene", matched=0))
+
+
+def require_match(matched: int, found: Iterable[str], wanted: Iterable[str], hint: str) -> None:
+    """Raise InputError, with two examples of each side, when no stem is the same."""
+    if matched == 0:
+        raise InputError(
+            f"no stem matches: there are {_examples(found)} against {_examples(wanted)}", hint=hint
+        )
+
+
+def _require_match(
+    matched: list[str], listed: Mapping[str, object], own: Mapping[str, object], run: Path
+) -> None:
+    require_match(
+        len(matched), listed, own, f"name the references like the frames (cleargs show {run} ingest)"
+    )
+
+
+def _examples(stems: Iterable[str]) -> str:
+    names = sorted(stems, key=natural_key)
+    return f"{', '.join(names[:2]) or 'none'}{f' ... ({len(names)} in all)' if len(names) > 2 else ''}"
+
+
+def _reference(
+    directory: Path, views: Iterable[ReferenceView], poses: PosesFrom, alignment: Alignment
+) -> Reference:
+    ordered = sorted(views, key=lambda view: natural_key(view.name))
+    return Reference(directory.resolve().name, tuple(ordered), poses, alignment)
+
+
+# -- the run's own held-out frames -------------------------------------------------------------------------
+
+
+def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
+    test = [frame for frame in frames if frame.split == "test" and frame.registered]
+    if not test:
+        raise InputError(
+            "the run held no frames out: there is nothing to compare with",
+            hint="give --reference DIR, or run it again with --set ingest.holdout=every:8",
+        )
+    views = []
+    for stem, frame in _by_stem((_stem(frame.name), frame) for frame in test).items():
+        view = view_of(frame, ingest, 1.0)
+        mask = None if frame.mask is None else ingest / frame.mask
+        size = (frame.width, frame.height)
+        views.append(ReferenceView(stem, view.camera, partial(_load, ingest / frame.image, mask, size, None)))
+    views.sort(key=lambda view: natural_key(view.name))
+    return Reference("holdout", tuple(views), "given", Alignment(world="scene", matched=len(views)))
+
+
+# -- a folder ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """An entry of transforms.json."""
+
+    frame: TransformsFrame
+    mask: Path | None
+    way: Undistorter | None
+    """None without distortion."""
+
+
+def _listed(directory: Path) -> dict[str, _Listed]:
+    """Stem -> entry, of a folder with ``transforms.json``."""
+    path = directory / "transforms.json"
+    if not path.is_file():
+        raise InputError(
+            f"{directory} is no reference: it has no transforms.json",
+            hint="give a folder with images/ and transforms.json in the world of the run's input",
+        )
+    entries = read_transforms(path, poses=True)
+    if not entries:
+        raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
+    folder = mask_folder(directory / "images")
+    masks = {} if folder is None else _masks(folder)
+    ways: dict[Lens, Undistorter] = {}
+    listed = []
+    for entry in entries:
+        lens = entry.camera
+        assert lens is not None  # asked for with poses=True
+        if lens not in ways:
+            ways[lens] = undistorter(lens, sys.maxsize)
+        stem = _stem(entry.name)
+        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), ways[lens])))
+    return _by_stem(listed)
+
+
+def _masks(folder: Path) -> dict[str, Path]:
+    files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
+    return {path.stem: path for path in files}
+
+
+def _pose(listed: _Listed) -> Pose:
+    assert listed.frame.pose is not None  # read with poses=True
+    return listed.frame.pose
+
+
+def _view(stem: str, listed: _Listed, pose: Pose) -> ReferenceView:
+    lens, way = listed.frame.camera, listed.way
+    assert lens is not None and way is not None
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose.rotation, pose.translation
+    flat = way.pinhole
+    camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, world_to_camera)
+    size = (lens.width, lens.height)
+    return ReferenceView(stem, camera, partial(_load, listed.frame.path, listed.mask, size, way))
+
+
+def _load(
+    path: Path, mask: Path | None, size: tuple[int, int], way: Undistorter | None
+) -> tuple[Pixels, Mask | None]:
+    """The pinhole image and mask of a reference whose file should have ``size`` (width, height)."""
+    image = read_rgb(path)
+    if image.shape[1::-1] != size:
+        # A camera belongs to the image as it is stored, unless it fits it upright.
+        image = read_rgb(path, upright=False)
+    if image.shape[1::-1] != size:
+        raise InputError(
+            f"{path} has {image.shape[1]}x{image.shape[0]} pixels, its camera {size[0]}x{size[1]}",
+            hint="give the images at the size that transforms.json states (w, h)",
+        )
+    stencil = None if mask is None else read_mask(mask)
+    if stencil is not None and stencil.shape != image.shape[:2]:
+        raise InputError(
+            f"the mask {mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "
+            f"its image {size[0]}x{size[1]}",
+            hint="make masks of the size of their images",
+        )
+    if way is not None:
+        image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
+    if min(image.shape[:2]) < MIN_SIDE:
+        raise InputError(
+            f"{path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be judged",
+            hint=f"give references of at least {MIN_SIDE} pixels on each side",
+        )
+    return image, None if stencil is None else stencil > 0
+
+
+# -- worlds ------------------------------------------------------------------------------------------------
+
+
+def _similarity(noted: Any, ingest: Path) -> Similarity:
+    """From the input's world to the normalised one, as ingest noted it (the way back)."""
+    try:
+        return Similarity(
+            np.array(noted["rotation"], np.float64).T,
+            np.array(noted["translation"], np.float64),
+            float(noted["scale"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{ingest} does not say how it was normalised", hint="run that stage with --force"
+        ) from error
+
+
+def _aligned(
+    listed: Mapping[str, _Listed], own: Mapping[str, Frame], run: Path, folder: Path, reporter: Reporter
+) -> tuple[Similarity, Alignment]:
+    """The similarity from the reference's world to that of a run whose poses come from SfM."""
+    matched = sorted(listed.keys() & own.keys(), key=natural_key)
+    _require_match(matched, listed, own, run)
+    theirs = [_pose(listed[stem]) for stem in matched]
+    ours = [_own_pose(own[stem]) for stem in matched]
+    fit = umeyama(np.stack([pose.centre for pose in theirs]), np.stack([pose.centre for pose in ours]))
+    angles = [
+        rotation_between(fit.similarity.pose(their).rotation, our.rotation)
+        for their, our in zip(theirs, ours, strict=True)
+    ]
+    alignment = Alignment(
+        world="umeyama", matched=len(matched), residual=fit.residual, rotation_deg=float(np.mean(angles))
+    )
+    text = (
+        f"worlds aligned by {len(matched)} camera centres of {folder}: residual {fit.residual:.2%} "
+        f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
+    )
+    if fit.residual > LARGE_RESIDUAL:
+        reporter.warn(
+            f"{text}: large; if equal stems are not the same frames there, give --align DIR "
+            "with the poses of the run's own frames"
+        )
+    else:
+        reporter.info(text)
+    return fit.similarity, alignment
+
+
+def _own_pose(frame: Frame) -> Pose:
+    """The pose that the run has of a registered frame."""
+    values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
+    numbers = np.array([value for value in values if value is not None], np.float64)
+    return Pose.from_quaternion(numbers[:4], numbers[4:])
+
+
+# -- names -------------------------------------------------------------------------------------------------
+
+
+def _stem(name: str) -> str:
+    """A file's name without folder and image ending (a video's name may hold dots of its own)."""
+    path = Path(name)
+    return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+
+
+def _by_stem(items: Iterable[tuple[str, T]]) -> dict[str, T]:
+    found: dict[str, T] = {}
+    for stem, item in items:
+        if stem in found:
+            raise InputError(
+                f"two images are called {stem}: they cannot be told apart by their stems",
+                hint="give each image a name of its own",
+            )
+        found[stem] = item
+    return found

@@ -1,0 +1,180 @@
+"""What an evaluation found: ``eval.json`` and its Parquet twin."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from cleargs.errors import InputError
+from cleargs.evaluate.config import EvalOptions
+from cleargs.files import disk_error, write_json
+from cleargs.tables import column, write_table
+
+PosesFrom = Literal["reference", "given"]
+World = Literal["scene", "ingest", "umeyama"]
+
+LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
+"""All other metrics are better the higher they are."""
+
+
+class _Record(BaseModel):
+    # A perfect image has an infinite PSNR, which JSON has no number for: it is written as "Infinity".
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+
+class Alignment(_Record):
+    """How the reference's poses came into the scene's world."""
+
+    world: World = Field(
+        description="scene: they are in it; ingest: by the similarity of ingest; umeyama: fitted to the "
+        "camera centres of the frames of the same stem, because the run's poses come from SfM."
+    )
+    matched: int = Field(ge=0, description="References whose stem is that of a registered frame of the run.")
+    residual: float | None = Field(
+        None, ge=0, description="RMS distance of fitted centres, as a share of the trajectory's extent."
+    )
+    rotation_deg: float | None = Field(
+        None, ge=0, description="Mean angle between fitted and actual orientations, degrees."
+    )
+
+
+class Refinement(_Record):
+    """What pose refinement changed in one view."""
+
+    rotation_deg: float = Field(ge=0, description="Angle turned, degrees.")
+    shift: float = Field(ge=0, description="Distance that the camera centre moved, in the scene's units.")
+    loss_before: float = Field(ge=0, description="Mean squared difference at the reduced size, before.")
+    loss_after: float = Field(ge=0, description="The same after the last accepted step.")
+
+
+class ImageResult(_Record):
+    """The figures of one image."""
+
+    name: str = Field(description="Stem of the reference's file.")
+    width: int = Field(ge=1, description="Pixels.")
+    height: int = Field(ge=1, description="Pixels.")
+    values: dict[str, float | None] = Field(description="Metric -> value; null where it cannot be had.")
+    prediction: str = Field(description="SHA-256 of the evaluated 8-bit pixels.")
+    reference: str = Field(description="SHA-256 of the reference's 8-bit pixels, and of its mask.")
+    colour: tuple[tuple[float, ...], ...] | None = Field(
+        None, description="The affine [3, 4] on sRGB that colour alignment applied."
+    )
+    refinement: Refinement | None = Field(None, description="What pose refinement did.")
+
+
+class Evaluation(_Record):
+    """One scene, or one folder of images, against one reference."""
+
+    subject: str = Field(description="The stage, or the name of the scene file or of the folder of images.")
+    scene: str | None = Field(description="SHA-256 of the scene file; null for a folder of images.")
+    reference: str = Field(description="Name of the reference folder, or holdout.")
+    split: str = Field(description="SHA-256 over the sorted stems and the digests of the references.")
+    poses: PosesFrom = Field(description="Whose poses are rendered: the reference's, or the run's own.")
+    alignment: Alignment
+    options: EvalOptions
+    means: dict[str, float | None] = Field(description="Metric -> mean over the images.")
+    unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
+    weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
+    versions: dict[str, str]
+    images: tuple[ImageResult, ...]
+
+
+class Report(_Record):
+    """``eval.json``: evaluations against one reference, one a stage."""
+
+    schema_version: Literal[1] = 1
+    evaluations: tuple[Evaluation, ...]
+
+    def document(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        document: dict[str, Any] = json.loads(self.model_dump_json())
+        return document
+
+
+def mean_values(images: Sequence[ImageResult], metrics: Sequence[str]) -> dict[str, float | None]:
+    """The mean of each metric over the images that have it; None where none has."""
+    means: dict[str, float | None] = {}
+    for metric in metrics:
+        values = [value for image in images if (value := image.values[metric]) is not None]
+        means[metric] = math.fsum(values) / len(values) if values else None
+    return means
+
+
+def split_hash(references: Mapping[str, str]) -> str:
+    """SHA-256 over the sorted stems with their references' digests: equal for equal test sets only."""
+    lines = "".join(f"{stem} {digest}\n" for stem, digest in sorted(references.items()))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write ``path`` (.json) and the table beside it (.parquet). Raises StoreError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(error, path) from error
+    write_json(path, report.document())
+    schema = table_schema(report.evaluations[0].options.metrics)
+    write_table(path.with_suffix(".parquet"), pa.Table.from_pylist(_rows(report), schema), schema)
+
+
+def read_report(path: Path) -> Report:
+    """Read what `write_report` wrote. Raises InputError when it is missing or damaged."""
+    try:
+        return Report.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise InputError(
+            f"cannot read {path}: {str(error).splitlines()[0]}", hint="make it again with `cleargs eval`"
+        ) from error
+
+
+def table_schema(metrics: Sequence[str]) -> pa.Schema:
+    """The columns of the Parquet twin: one row an image, one column a metric."""
+    return pa.schema(
+        [
+            column("subject", pa.string(), "stage, or name of the scene file or of the folder of images"),
+            column("name", pa.string(), "stem of the reference's file"),
+            column("width", pa.int32(), "px"),
+            column("height", pa.int32(), "px"),
+            *(column(metric, pa.float64(), meaning(metric), nullable=True) for metric in metrics),
+            column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
+            column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
+            column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),
+            column("refined_rotation_deg", pa.float64(), "angle of pose refinement", nullable=True),
+            column(
+                "refined_shift", pa.float64(), "movement of the camera centre, scene units", nullable=True
+            ),
+        ]
+    )
+
+
+def meaning(metric: str) -> str:
+    """What a metric is, in one line."""
+    known = {
+        "psnr": "dB, of the mean squared error of an image; higher is better",
+        "ssim": "Gaussian window 11, sigma 1.5, border mirrored; higher is better",
+        "lpips_alex": "LPIPS v0.1, AlexNet; lower is better",
+        "lpips_vgg": "LPIPS v0.1, VGG16; lower is better",
+    }
+    return known.get(metric, "no-reference score; higher is better")
+
+
+def _rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "subject": evaluation.subject,
+            **image.model_dump(include={"name", "width", "height", "prediction", "reference"}),
+            **image.values,
+            "colour": None if image.colour is None else [x for row in image.colour for x in row],
+            "refined_rotation_deg": image.refinement.rotation_deg if image.refinement else None,
+            "refined_shift": image.refinement.shift if image.refinement else None,
+        }
+        for evaluation in report.evaluations
+        for image in evaluation.images
+    ]

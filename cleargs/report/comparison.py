@@ -1,0 +1,125 @@
+"""A comparison as pictures: values of all variants by column, and what the scenes look like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.evaluate.cells import Cell, Cells, ViewSet
+from cleargs.evaluate.results import Evaluation
+from cleargs.evaluate.tables import TITLES, metric_title
+from cleargs.files import atomic_path
+from cleargs.media.image import read_rgb, write_rgb
+from cleargs.report.contact import Tile, contact_sheet
+
+PLOTTED = ("psnr", "ssim", "lpips_alex", "clarity-net")
+
+
+def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
+    """Write a PNG: a row a set of views, a panel a metric; a point a variant and column, bars for the spread
+    over the samples."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    metrics = [metric for metric in PLOTTED if metric in cells.metrics()]
+    sets = cells.view_sets()
+    width = max(4.0, 1.1 * max(len(cells.columns(views)) for views in sets))
+    figure, panels = pyplot.subplots(
+        len(sets), len(metrics), squeeze=False, figsize=(width * len(metrics), 3.6 * len(sets))
+    )
+    for row, views in zip(panels, sets, strict=True):
+        for panel, metric in zip(row, metrics, strict=True):
+            _panel(panel, cells, labels, views, metric)
+    handles, names = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="lower center", ncols=4, frameon=False)
+    figure.tight_layout(rect=(0, 0.06 + 0.02 / len(sets), 1, 1))
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+    pyplot.close(figure)
+
+
+def _panel(panel: object, cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> None:
+    from matplotlib.axes import Axes
+
+    assert isinstance(panel, Axes)
+    columns, variants = cells.columns(views), cells.variants()
+    for number, variant in enumerate(variants):
+        found = [cells.spread(views, column, variant, metric) for column in columns]
+        places = [
+            place + (number - (len(variants) - 1) / 2) * 0.09
+            for place, value in enumerate(found)
+            if value is not None
+        ]
+        values = [value for value in found if value is not None]
+        panel.errorbar(
+            places,
+            [value.mean for value in values],
+            [value.deviation or 0.0 for value in values],
+            fmt="o",
+            markersize=4,
+            label=labels[variant],
+        )
+    panel.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
+    panel.set_title(f"{metric_title(metric)}  {TITLES[views].split(',')[0]}", fontsize=9)
+    panel.grid(axis="y", alpha=0.3)
+
+
+def comparison_sheet(
+    path: Path,
+    out: Path,
+    cells: Cells,
+    labels: Mapping[str, str],
+    variants: Sequence[str],
+    captures: Mapping[str, Path],
+) -> None:
+    """Write a PNG with a row a column of the tables: truth, input, and the scenes of ``variants``.
+
+    Each row shows one of the worse frames of the first sample of its column; ``captures`` maps samples to
+    their captures.
+    """
+    views = cells.view_sets()[0]
+    rows = []
+    for column in cells.columns(views):
+        first = next(cell for cell in cells.cells if (cell.views, cell.column) == (views, column))
+        shown = {
+            cell.variant: cell
+            for cell in cells.cells
+            if (cell.views, cell.sample) == (views, first.sample) and cell.variant in variants
+        }
+        capture = captures[first.sample]
+        name = _telling(out, first, capture)
+        tiles = [
+            Tile(_find(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
+            Tile(_find(capture / "images", name), "input"),
+        ]
+        for variant, cell in shown.items():
+            tiles.append(Tile(_find(out / cell.evaluation, name), labels[variant]))
+        rows.append([tile for tile in tiles if tile.image is not None])
+    write_rgb(path, contact_sheet(rows, tile_width=320))
+
+
+def _telling(out: Path, cell: Cell, capture: Path) -> str:
+    """The frame to show: a bad one, but not the worst. At the upper quartile of the input's error against the
+    truth; where there is no such pair, at the lower quartile of the scene's PSNR."""
+    truth, observed = capture / "truth" / "observed" / "images", capture / "images"
+    evaluation = Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
+    errors = {}
+    for image in evaluation.images:
+        sharp, seen = _find(truth, image.name), _find(observed, image.name)
+        if sharp is not None and seen is not None and sharp.shape == seen.shape:
+            errors[image.name] = float(np.square(sharp - seen).mean(dtype=np.float64))
+        else:
+            errors[image.name] = -(image.values["psnr"] or 0.0)
+    ordered = sorted(errors, key=lambda name: (errors[name], name))
+    return ordered[3 * len(ordered) // 4]
+
+
+def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
+    """The image of that stem as sRGB in [0, 1]; None without one."""
+    files = sorted(folder.glob(f"{stem}.*"))
+    return read_rgb(files[0]).astype(np.float32) / np.float32(255) if files else None

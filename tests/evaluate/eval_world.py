@@ -1,0 +1,192 @@
+"""A small scene, references rendered from it, and the folders of a run around it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cleargs.capture.cameras import Pose
+from cleargs.capture.tables import FRAMES
+from cleargs.capture.world import Similarity
+from cleargs.evaluate.evaluate import EvalOptions
+from cleargs.media.image import to_uint8, write_mask, write_rgb
+from cleargs.pipeline.keys import KeyParts
+from cleargs.pipeline.manifest import Manifest, write_manifest
+from cleargs.progress import SilentReporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.ply import write_ply
+from cleargs.splat.render import render
+from cleargs.splat.scene import Scene
+from cleargs.tables import write_table
+
+WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
+WORLD = Similarity(
+    Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix(), np.array([3.0, -7, 2]), 2.5
+)
+"""From the input's world to the run's."""
+
+PLAIN = EvalOptions(lpips=(), scorers=())
+"""PSNR and SSIM alone."""
+
+
+@dataclass
+class Remarks(SilentReporter):
+    """Keeps what it is told."""
+
+    infos: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def info(self, text: str) -> None:
+        self.infos.append(text)
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+def make_scene(seed: int = 0, count: int = 300) -> Scene:
+    """Opaque coloured blobs that fill the views of `cameras`."""
+    rng = np.random.default_rng(seed)
+    sh = np.zeros((count, 1, 3))
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
+    arrays = (
+        rng.uniform([-2.5, -2, 3], [2.5, 2, 5], (count, 3)),
+        np.log(rng.uniform(0.08, 0.4, (count, 3))),
+        rng.normal(size=(count, 4)),
+        np.full(count, 3.0),
+        sh,
+    )
+    gaussians = Gaussians(*(torch.tensor(array, dtype=torch.float32) for array in arrays))
+    return Scene(gaussians, background=(0.2, 0.3, 0.4))
+
+
+def cameras(count: int = 6) -> list[Camera]:
+    """Cameras on a winding path, looking at the scene."""
+    found = []
+    for t in np.linspace(0, 1, count):
+        centre = np.array([0.8 * t - 0.4, 0.2 * np.sin(7 * t), 0.3 * np.cos(5 * t)])
+        rotation = Rotation.from_euler("yx", [6 - 12 * t, 3 * np.sin(9 * t)], degrees=True).as_matrix()
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+        found.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+    return found
+
+
+def picture(scene: Scene, camera: Camera) -> NDArray[np.uint8]:
+    image = render(scene.gaussians, camera, background=scene.background).image
+    return to_uint8(image.numpy())
+
+
+def to_input(camera: Camera, similarity: Similarity = WORLD) -> NDArray[np.float64]:
+    """The OpenGL camera-to-world matrix in the input's world of a camera in the run's."""
+    rotation = camera.world_to_camera[:3, :3] @ similarity.rotation
+    centre = similarity.rotation.T @ camera.centre * similarity.scale + similarity.origin
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation.T @ np.diag([1.0, -1.0, -1.0]), centre
+    return matrix
+
+
+def write_reference(
+    folder: Path,
+    scene: Scene,
+    views: Sequence[Camera],
+    *,
+    names: Sequence[str] | None = None,
+    similarity: Similarity = WORLD,
+    lens: dict[str, Any] | None = None,
+    pictures: Sequence[NDArray[np.uint8]] | None = None,
+) -> Path:
+    """``images/`` and ``transforms.json`` of what the scene shows at ``views``."""
+    (folder / "images").mkdir(parents=True)
+    names = names or [f"{index:03d}" for index in range(len(views))]
+    frames = []
+    for index, (name, view) in enumerate(zip(names, views, strict=True)):
+        write_rgb(folder / "images" / f"{name}.png", pictures[index] if pictures else picture(scene, view))
+        frames.append(
+            {"file_path": f"images/{name}.png", "transform_matrix": to_input(view, similarity).tolist()}
+        )
+    first = views[0]
+    camera = {"w": first.width, "h": first.height, "fl_x": first.fx, "fl_y": first.fy}
+    camera |= {"cx": first.cx, "cy": first.cy, **(lens or {})}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    return folder
+
+
+def write_run(
+    folder: Path,
+    scene: Scene,
+    views: Sequence[Camera],
+    *,
+    poses: Literal["input", "sfm"] = "input",
+    test: Sequence[int] = (),
+    masked: bool = False,
+    names: Sequence[str] | None = None,
+) -> Path:
+    """A run as far as evaluation reads it: ingest, and the scene of g0."""
+    ingest = folder / "ingest"
+    (ingest / "images").mkdir(parents=True)
+    (folder / "run.toml").write_text("")
+    rows = []
+    for index, view in enumerate(views):
+        image = f"images/{index:06d}.png"
+        write_rgb(ingest / image, picture(scene, view))
+        if masked:
+            (ingest / "masks").mkdir(exist_ok=True)
+            mask = np.full((view.height, view.width), 255, np.uint8)
+            mask[:, : view.width // 2] = 0
+            write_mask(ingest / "masks" / f"{index:06d}.png", mask)
+        pose = Pose(view.world_to_camera[:3, :3], view.world_to_camera[:3, 3])
+        rows.append(
+            {
+                "frame_id": index,
+                "name": f"images/{names[index] if names else f'{index:03d}'}.jpg",
+                "image": image,
+                "time_s": None,
+                **{key: getattr(view, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+                **dict(zip(("qw", "qx", "qy", "qz"), pose.quaternion, strict=True)),
+                **dict(zip(("tx", "ty", "tz"), pose.translation.tolist(), strict=True)),
+                "registered": True,
+                "n_points": 0,
+                "split": "test" if index in test else "train",
+            }
+        )
+    write_table(ingest / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
+    parts = KeyParts(
+        stage="ingest", version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
+    )
+    manifest = Manifest(
+        stage="ingest",
+        key=parts.key,
+        status="complete",
+        missing=(),
+        inherited=(),
+        parts=parts,
+        origins={},
+        files={},
+        digest="",
+        versions={},
+        started="",
+        seconds=0.0,
+        device="cpu",
+        summary={"poses": poses, "similarity": WORLD.to_json()},
+    )
+    write_manifest(ingest, manifest)
+    (folder / "g0").mkdir()
+    write_ply(folder / "g0" / "scene.ply", scene)
+    return folder
+
+
+def turned(camera: Camera, degrees: float) -> Camera:
+    """The camera turned about its own axes."""
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.8, 0.0])).as_matrix()
+    return replace(camera, world_to_camera=step @ camera.world_to_camera)

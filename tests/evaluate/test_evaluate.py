@@ -1,0 +1,329 @@
+"""Evaluation of a small scene against its own renders: worlds, poses, hold-out, adjustments, results."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from eval_world import (
+    FOCAL,
+    HEIGHT,
+    PLAIN,
+    WIDTH,
+    WORLD,
+    Remarks,
+    cameras,
+    make_scene,
+    picture,
+    turned,
+    write_reference,
+    write_run,
+)
+from numpy.typing import NDArray
+
+from cleargs.capture.cameras import Camera as Lens
+from cleargs.capture.world import Similarity
+from cleargs.errors import InputError
+from cleargs.evaluate.alignment import umeyama
+from cleargs.evaluate.colour import apply_affine, fit_affine
+from cleargs.evaluate.evaluate import (
+    EvalOptions,
+    Evaluation,
+    Reference,
+    Report,
+    evaluate_images,
+    evaluate_scene,
+    reference_in,
+    reference_of,
+)
+from cleargs.evaluate.results import read_report, split_hash, write_report
+from cleargs.media.image import write_mask, write_rgb
+
+SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
+
+# Poses pass through another world and back in float64; a float32 render then differs in few pixels by one
+# step of 255 (60 dB and more), where a pose 0.1 degrees wrong gives less than 45 dB.
+NEARLY_EQUAL = 58.0
+
+
+def measured(scene: Path, reference: Reference, options: EvalOptions = PLAIN, threads: int = 1) -> Evaluation:
+    return evaluate_scene(scene, reference, options=options, threads=threads, reporter=Remarks())
+
+
+def psnr_of(evaluation: Evaluation) -> float:
+    found = evaluation.means["psnr"]
+    assert found is not None
+    return found
+
+
+# -- worlds and poses --------------------------------------------------------------------------------------
+
+
+def test_umeyama_recovers_a_planted_similarity() -> None:
+    rng = np.random.default_rng(3)
+    source = rng.normal(size=(12, 3)) + 1e5  # far from the origin, as GPS-based worlds are
+    fit = umeyama(source, WORLD.points(source))
+    np.testing.assert_allclose(fit.similarity.rotation, WORLD.rotation, atol=1e-9)
+    assert fit.similarity.scale == pytest.approx(WORLD.scale, rel=1e-9)
+    assert fit.residual < 1e-9
+    noisy = umeyama(source, WORLD.points(source) + rng.normal(0, 0.05, source.shape))
+    assert 0.005 < noisy.residual < 0.1
+
+
+def test_umeyama_does_not_mirror() -> None:
+    source = np.random.default_rng(0).normal(size=(8, 3))
+    fit = umeyama(source, source * [1, 1, -1])
+    assert np.linalg.det(fit.similarity.rotation) == pytest.approx(1.0)
+    assert fit.residual > 0.05
+
+
+@pytest.mark.parametrize("centres", [np.eye(3)[:2], np.outer(np.arange(5.0), [1, 2, 3])])
+def test_umeyama_needs_three_places_off_a_line(centres: NDArray[np.float64]) -> None:
+    with pytest.raises(InputError):
+        umeyama(centres, centres)
+
+
+def test_own_renders_are_perfect_in_the_scenes_world(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    found = measured(run / "g0" / "scene.ply", reference_in(folder))
+    assert psnr_of(found) > NEARLY_EQUAL and found.alignment.world == "scene"
+    assert found.images[0].prediction and found.scene is not None
+
+
+def test_poses_go_through_ingests_similarity(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras())
+    reference = reference_of(run, folder, reporter=Remarks())
+    assert reference.alignment.world == "ingest" and reference.alignment.matched == 6
+    assert psnr_of(measured(run / "g0" / "scene.ply", reference)) > NEARLY_EQUAL
+    # Taken as they are, the poses are wrong.
+    assert psnr_of(measured(run / "g0" / "scene.ply", reference_in(folder))) < 25
+
+
+def test_worlds_of_sfm_are_aligned_by_camera_centres(tmp_path: Path) -> None:
+    scene, other = make_scene(), Similarity(WORLD.rotation.T, np.array([1.0, 2, 3]), 0.2)
+    run = write_run(tmp_path / "run", scene, cameras(), poses="sfm")
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=other)
+    remarks = Remarks()
+    reference = reference_of(run, folder, reporter=remarks)
+    assert reference.alignment.world == "umeyama" and not remarks.warnings
+    assert reference.alignment.residual is not None and reference.alignment.residual < 1e-9
+    assert psnr_of(measured(run / "g0" / "scene.ply", reference)) > NEARLY_EQUAL
+
+
+def test_equal_stems_of_other_views_are_noticed_and_helped(tmp_path: Path) -> None:
+    scene, novel = make_scene(), [turned(camera, 3.0) for camera in cameras()[::-1]]
+    run = write_run(tmp_path / "run", scene, cameras(), poses="sfm")
+    observed = write_reference(tmp_path / "observed", scene, cameras())
+    folder = write_reference(tmp_path / "novel", scene, novel)
+    remarks = Remarks()
+    reference_of(run, folder, reporter=remarks)
+    assert "--align" in remarks.warnings[0]
+    reference = reference_of(run, folder, align=observed, reporter=Remarks())
+    assert psnr_of(measured(run / "g0" / "scene.ply", reference)) > NEARLY_EQUAL
+
+
+def test_given_poses_are_the_runs_own(tmp_path: Path) -> None:
+    scene, noisy = make_scene(), [turned(camera, 1.0) for camera in cameras()]
+    run = write_run(tmp_path / "run", scene, noisy)
+    folder = write_reference(tmp_path / "truth", scene, cameras())
+    at_truth = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    given = reference_of(run, folder, poses="given", reporter=Remarks())
+    at_given = measured(run / "g0" / "scene.ply", given)
+    assert psnr_of(at_truth) > NEARLY_EQUAL and psnr_of(at_given) < 35
+    assert at_given.poses == "given" and at_given.split == at_truth.split
+
+
+def test_reference_at_another_size(tmp_path: Path) -> None:
+    scene, large = make_scene(), [camera.resized(144, 108) for camera in cameras()]
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, large)
+    for poses in ("reference", "given"):
+        found = measured(run / "g0" / "scene.ply", reference_of(run, folder, poses=poses, reporter=Remarks()))
+        assert found.images[0].width == 144 and psnr_of(found) > NEARLY_EQUAL
+
+
+def test_distorted_references_are_undistorted(tmp_path: Path) -> None:
+    scene = make_scene()
+    lens = Lens("OPENCV", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, 0.08, 0.0, 0.0, 0.0))
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1).reshape(-1, 2)
+    rays = np.asarray(lens.colmap().cam_from_img(pixels)).reshape(HEIGHT, WIDTH, 2)
+    wide, zoom = cameras(), 4  # a finer render to sample from
+    pictures = []
+    for camera in wide:
+        fine = picture(scene, camera.resized(zoom * WIDTH, zoom * HEIGHT))
+        at = (rays * FOCAL + [WIDTH / 2, HEIGHT / 2]) * zoom - 0.5
+        maps = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+        pictures.append(np.asarray(cv2.remap(fine, *maps, cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)))
+    run = write_run(tmp_path / "run", scene, wide)
+    folder = write_reference(tmp_path / "truth", scene, wide, lens={"k1": 0.08}, pictures=pictures)
+    found = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    assert found.images[0].width < WIDTH  # the corners of the lens's image are cropped
+    ignored = write_reference(tmp_path / "wrong", scene, wide, pictures=pictures)
+    without = measured(run / "g0" / "scene.ply", reference_of(run, ignored, reporter=Remarks()))
+    # Resampling twice costs sharpness (about 33 dB); distortion left alone costs far more.
+    assert psnr_of(found) > psnr_of(without) + 5
+
+
+# -- what is compared --------------------------------------------------------------------------------------
+
+
+def test_held_out_frames_with_their_masks(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras(), test=[1, 4], masked=True)
+    image = run / "ingest" / "images" / "000001.png"
+    damaged = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    damaged[:, WIDTH // 2 :] = picture(scene, cameras()[1])[:, WIDTH // 2 :]
+    write_rgb(image, damaged)  # wrong only where the mask says ignore
+    reference = reference_of(run, None, reporter=Remarks())
+    found = measured(run / "g0" / "scene.ply", reference)
+    assert found.reference == "holdout" and [image.name for image in found.images] == ["001", "004"]
+    assert psnr_of(found) > NEARLY_EQUAL
+
+
+def test_a_mask_beside_the_references(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    pictures = [picture(scene, camera) for camera in cameras()]
+    pictures[2] = pictures[2].copy()
+    pictures[2][:20, :30] = 0
+    folder = write_reference(tmp_path / "truth", scene, cameras(), pictures=pictures)
+    before = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    (folder / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:20, :30] = 0
+    write_mask(folder / "masks" / "002.png", mask)
+    after = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    assert (before.images[2].values["psnr"] or 0) < 30
+    assert psnr_of(after) > NEARLY_EQUAL and after.split != before.split
+
+
+def test_another_methods_images(tmp_path: Path) -> None:
+    scene = make_scene()
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    (tmp_path / "theirs").mkdir()
+    for index in (0, 2, 3):
+        write_rgb(tmp_path / "theirs" / f"{index:03d}.png", picture(scene, cameras()[index]))
+    remarks = Remarks()
+    found = evaluate_images(
+        tmp_path / "theirs", reference_in(folder), options=PLAIN, threads=1, reporter=remarks
+    )
+    assert psnr_of(found) == math.inf and found.scene is None and found.subject == "theirs"
+    assert "3 of 6" in remarks.warnings[0]
+
+
+def test_saved_renders_evaluate_to_the_same(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, [turned(camera, 1.0) for camera in cameras()])
+    folder = write_reference(tmp_path / "truth", scene, cameras())
+    reference = reference_of(run, folder, poses="given", reporter=Remarks())
+    options = PLAIN.model_copy(update={"align_colour": True})
+    saved = evaluate_scene(
+        run / "g0" / "scene.ply",
+        reference,
+        options=options,
+        threads=1,
+        reporter=Remarks(),
+        save=tmp_path / "saved",
+    )
+    again = evaluate_images(tmp_path / "saved", reference, options=PLAIN, threads=1, reporter=Remarks())
+    assert again.means == saved.means and again.split == saved.split
+    assert [i.prediction for i in again.images] == [i.prediction for i in saved.images]
+
+
+def test_results_do_not_depend_on_threads(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, [turned(camera, 0.4) for camera in cameras()])
+    folder = write_reference(tmp_path / "truth", scene, cameras())
+    reference = reference_of(run, folder, poses="given", reporter=Remarks())
+    options = EvalOptions(scorers=("naturalness-stats",), lpips=(), align_colour=True, refine_poses=2)
+    one, two = (measured(run / "g0" / "scene.ply", reference, options, threads) for threads in (1, 2))
+    assert one.model_dump_json() == two.model_dump_json()
+
+
+# -- adjustments -------------------------------------------------------------------------------------------
+
+
+def test_colour_alignment_recovers_a_planted_affine(tmp_path: Path) -> None:
+    planted = np.array([[0.8, 0.05, 0, 0.05], [0, 0.7, 0.1, 0.1], [0.05, 0, 0.75, 0.08]])
+    scene = make_scene()
+    pictures = [
+        (apply_affine(picture(scene, camera) / 255.0, planted) * 255).round().astype(np.uint8)
+        for camera in cameras()
+    ]
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME, pictures=pictures)
+    run = write_run(tmp_path / "run", scene, cameras())
+    plain = measured(run / "g0" / "scene.ply", reference_in(folder))
+    assert plain.images[0].colour is None and psnr_of(plain) < 30
+    options = PLAIN.model_copy(update={"align_colour": True})
+    aligned = measured(run / "g0" / "scene.ply", reference_in(folder), options)
+    # Both images are rounded to 8 bits.
+    np.testing.assert_allclose(aligned.images[0].colour, planted, atol=2e-3)
+    assert psnr_of(aligned) > 50
+
+
+def test_colour_of_a_grey_image_stays_defined() -> None:
+    grey = np.full((8, 8, 3), 0.5)
+    affine = fit_affine(grey, grey * 0.5, None)
+    np.testing.assert_allclose(apply_affine(grey, affine), grey * 0.5, atol=1e-4)
+    np.testing.assert_array_equal(fit_affine(grey, grey, np.zeros((8, 8), bool)), np.eye(3, 4))
+
+
+def test_pose_refinement_recovers_a_planted_turn(tmp_path: Path) -> None:
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, [turned(camera, 1.0) for camera in cameras(3)])
+    folder = write_reference(tmp_path / "truth", scene, cameras(3))
+    reference = reference_of(run, folder, poses="given", reporter=Remarks())
+    plain = measured(run / "g0" / "scene.ply", reference)
+    options = PLAIN.model_copy(update={"refine_poses": 8})
+    refined = measured(run / "g0" / "scene.ply", reference, options)
+    assert psnr_of(plain) < 35 and plain.images[0].refinement is None
+    for image in refined.images:
+        assert image.refinement is not None
+        assert image.refinement.rotation_deg == pytest.approx(1.0, abs=0.05)
+        assert image.refinement.loss_after < 1e-2 * image.refinement.loss_before
+    assert psnr_of(refined) > 45
+
+
+# -- the result --------------------------------------------------------------------------------------------
+
+
+def test_the_result_is_written_and_read(tmp_path: Path) -> None:
+    scene = make_scene()
+    folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
+    (tmp_path / "theirs").mkdir()
+    for index, camera in enumerate(cameras()):
+        write_rgb(tmp_path / "theirs" / f"{index:03d}.png", picture(scene, turned(camera, float(index))))
+    options = PLAIN.model_copy(update={"align_colour": True})
+    found = evaluate_images(
+        tmp_path / "theirs", reference_in(folder), options=options, threads=1, reporter=Remarks()
+    )
+    report = Report(evaluations=(found,))
+    path = tmp_path / "deep" / "eval.json"
+    write_report(path, report)
+    json.loads(path.read_text(), parse_constant=pytest.fail)  # plain JSON, without Infinity or NaN
+    assert read_report(path) == report
+    rows = pq.read_table(path.with_suffix(".parquet")).to_pylist()
+    assert [row["psnr"] for row in rows] == [image.values["psnr"] for image in found.images]
+    assert len(rows[0]["colour"]) == 12
+    assert found.means["ssim"] == pytest.approx(np.mean([row["ssim"] for row in rows]))
+    assert found.split == split_hash({row["name"]: row["reference"] for row in rows})
+
+
+def test_an_infinite_psnr_survives_the_file(tmp_path: Path) -> None:
+    scene = make_scene()
+    folder = write_reference(tmp_path / "truth", scene, cameras(2), similarity=SAME)
+    found = evaluate_images(
+        folder / "images", reference_in(folder), options=PLAIN, threads=1, reporter=Remarks()
+    )
+    write_report(tmp_path / "eval.json", Report(evaluations=(found,)))
+    json.loads((tmp_path / "eval.json").read_text(), parse_constant=pytest.fail)
+    assert read_report(tmp_path / "eval.json").evaluations[0].means["psnr"] == math.inf
