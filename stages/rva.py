@@ -3,36 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rva.config import RvaConfig
 
-VERSION = 1
+VERSION = 2
 CONFIG = RvaConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
 }
 OUTPUTS = ("frames.parquet", "bins.parquet")
-LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
 
 _FRAMES_PER_MINUTE = 600  # frames of about 1 MP on one core, decoding included
+_REPLIES_PER_MINUTE = 20  # of a vision-language model, one at a time: a guess, since the server is unknown
 
 
 def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
-    """Nothing outside the store: the evaluator has no weights."""
+    """The folder of the vision-language model, where one runs in process."""
+    if config.evaluator == "qwen3-vl" and config.qwen.model_dir:
+        return {"vlm": Path(config.qwen.model_dir).expanduser().absolute()}
     return {}
 
 
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
-    """Cues take nearly all of the time; memory is a handful of images a thread."""
+    """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
+    config = context.config
     images = context.inputs.get("ingest", Path()) / "images"
     frames = sum(1 for _ in images.iterdir()) if images.is_dir() else 0
-    return Estimate(minutes=frames / _FRAMES_PER_MINUTE, memory_gb=0.3, disk_gb=0.001)
+    if config.evaluator == "statistics":
+        return Estimate(minutes=frames / _FRAMES_PER_MINUTE, memory_gb=0.3, disk_gb=0.001)
+    at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
+    weights = sum(file.stat().st_size for folder in context.externals.values() for file in folder.glob("*"))
+    minutes = frames / (_REPLIES_PER_MINUTE * at_once)
+    return Estimate(minutes=minutes, memory_gb=0.3 + weights / 1e9, disk_gb=0.001)
 
 
 def run(context: StageContext[RvaConfig]) -> StageResult:
-    """Cues -> R and B -> geometric utility -> roles -> coverage -> weights; writes the two tables."""
+    """Cues -> R and B -> geometric utility -> roles -> coverage -> weights; writes the two tables.
+
+    A frame that the evaluator could not score is treated like one without a pose: it is in no set, weighs 0,
+    and the stage is done only in part.
+    """
     import numpy as np
 
     from cleargs.capture.tables import load_frames, load_observations
@@ -46,14 +60,19 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]
     observations = Observations(*load_observations(ingest))
 
-    evaluator = make_evaluator(config)
+    evaluator = make_evaluator(
+        config, seed=context.seed, device=context.device, cache=context.checkpoints / "scores"
+    )
     views = [
         View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
+    scored = np.asarray(~np.isnan(cues).any(axis=1))
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
-    result = assess(frame_id, cues, poses_from(frames), observations, config)
+    poses = poses_from(frames)
+    poses = replace(poses, registered=poses.registered & scored)
+    result = assess(frame_id, cues, poses, observations, config)
 
     names = [frame.name for frame in frames]
     write_table(
@@ -65,4 +84,9 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         context.reporter.warn(
             "no frame is reliable: the best by R - B stand in for the reliable set in the geometry"
         )
-    return StageResult(summary=figures)
+    missing = tuple(
+        f"frame {frame.frame_id} ({frame.name}) was not scored"
+        for frame, there in zip(frames, scored, strict=True)
+        if not there
+    )
+    return StageResult(missing, figures)

@@ -29,7 +29,8 @@ from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
     from cleargs.evaluate.cells import Cell
-    from cleargs.evaluate.comparison import Made, Sample
+    from cleargs.evaluate.comparison import Made, Recipe, Sample
+    from cleargs.evaluate.variants import Variant
 
 
 def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, ...]:
@@ -153,7 +154,7 @@ def compare(
     found = Cells(cells)
     labels = {scene.variant.name: scene.variant.label for scene in scenes}
     baselines = BASELINES if not runs else found.variants()[:1]
-    text = markdown(found, labels, baselines)
+    text = _head(chosen if not runs else (), seeds, recipe) + markdown(found, labels, baselines)
     write_bytes(out / "comparison.md", text.encode())
     document = {"cells": [cell.model_dump() for cell in cells], "failures": failures}
     write_json(out / "comparison.json", document)
@@ -167,6 +168,25 @@ def compare(
         click.echo(text)
         click.echo(f"written: {out}/comparison.md, comparison.json, comparison.png, sheet.png")
     return DONE_IN_PART if failures else 0
+
+
+def _head(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> str:
+    """What the tables were made with."""
+    from cleargs.pipeline.manifest import versions
+
+    nets = ", ".join(recipe.options.lpips)
+    lines = ["# Comparison", "", f"LPIPS v0.1 with {nets}; device {recipe.device}."]
+    if variants:
+        settings = "".join(f" --set {override}" for override in recipe.overrides)
+        lines.append(f"Recipe `{recipe.workflow}{settings}`; seeds {', '.join(map(str, seeds))}.")
+        lines += ["", *(f"* {variant.label}: {_settings(variant)}" for variant in variants)]
+    lines += ["", ", ".join(f"{name} {version}" for name, version in versions().items())]
+    return "\n".join(lines) + "\n\n"
+
+
+def _settings(variant: Variant) -> str:
+    changes = ", ".join(f"`{override}`" for override in variant.overrides) or "the recipe"
+    return f"{changes}; the scene of `{variant.stage}`"
 
 
 def _check_names(samples: Sequence[Sample]) -> None:

@@ -89,7 +89,8 @@ def run(
     """Turn INPUT into a clean scene in the folder RUN.
 
     INPUT is a video, an image folder, a COLMAP project (images/ and sparse/0), or a folder with
-    transforms.json or poses_bounds.npy. Results that are there already are not made again; an interrupted run goes on.
+    transforms.json or poses_bounds.npy. Results that are there already are not made again; an interrupted
+    run goes on.
     """
     if not source.exists():
         raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")

@@ -50,13 +50,14 @@ class Supervision:
 
 
 def load_supervision(ingest: Path, rva: Path) -> Supervision:
-    """Read the finished folders of ingest and rva. Decodes no image.
+    """Read the finished folders of ingest and rva; frames that RVA could not score stay out. Decodes no
+    image.
 
     Raises StoreError when a table is damaged, StageError when no frame can judge the result.
     """
     frames = {f.frame_id: f for f in load_frames(ingest) if f.registered and f.split == "train"}
     table = read_table(rva / "frames.parquet", _APPRAISED)
-    rows = [row for row in table.to_pylist() if row["frame_id"] in frames]
+    rows = [row for row in table.to_pylist() if row["frame_id"] in frames and row["R"] is not None]
     weights = {row["frame_id"]: row.pop("weight") for row in rows}
     appraisals = sorted((Appraisal(**row) for row in rows), key=lambda frame: frame.frame_id)
     views = {a.frame_id: view_of(frames[a.frame_id], ingest, weights[a.frame_id]) for a in appraisals}

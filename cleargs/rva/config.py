@@ -4,14 +4,90 @@ open.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import os
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 """A number in [0, 1]."""
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
+
+
+MODEL_VARIABLE = "CLEARGS_VLM_MODEL"
+"""Environment variable with the model's name, where ``qwen.model`` gives none."""
+
+_PLACE: dict[str, JsonValue] = {
+    "key": False
+}  # where the work is done, not what comes of it: stays out of the stage's key
+
+
+class QwenConfig(BaseModel):
+    """The evaluator ``qwen3-vl``: a vision-language model behind a server, or in a folder of this machine.
+
+    The server's key is no setting: it comes from the environment (CLEARGS_VLM_API_KEY) and is written
+    nowhere.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str = Field(
+        "",
+        max_length=200,
+        description=f"name of the model at the server; empty: from {MODEL_VARIABLE} in the environment",
+    )
+    base_url: str = Field(
+        "",
+        json_schema_extra=_PLACE,
+        description="OpenAI-compatible server (vLLM, llama.cpp, Ollama, LM Studio), up to and with /v1; "
+        "empty: from CLEARGS_VLM_URL in the environment, else http://127.0.0.1:8000/v1",
+    )
+    model_dir: str = Field(
+        "",
+        json_schema_extra=_PLACE,
+        description="folder of a Qwen3-VL model to run in process (extra vlm) in place of a server",
+    )
+    prompt: Literal[1] = Field(1, description="version of the prompt")
+    image_size: int = Field(
+        1024, ge=64, le=4096, description="px; larger images are reduced to this long side"
+    )
+    max_tokens: int = Field(1024, ge=64, le=32_768, description="longest reply")
+    local_threads: int = Field(
+        4,
+        ge=1,
+        le=256,
+        description="threads of a model in process on the CPU; its sums depend on their number",
+    )
+    concurrency: int = Field(
+        4, ge=1, le=256, json_schema_extra=_PLACE, description="requests under way at once"
+    )
+    timeout_s: float = Field(
+        120.0, gt=0.0, le=3600.0, json_schema_extra=_PLACE, description="longest wait for one reply"
+    )
+    attempts: int = Field(
+        5,
+        ge=1,
+        le=100,
+        json_schema_extra=_PLACE,
+        description="tries of one request while the server is busy, fails or does not answer",
+    )
+    backoff_s: float = Field(
+        1.0,
+        ge=0.0,
+        le=60.0,
+        json_schema_extra=_PLACE,
+        description="pause before the second try; doubled before each further one",
+    )
+    asks: int = Field(
+        3,
+        ge=1,
+        le=20,
+        json_schema_extra=_PLACE,
+        description="how often a frame is asked for while the replies break the schema",
+    )
 
 
 class RvaConfig(BaseModel):
@@ -39,9 +115,12 @@ class RvaConfig(BaseModel):
     coverage: bool = Field(
         True, description="reactivate one suppressed frame in every uncovered trajectory bin"
     )
-    evaluator: Literal["statistics"] = Field(
-        "statistics", description="who judges appearance; statistics: image and video statistics, no network"
+    evaluator: Literal["statistics", "qwen3-vl"] = Field(
+        "statistics",
+        description="who judges appearance; statistics: image and video statistics, no network; "
+        "qwen3-vl: the paper's vision-language model",
     )
+    qwen: QwenConfig = Field(QwenConfig(), description="how qwen3-vl is asked")
     frames_per_bin: int = Field(
         8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
     )
@@ -115,6 +194,28 @@ class RvaConfig(BaseModel):
         0.30, ge=0.0, le=1.0, description="gain of the weight of geometric and auxiliary frames"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _model_from_environment(cls, data: Any) -> Any:
+        """Resolve the name of the model here, so that ``run.toml`` and the stage's key hold it."""
+        if not isinstance(data, Mapping) or data.get("evaluator") != "qwen3-vl":
+            return data
+        qwen = data.get("qwen", {})
+        if not isinstance(qwen, Mapping) or qwen.get("model") or qwen.get("model_dir"):
+            return data
+        return {**data, "qwen": {**qwen, "model": os.environ.get(MODEL_VARIABLE, "").strip()}}
+
+    @model_validator(mode="after")
+    def _model_is_known(self) -> RvaConfig:
+        if self.qwen.base_url:
+            check_base_url(self.qwen.base_url)
+        if self.evaluator == "qwen3-vl" and bool(self.qwen.model) == bool(self.qwen.model_dir):
+            raise ValueError(
+                "qwen3-vl needs either qwen.model (the name of a model at the server) or qwen.model_dir "
+                "(a model folder)"
+            )
+        return self
+
     @model_validator(mode="after")
     def _ranges_hold(self) -> RvaConfig:
         """R, B, pose distances and frame weights stay in [0, 1] only if these sums do."""
@@ -128,3 +229,14 @@ class RvaConfig(BaseModel):
             if getattr(self, base) + getattr(self, gain) > 1.0 + _SUM_TOLERANCE:
                 raise ValueError(f"{base} + {gain} must not exceed 1: it is the largest weight of a frame")
         return self
+
+
+def check_base_url(url: str) -> None:
+    """Raise ValueError for what is no plain http(s) address. The message does not repeat it: it may hold a
+    password.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise ValueError("the server's base_url must start with http:// or https:// and name a host")
+    if "@" in parts.netloc or parts.query or parts.fragment:
+        raise ValueError("the server's base_url may hold no user, password or query: use CLEARGS_VLM_API_KEY")

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from cleargs.progress import Reporter
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.scores import Floats
+
+if TYPE_CHECKING:
+    from cleargs.rva.vlm.judge import Judge
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Evaluator(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user calls it in ``rva.evaluator``."""
+        """What the user calls it in ``rva.evaluator``, with the model it asks where there is one."""
 
     @property
     def version(self) -> int:
@@ -36,8 +39,9 @@ class Evaluator(Protocol):
     def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
         """Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`, for frames given in trajectory order.
 
-        Neighbours in ``views`` are neighbours in the video. Images are read as they are needed: memory does
-        not grow with their number. The result does not depend on ``threads``.
+        A row of NaN is a frame that could not be scored; ``reporter`` was told why. Neighbours in ``views``
+        are neighbours in the video. Images are read as they are needed: memory does not grow with their
+        number. The result does not depend on ``threads``.
         """
 
 
@@ -46,8 +50,33 @@ def label(evaluator: Evaluator) -> str:
     return f"{evaluator.name}-{evaluator.version}"
 
 
-def make_evaluator(config: RvaConfig) -> Evaluator:
-    """The evaluator that the settings name."""
-    from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
+def make_evaluator(
+    config: RvaConfig,
+    *,
+    seed: int = 0,
+    device: Literal["cpu", "cuda"] = "cpu",
+    cache: Path | None = None,
+) -> Evaluator:
+    """The evaluator that the settings name.
 
-    return StatisticsEvaluator()
+    ``cache`` is a folder in which a slow evaluator keeps the scores of single frames; ``qwen3-vl`` needs one.
+    Raises InputError when the evaluator cannot be had: a bad address or key of its server, say.
+    """
+    if config.evaluator == "statistics":
+        from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
+
+        return StatisticsEvaluator()
+    from cleargs.rva.vlm.evaluator import QwenEvaluator
+
+    if cache is None:
+        raise ValueError("qwen3-vl needs a cache folder")
+    judge: Judge
+    if config.qwen.model_dir:
+        from cleargs.rva.vlm.local import LocalJudge  # loads torch
+
+        judge = LocalJudge(config.qwen, device=device)
+    else:
+        from cleargs.rva.vlm.server import ServerJudge
+
+        judge = ServerJudge(config.qwen, seed=seed)
+    return QwenEvaluator(judge, image_size=config.qwen.image_size, cache=cache)

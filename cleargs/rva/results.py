@@ -57,18 +57,18 @@ def frames_table(
     frame_id: npt.NDArray[np.int32],  # [N] ascending
     names: Sequence[str],
     evaluator: str,
-    cues: Floats,  # [N, 11]
+    cues: Floats,  # [N, 11], NaN where a frame could not be scored
     result: Assessment,
 ) -> pa.Table:
-    """The rows of rva/frames.parquet."""
+    """The rows of rva/frames.parquet; NaN becomes null."""
     placed = result.bin >= 0
     columns: dict[str, Any] = {
         "frame_id": frame_id,
         "name": list(names),
         "evaluator": [evaluator] * len(names),
-        **{column: cues[:, k] for k, column in enumerate(CUE_COLUMNS)},
-        "R": result.R,
-        "B": result.B,
+        **{column: pa.array(cues[:, k], from_pandas=True) for k, column in enumerate(CUE_COLUMNS)},
+        "R": pa.array(result.R, from_pandas=True),
+        "B": pa.array(result.B, from_pandas=True),
         "reliable": result.reliable,
         **{
             column: pa.array(getattr(result, column), mask=~placed)

@@ -24,27 +24,32 @@ def _score(name: str, meaning: str, *, nullable: bool = False) -> pa.Field:
     return column(name, pa.float64(), f"{meaning}, in [0, 1]", nullable=nullable)
 
 
+def _appearance(name: str, meaning: str) -> pa.Field:
+    return _score(name, f"{meaning}; null when the frame could not be scored", nullable=True)
+
+
 def _geometry(name: str, meaning: str) -> pa.Field:
-    return _score(name, f"{meaning}; null when the frame is not registered", nullable=True)
+    return _score(name, f"{meaning}; null when the frame is not registered or not scored", nullable=True)
 
 
 FRAMES = pa.schema(
     [
         column("frame_id", pa.int32(), "id of the frame in ingest/frames; orders the trajectory"),
         column("name", pa.string(), "name of the frame in the capture"),
-        column("evaluator", pa.string(), "who judged the appearance: name-version"),
-        *(_score(f"r_{name}", f"quality cue {name.replace('_', ' ')}, 1 is best") for name in R_CUES),
-        *(_score(f"b_{name}", f"degradation cue {name.replace('_', ' ')}, 1 is worst") for name in B_CUES),
-        _score("R", "appearance reliability, w_R . r"),
-        _score("B", "degradation risk, w_B . b"),
+        column("evaluator", pa.string(), "who judged the appearance: name-version, with the model's name"),
+        *(_appearance(f"r_{name}", f"quality cue {name.replace('_', ' ')}, 1 is best") for name in R_CUES),
+        *(
+            _appearance(f"b_{name}", f"degradation cue {name.replace('_', ' ')}, 1 is worst")
+            for name in B_CUES
+        ),
+        _appearance("R", "appearance reliability, w_R . r"),
+        _appearance("B", "degradation risk, w_B . b"),
         column("reliable", pa.bool_(), "in the set A: registered, R >= tau_R and B <= tau_B"),
         _geometry("C", "coverage gain over the points of the reliable frames"),
         _geometry("D", "pose diversity: largest pose distance to another reliable frame"),
         _geometry("O", "visibility redundancy: largest overlap (IoU of points) with another reliable frame"),
         _geometry("G", "geometric utility, clip(alpha C + beta D - eta O)"),
-        column(
-            "bin", pa.int32(), "trajectory bin, from 0; null when the frame is not registered", nullable=True
-        ),
+        column("bin", pa.int32(), "trajectory bin, from 0; null when C is", nullable=True),
         _geometry("Z", "centrality in the bin, 1 at its middle"),
         column("role", pa.string(), "strong, geometric, auxiliary, reactivated or suppressed"),
         _score("weight", "weight of the frame's raw supervision; 0: the frame is never loaded"),

@@ -1,0 +1,128 @@
+"""How far two evaluators agree about the frames of one capture, and where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import rankdata
+
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.scores import Floats, appearance_scores, is_reliable
+from cleargs.rva.tables import CUE_COLUMNS
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What one evaluator says of n frames."""
+
+    evaluator: str
+    """Its label in the tables."""
+    cues: Floats  # [n, 11], NaN where it could not score a frame
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A frame on which two evaluators part."""
+
+    row: int
+    gap: float
+    """Difference of its ranks by R - B, in [0, 1]: 1 when it is one's best and the other's worst."""
+    R: tuple[float, float]
+    B: tuple[float, float]
+    rank: tuple[int, int]
+    """Place by R - B, 1 is best; equal frames share the place of the first."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Two evaluators side by side, over the frames that both scored."""
+
+    evaluators: tuple[str, str]
+    frames: int
+    spearman: dict[str, float | None]
+    """R, B, R-B and each cue -> rank correlation; None where one of them is constant (or for < 2 frames)."""
+    reliable: dict[str, int]
+    """How many frames both, only the first, only the second, and neither put into the reliable set A."""
+    disagreements: tuple[Disagreement, ...]
+    """Widest gap first; ties go to the earlier frame."""
+
+    def document(self, frame_id: list[int], names: list[str]) -> dict[str, Any]:
+        """As JSON values; ``frame_id`` and ``names`` of the rows."""
+        return {
+            "evaluators": list(self.evaluators),
+            "frames": self.frames,
+            "spearman": self.spearman,
+            "reliable": self.reliable,
+            "disagreements": [
+                {
+                    "frame_id": frame_id[d.row],
+                    "name": names[d.row],
+                    "gap": round(d.gap, 6),
+                    "R": [round(value, 6) for value in d.R],
+                    "B": [round(value, 6) for value in d.B],
+                    "rank": list(d.rank),
+                }
+                for d in self.disagreements
+            ],
+        }
+
+
+def compare(first: Judgement, second: Judgement, config: RvaConfig, *, most: int) -> Agreement:
+    """Rank agreement of two evaluators and the ``most`` frames on which they part furthest.
+
+    Frames that one of them could not score are left out.
+    """
+    rows = np.flatnonzero(~np.isnan(first.cues).any(axis=1) & ~np.isnan(second.cues).any(axis=1))
+    sides = []
+    for judgement in (first, second):
+        cues = judgement.cues[rows]
+        R, B = appearance_scores(cues, config)
+        sides.append(np.column_stack([R, B, R - B, cues]))
+    a, b = sides
+    columns = ("R", "B", "R-B", *CUE_COLUMNS)
+    in_a, in_b = (is_reliable(side[:, 0], side[:, 1], config) for side in sides)
+    return Agreement(
+        evaluators=(first.evaluator, second.evaluator),
+        frames=len(rows),
+        spearman={name: spearman(a[:, k], b[:, k]) for k, name in enumerate(columns)},
+        reliable={
+            "both": int(np.count_nonzero(in_a & in_b)),
+            "first_only": int(np.count_nonzero(in_a & ~in_b)),
+            "second_only": int(np.count_nonzero(~in_a & in_b)),
+            "neither": int(np.count_nonzero(~in_a & ~in_b)),
+        },
+        disagreements=_disagreements(rows, a, b, most),
+    )
+
+
+def spearman(x: Floats, y: Floats) -> float | None:  # [n] each
+    """Rank correlation with mean ranks for ties, in [-1, 1]; None where it is not defined."""
+    if len(x) < 2 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    correlation = float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])
+    return round(min(1.0, max(-1.0, correlation)), 6)
+
+
+def _disagreements(
+    rows: npt.NDArray[np.intp],  # [m] rows of the capture
+    a: Floats,  # [m, 3+] R, B, R - B
+    b: Floats,  # [m, 3+]
+    most: int,
+) -> tuple[Disagreement, ...]:
+    means = [rankdata(-side[:, 2]) for side in (a, b)]
+    places = [rankdata(-side[:, 2], method="min") for side in (a, b)]
+    gaps = np.abs(means[0] - means[1]) / max(1, len(rows) - 1)
+    widest = [k for k in np.argsort(-gaps, kind="stable")[:most] if gaps[k] > 0.0]
+    return tuple(
+        Disagreement(
+            row=int(rows[k]),
+            gap=float(gaps[k]),
+            R=(float(a[k, 0]), float(b[k, 0])),
+            B=(float(a[k, 1]), float(b[k, 1])),
+            rank=(int(places[0][k]), int(places[1][k])),
+        )
+        for k in widest
+    )

@@ -1,0 +1,98 @@
+"""Frames in, cues out: keeps what is scored, goes on after a kill, marks what could not be scored."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+
+from cleargs.errors import StageError
+from cleargs.files import write_json
+from cleargs.progress import Reporter
+from cleargs.rva.evaluator import View
+from cleargs.rva.scores import Floats
+from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.rva.vlm.judge import Judge, UnscoredError
+from cleargs.rva.vlm.picture import Picture, load_picture
+from cleargs.rva.vlm.prompt import VERSION
+
+
+class QwenEvaluator:
+    """Evaluator ``qwen3-vl``: each frame alone, by a vision-language model.
+
+    Scores are kept in ``cache``, one file a picture, as they come: a second call asks for the others only.
+    """
+
+    version = VERSION
+
+    def __init__(self, judge: Judge, *, image_size: int, cache: Path) -> None:
+        self._judge = judge
+        self._image_size = image_size
+        self._cache = cache
+
+    @property
+    def name(self) -> str:
+        """The evaluator, its model, and what its version counts: ``qwen3-vl:MODEL:prompt``."""
+        return f"qwen3-vl:{self._judge.model}:prompt"
+
+    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+        """See `Evaluator.evaluate`. ``threads`` is not used: the work is done elsewhere or has its own.
+
+        Raises StageError when no frame at all could be scored.
+        """
+        cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
+        faults: dict[int, str] = {}
+        self._cache.mkdir(parents=True, exist_ok=True)
+        pool = ThreadPoolExecutor(self._judge.workers)
+        try:
+            with reporter.task("cues", total=len(views)) as task:
+                rows = {pool.submit(self._score, view): row for row, view in enumerate(views)}
+                for future in as_completed(rows):
+                    try:
+                        cues[rows[future]] = future.result()
+                    except UnscoredError as fault:
+                        faults[rows[future]] = str(fault)
+                    task.advance()
+        except BaseException:
+            self._judge.stop()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown()
+        if faults and len(faults) == len(views):
+            raise StageError(
+                f"{self._judge.model} scored no frame: {faults[0]}",
+                hint="check the server and rva.qwen, or use --set rva.evaluator=statistics",
+            )
+        for row in sorted(faults):
+            reporter.warn(f"frame {views[row].frame_id} was not scored: {faults[row]}")
+        return cues
+
+    def _score(self, view: View) -> Floats:
+        picture = load_picture(view, self._image_size)
+        file = self._cache / f"{_digest(self._judge.identity, picture)}.json"
+        kept = _read(file)
+        if kept is not None:
+            return kept
+        cues = self._judge.score(picture)
+        write_json(file, dict(zip(CUE_COLUMNS, cues.tolist(), strict=True)))
+        return cues
+
+
+def _digest(identity: str, picture: Picture) -> str:
+    """Names the scores by all that decides them."""
+    facts = [identity, VERSION, picture.rgb.shape, picture.masked]
+    return hashlib.sha256(json.dumps(facts).encode() + picture.rgb.tobytes()).hexdigest()
+
+
+def _read(file: Path) -> Floats | None:
+    """Kept scores; None where there are none, or where the file is damaged."""
+    try:
+        kept = json.loads(file.read_text(encoding="utf-8"))
+        cues = np.array([kept[column] for column in CUE_COLUMNS], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return cues if bool(((cues >= 0.0) & (cues <= 1.0)).all()) else None

@@ -1,0 +1,159 @@
+"""Qwen3-VL in process, through transformers: images only, each reply held to the schema token by token.
+
+The model's own processor is not used: it loads a video processor, which wants torchvision. Its image
+processor (the variant on Pillow) and its tokenizer do the same alone.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from cleargs.errors import InputError
+from cleargs.rva.config import QwenConfig
+from cleargs.rva.scores import Floats
+from cleargs.rva.vlm.judge import UnscoredError
+from cleargs.rva.vlm.picture import Picture
+from cleargs.rva.vlm.prompt import prompt_text, reply_schema
+from cleargs.rva.vlm.reply import ReplyError, parse_reply
+
+_IMAGE = "<|image_pad|>"
+_ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """A model folder in memory (types of transformers and llguidance, which have no stubs here)."""
+
+    model: Any
+    tokenizer: Any
+    images: Any
+    vocabulary: Any
+    grammar: str
+
+
+class LocalJudge:
+    """Runs a model folder of this machine; see `judge.Judge`. Loads it when the first picture comes."""
+
+    workers = 1
+
+    def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"]) -> None:
+        self._folder = Path(config.model_dir).expanduser().absolute()
+        self._device = device
+        self._threads = config.local_threads
+        self._max_tokens = config.max_tokens
+        self.model = self._folder.name
+
+    @cached_property
+    def identity(self) -> str:
+        """The folder's files by size and time: reading gigabytes for a digest is left to the stage's key."""
+        files = sorted(path for path in self._folder.rglob("*") if path.is_file())
+        facts = [(path.name, stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]]
+        return json.dumps(["local", self._device, self._threads, self._max_tokens, facts])
+
+    def stop(self) -> None:
+        """See `Judge.stop`: the one picture under way is finished."""
+
+    @cached_property
+    def _loaded(self) -> _Loaded:
+        return _load(self._folder, self._device)
+
+    def score(self, picture: Picture) -> Floats:
+        """See `Judge.score`. Greedy decoding: the same picture gets the same scores."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(self._threads)
+        try:
+            text = _generate(self._loaded, picture, self._max_tokens)
+        finally:
+            torch.set_num_threads(threads)
+        try:
+            return parse_reply(text)
+        except ReplyError as fault:  # a reply cut off at max_tokens
+            raise UnscoredError(f"the reply cannot be used: {fault}") from None
+
+
+def _load(folder: Path, device: Literal["cpu", "cuda"]) -> _Loaded:
+    """Raises InputError when the extra is not installed or the folder holds no such model."""
+    try:
+        import llguidance
+        import llguidance.hf
+        from transformers import AutoConfig, AutoModelForImageTextToText, AutoTokenizer
+        from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+        from transformers.utils.logging import disable_progress_bar
+    except ImportError as error:
+        raise InputError(
+            f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
+        ) from error
+    disable_progress_bar()
+    try:
+        kind = AutoConfig.from_pretrained(folder, local_files_only=True).model_type
+        if kind not in _ARCHITECTURES:
+            raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
+        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+        images = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
+        model = AutoModelForImageTextToText.from_pretrained(folder, local_files_only=True, dtype="auto")
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
+            hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
+        ) from error
+    vocabulary = llguidance.hf.from_tokenizer(tokenizer, n_vocab=model.config.get_text_config().vocab_size)
+    grammar = llguidance.LLMatcher.grammar_from_json_schema(
+        reply_schema(), defaults={"whitespace_flexible": False}
+    )
+    return _Loaded(model.to(device).eval(), tokenizer, images, vocabulary, grammar)
+
+
+def _generate(loaded: _Loaded, picture: Picture, max_tokens: int) -> str:
+    """The model's reply to the prompt about ``picture``; a valid object unless it runs out of tokens."""
+    seen = loaded.images(images=[picture.rgb], return_tensors="pt")
+    pads = int(seen["image_grid_thw"].prod()) // loaded.images.merge_size**2
+    chat = (
+        f"<|im_start|>user\n<|vision_start|>{_IMAGE * pads}<|vision_end|>"
+        f"{prompt_text(masked=picture.masked)}<|im_end|>\n<|im_start|>assistant\n"
+    )
+    tokens = loaded.tokenizer(chat, return_tensors="pt", add_special_tokens=False)
+    ids = tokens["input_ids"].to(loaded.model.device)
+    with torch.inference_mode():
+        written = loaded.model.generate(
+            input_ids=ids,
+            attention_mask=torch.ones_like(ids),
+            mm_token_type_ids=(ids == loaded.tokenizer.convert_tokens_to_ids(_IMAGE)).int(),
+            pixel_values=seen["pixel_values"].to(loaded.model.device, loaded.model.dtype),
+            image_grid_thw=seen["image_grid_thw"].to(loaded.model.device),
+            logits_processor=[_SchemaMask(loaded, ids.shape[1])],
+            max_new_tokens=max_tokens,
+            eos_token_id=loaded.tokenizer.eos_token_id,
+            pad_token_id=loaded.tokenizer.eos_token_id,
+            do_sample=False,
+            temperature=None,
+            top_p=None,
+            top_k=None,
+        )
+    return str(loaded.tokenizer.decode(written[0, ids.shape[1] :], skip_special_tokens=True))
+
+
+class _SchemaMask:
+    """A logits processor of transformers that leaves only tokens with which the reply still fits the schema.
+
+    llguidance's own masking kernel goes through torch.compile and so wants a C++ compiler; this does not.
+    """
+
+    def __init__(self, loaded: _Loaded, prompt_length: int) -> None:
+        from llguidance import LLMatcher
+
+        self._matcher = LLMatcher(loaded.vocabulary, loaded.grammar)
+        self._consumed = prompt_length
+
+    def __call__(self, input_ids: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:  # [1, T], [1, V]
+        self._matcher.consume_tokens(input_ids[0, self._consumed :].tolist())
+        self._consumed = input_ids.shape[1]
+        bits = np.frombuffer(self._matcher.compute_bitmask(), np.uint8)
+        allowed = np.unpackbits(bits, bitorder="little", count=scores.shape[1]).astype(bool)
+        return scores.masked_fill(torch.from_numpy(~allowed).to(scores.device), float("-inf"))

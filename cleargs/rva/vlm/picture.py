@@ -1,0 +1,51 @@
+"""The image as the model meets it: reduced to a stated size, masked pixels painted over, never enlarged."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cleargs.errors import StoreError
+from cleargs.media.image import read_mask, read_rgb
+from cleargs.rva.evaluator import View
+
+_MASKED = 127  # mid-grey, as the prompt calls it
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is shown to a model."""
+
+    rgb: npt.NDArray[np.uint8]  # [h, w, 3] sRGB
+    masked: bool
+    """Whether parts are painted grey."""
+
+    def data_url(self) -> str:
+        """As PNG: a lossy format would add artifacts of its own to those that are judged."""
+        _, png = cv2.imencode(".png", cv2.cvtColor(self.rgb, cv2.COLOR_RGB2BGR))
+        return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
+
+
+def load_picture(view: View, long_side: int) -> Picture:
+    """Read a frame and its mask; reduce by area averaging to ``long_side`` px where it is larger.
+
+    Raises InputError when an image cannot be read, StoreError when the mask differs in size.
+    """
+    rgb = read_rgb(view.image)
+    mask = read_mask(view.mask) if view.mask else None
+    if mask is not None:
+        if mask.shape != rgb.shape[:2]:
+            raise StoreError(
+                f"the mask {view.mask} differs in size from its image", hint="run again with --force ingest"
+            )
+        rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
+    height, width = rgb.shape[:2]
+    scale = long_side / max(height, width)
+    if scale < 1.0:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return Picture(rgb, mask is not None and not mask.all())

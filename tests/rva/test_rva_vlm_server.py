@@ -1,0 +1,409 @@
+"""Qwen3-VL over a real HTTP server on loopback that answers well, badly, late, or not at all."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+from vlm_server import FRAMES, KEY, Answer, Asked, make_ingest, true_cues, truth, two_stages, vlm_server, well
+
+from cleargs.cli.main import invoke
+from cleargs.errors import ConfigError, InputError, StageError
+from cleargs.pipeline.config import check_document
+from cleargs.pipeline.stage import StageContext, StageResult
+from cleargs.progress import SilentReporter
+from cleargs.rivr.supervision import load_supervision
+from cleargs.rva import tables
+from cleargs.rva.config import RvaConfig
+from cleargs.tables import read_table
+
+MODEL = "Qwen/Qwen3-VL-8B-Instruct"
+
+
+class Remarks(SilentReporter):
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+Rows = dict[int, dict[str, Any]]
+
+
+class Bench:
+    """The RVA stage on a capture of six frames; a second call goes on from what the first kept."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.remarks = Remarks()
+        make_ingest(root / "ingest")
+        for name in ("out", "checkpoints"):
+            (root / name).mkdir()
+
+    def run(self, url: str, **settings: Any) -> tuple[StageResult, Rows]:
+        qwen = {"model": MODEL, "base_url": url, "timeout_s": 10, "backoff_s": 0, **settings}
+        context = StageContext(
+            config=RvaConfig.model_validate({"evaluator": "qwen3-vl", "qwen": qwen}),
+            source=self.root,
+            inputs={"ingest": self.root / "ingest"},
+            externals={},
+            out=self.root / "out",
+            checkpoints=self.root / "checkpoints",
+            seed=7,
+            device="cpu",
+            threads=1,
+            reporter=self.remarks,
+        )
+        result = import_module("cleargs.stages.rva").run(context)
+        table = read_table(self.root / "out" / "frames.parquet", tables.FRAMES).to_pylist()
+        return result, {row["frame_id"]: row for row in table}
+
+    def bytes(self) -> dict[str, bytes]:
+        return {file.name: file.read_bytes() for file in (self.root / "out").iterdir()}
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    for name in ("CLEARGS_VLM_URL", "CLEARGS_VLM_MODEL", "http_proxy", "HTTP_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("CLEARGS_VLM_API_KEY", KEY)
+    return Bench(tmp_path)
+
+
+def cues_of(row: dict[str, Any]) -> dict[str, float]:
+    return {column: row[column] for column in tables.CUE_COLUMNS}
+
+
+def assert_complete(result: StageResult, rows: Rows) -> None:
+    assert result.missing == ()
+    assert {k: cues_of(row) for k, row in rows.items()} == {k: true_cues(k) for k in range(FRAMES)}
+
+
+def first(answer: Answer) -> Callable[[Asked, int], Answer]:
+    """A script that gives ``answer`` to the first request of every frame, then answers well."""
+    return lambda asked, before: answer if before == 0 else well(asked, before)
+
+
+def test_a_server_that_answers_well(bench: Bench) -> None:
+    with vlm_server() as log:
+        result, rows = bench.run(log.url, image_size=64)
+    assert_complete(result, rows)
+    assert {row["evaluator"] for row in rows.values()} == {f"qwen3-vl:{MODEL}:prompt-1"}
+    assert rows[0]["role"] == "strong" and rows[5]["R"] == pytest.approx(0.2)
+    assert log.frames() == list(range(FRAMES))
+    for asked in log.asked:
+        assert asked.headers["Authorization"] == f"Bearer {KEY}"
+        assert asked.chat["model"] == MODEL
+        assert asked.chat["temperature"] == 0 and asked.chat["seed"] == 7
+        assert asked.image.shape == (48, 64, 3)
+        question = asked.chat["messages"][0]["content"][1]["text"]
+        schema = asked.chat["response_format"]["json_schema"]["schema"]
+        assert list(schema["properties"]) == schema["required"] == list(truth(0))
+        assert all(name in question for name in truth(0))
+
+
+def test_no_more_requests_at_once_than_allowed(bench: Bench) -> None:
+    with vlm_server(lambda asked, before: Answer(json.dumps(truth(asked.frame)), delay=0.05)) as log:
+        assert_complete(*bench.run(log.url, concurrency=2))
+    assert log.most_at_once == 2
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        Answer(status=429, headers={"Retry-After": "0"}, body=b'{"error": {"message": "slow down"}}'),
+        Answer(status=500, body=b"<html>oops</html>"),
+        Answer(status=503, body=b""),
+        Answer(body=b'{"choices": [{"message": {"con'),
+        Answer(body=b"not json at all"),
+        Answer(body=b'{"choices": []}'),
+        Answer(json.dumps(truth(0)), announced=100_000),
+        Answer(json.dumps(truth(0)), delay=1.2),
+        Answer(json.dumps(truth(0)), drip=0.02),
+    ],
+    ids=["429", "500", "503", "breaks off", "no json", "no choice", "dies half way", "late", "drips"],
+)
+def test_passing_faults_are_tried_again(bench: Bench, answer: Answer) -> None:
+    with vlm_server(first(answer)) as log:
+        assert_complete(*bench.run(log.url, timeout_s=0.6, concurrency=FRAMES, attempts=10))
+    # A busy machine may make a good answer late, too.
+    assert all(log.frames().count(frame) >= 2 for frame in range(FRAMES))
+
+
+def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+
+    class Recorder:
+        def wait(self, seconds: float) -> bool:
+            pauses.append(seconds)
+            return False
+
+    monkeypatch.setattr("cleargs.rva.vlm.chat.Event", Recorder)
+    soon = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
+    answers = ["7", soon, "next week", None]
+
+    def script(asked: Asked, before: int) -> Answer:
+        if asked.frame or before >= len(answers):
+            return well(asked, before)
+        header = answers[before]
+        return Answer(status=429, headers={"Retry-After": header} if header else {}, body=b"")
+
+    with vlm_server(script) as log:
+        assert_complete(*bench.run(log.url, backoff_s=1.0, concurrency=1))
+    # Seconds; a date an hour ahead, held to two minutes; then the doubled back-off of the next tries.
+    assert pauses == [7.0, 120.0, 4.0, 8.0]
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ('{"sharpness": 0.5', "no complete JSON object"),
+        ("I cannot judge this picture.", "no complete JSON object"),
+        ("", "no complete JSON object"),
+        (json.dumps({**truth(0), "sharpness": 1.7}), "sharpness lies outside"),
+        (json.dumps({**truth(0), "ghosting": -0.1}), "ghosting lies outside"),
+        (json.dumps({**truth(0), "ghosting": float("nan")}), "ghosting lies outside"),
+        (json.dumps({**truth(0), "texture": "good"}), "texture is no number"),
+        (json.dumps({**truth(0), "texture": True}), "texture is no number"),
+        (json.dumps({**truth(0), "mood": 0.5}), "not asked for"),
+        (json.dumps({"sharpness": 0.5}), "lacks structure"),
+        (json.dumps(truth(0)) + json.dumps(truth(1)), "differ"),
+        ("{" * 3000, "no complete JSON object"),
+    ],
+)
+def test_a_reply_outside_the_schema_is_asked_again(bench: Bench, content: str, complaint: str) -> None:
+    with vlm_server(first(Answer(content))) as log:
+        assert_complete(*bench.run(log.url))
+    again = [asked.chat["messages"] for asked in log.asked if len(asked.chat["messages"]) > 1]
+    assert len(again) == FRAMES
+    assert all(complaint in messages[-1]["content"] for messages in again)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "Here is my judgement:\n```json\n{}\n```\nI hope that helps {{ :-)",
+        "<think>Perhaps {}? No.</think>{}",
+        "{} and once more {}",
+    ],
+    ids=["fence", "thoughts", "twice"],
+)
+def test_prose_around_the_object_is_passed_over(bench: Bench, words: str) -> None:
+    def script(asked: Asked, before: int) -> Answer:
+        return Answer(words.replace("{}", json.dumps(truth(asked.frame))))
+
+    with vlm_server(script) as log:
+        assert_complete(*bench.run(log.url))
+    assert log.frames() == list(range(FRAMES))
+
+
+def test_a_frame_without_a_valid_reply_is_marked_and_tried_again_later(bench: Bench, tmp_path: Path) -> None:
+    def stubborn(asked: Asked, before: int) -> Answer:
+        if asked.frame == 2:
+            return Answer(json.dumps({**truth(2), "defocus": 5}))
+        return Answer(status=500, body=b"") if asked.frame == 4 else well(asked, before)
+
+    with vlm_server(stubborn) as log:
+        result, rows = bench.run(log.url, asks=2, attempts=3)
+    assert result.missing == ("frame 2 (2.jpg) was not scored", "frame 4 (4.jpg) was not scored")
+    assert log.frames() == [0, 1, 2, 2, 3, 4, 4, 4, 5]
+    for k in (2, 4):
+        scores = {*tables.CUE_COLUMNS, "R", "B", "C", "D", "O", "G", "bin", "Z"}
+        assert {rows[k][name] for name in scores} == {None}
+        assert (rows[k]["role"], rows[k]["weight"], rows[k]["reliable"]) == ("suppressed", 0.0, False)
+    assert cues_of(rows[3]) == true_cues(3)
+    supervision = load_supervision(bench.root / "ingest", bench.root / "out")
+    assert sorted(supervision.views) == [0, 1, 3, 5], "what goes on with --allow-partial leaves them out"
+    assert "frame 2" in bench.remarks.warnings[0] and "defocus lies outside" in bench.remarks.warnings[0]
+    assert "frame 4" in bench.remarks.warnings[1] and "500" in bench.remarks.warnings[1]
+
+    with vlm_server() as log:
+        assert_complete(*bench.run(log.url))
+    assert log.frames() == [2, 4]
+    undisturbed = Bench(tmp_path / "undisturbed")
+    with vlm_server() as log:
+        undisturbed.run(log.url)
+    assert bench.bytes() == undisturbed.bytes()
+
+
+def test_a_server_that_dies_half_way(bench: Bench) -> None:
+    """Nobody listens after the second frame; the next call, with the server back, asks for the others."""
+    with vlm_server(dies_with=2) as log:
+        result, rows = bench.run(log.url, attempts=3, concurrency=1)
+    assert len(result.missing) == FRAMES - 2
+    assert [k for k, row in rows.items() if row["r_sharpness"] is not None] == [0, 1]
+    reasons = [warning for warning in bench.remarks.warnings if "was not scored" in warning]
+    assert len(reasons) == FRAMES - 2 and all("nobody answers" in reason for reason in reasons)
+    port = int(log.url.partition("127.0.0.1:")[2].partition("/")[0])
+    with vlm_server(port=port) as log:
+        assert_complete(*bench.run(log.url))
+    assert log.frames() == [2, 3, 4, 5]
+
+
+def test_no_score_at_all_is_a_failure(bench: Bench) -> None:
+    with socket.socket() as place:
+        place.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{place.getsockname()[1]}/v1"
+    with pytest.raises(StageError, match="scored no frame: nobody answers"):
+        bench.run(url, attempts=1)
+    assert not list((bench.root / "out").iterdir())
+
+
+def test_a_damaged_kept_score_is_asked_for_again(bench: Bench) -> None:
+    with vlm_server() as log:
+        bench.run(log.url)
+        torn, wild, *_ = sorted((bench.root / "checkpoints" / "scores").iterdir())
+        torn.write_text('{"r_sharpness": 0.5')
+        wild.write_text(wild.read_text().replace('"r_sharpness": ', '"r_sharpness": 3'))
+        assert_complete(*bench.run(log.url))
+    assert len(log.asked) == FRAMES + 2
+
+
+def test_kept_scores_serve_the_same_question_only(bench: Bench) -> None:
+    with vlm_server() as log:
+        for settings in ({}, {"model": "other"}, {"image_size": 64}, {"concurrency": 1}):
+            bench.run(log.url, **settings)
+    assert len(log.asked) == 3 * FRAMES
+
+
+def test_a_server_without_structured_output(bench: Bench) -> None:
+    def old(asked: Asked, before: int) -> Answer:
+        if "response_format" in asked.chat:
+            return Answer(status=400, body=b'{"error": "unknown field response_format"}')
+        return well(asked, before)
+
+    with vlm_server(old) as log:
+        assert_complete(*bench.run(log.url, concurrency=1))
+    assert sum("response_format" in asked.chat for asked in log.asked) == 1
+
+
+def test_a_frame_that_the_server_refuses_does_not_end_the_others(bench: Bench) -> None:
+    def narrow(asked: Asked, before: int) -> Answer:
+        refusal = Answer(status=400, body=b'{"error": {"message": "image too large"}}')
+        return refusal if asked.frame == 1 else well(asked, before)
+
+    with vlm_server(narrow) as log:
+        result, _ = bench.run(log.url, concurrency=1)
+    assert result.missing == ("frame 1 (1.jpg) was not scored",)
+    assert "image too large" in bench.remarks.warnings[0]
+    assert all("response_format" in asked.chat for asked in log.asked if asked.frame != 1)
+
+
+@pytest.mark.parametrize(("status", "remedy"), [(401, "API_KEY"), (403, "API_KEY"), (404, "qwen.model")])
+def test_what_no_frame_can_get_past_ends_the_stage(bench: Bench, status: int, remedy: str) -> None:
+    echo = json.dumps({"error": {"message": f"not with {KEY}"}}).encode()
+    with (
+        vlm_server(lambda asked, before: Answer(status=status, body=echo)) as log,
+        pytest.raises(StageError, match=str(status)) as caught,
+    ):
+        bench.run(log.url, concurrency=1)
+    assert remedy in caught.value.hint
+    assert KEY not in str(caught.value) + caught.value.hint
+    assert len(log.asked) <= 2
+
+
+def test_the_key_is_not_carried_to_another_host(bench: Bench) -> None:
+    with vlm_server() as other:
+        moved = Answer(status=307, headers={"Location": f"{other.url}/chat/completions"}, body=b"")
+        with vlm_server(lambda asked, before: moved) as log, pytest.raises(StageError, match="moved"):
+            bench.run(log.url)
+    assert other.asked == []
+
+
+def test_no_key_no_header(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CLEARGS_VLM_API_KEY")
+    with vlm_server() as log:
+        bench.run(log.url)
+    assert all("Authorization" not in asked.headers for asked in log.asked)
+
+
+def test_a_key_that_no_header_can_carry(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CLEARGS_VLM_API_KEY", "sk-one\nsk-two")
+    with pytest.raises(InputError, match="characters that no key has") as caught:
+        bench.run("http://127.0.0.1:9/v1")
+    assert "sk-one" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["127.0.0.1:8000", "ftp://host/v1", "http://", "http://me:sesame@host/v1", "http://host/v1?key=sesame"],
+)
+def test_addresses_that_cannot_be_used(bench: Bench, monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """Refused before anything is written, and not repeated: they may hold a password."""
+    settings = {"rva": {"evaluator": "qwen3-vl", "qwen": {"model": MODEL, "base_url": url}}}
+    with pytest.raises(ConfigError, match="base_url") as caught:
+        check_document(two_stages(), settings)
+    assert "sesame" not in str(caught.value) + caught.value.hint
+    monkeypatch.setenv("CLEARGS_VLM_URL", url)
+    with pytest.raises(InputError, match="base_url") as met:
+        bench.run("")
+    assert "sesame" not in str(met.value) + met.value.hint
+
+
+def test_from_the_command_line(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Model and address from the environment; exit codes; and the key in no file and no line of output."""
+    monkeypatch.setenv("CLEARGS_VLM_MODEL", MODEL)
+    monkeypatch.delenv("CLEARGS_STORE", raising=False)
+    folder, recipe = tmp_path / "run", tmp_path / "empty.toml"
+    recipe.touch()
+    (tmp_path / "source").mkdir()
+
+    def run() -> int:
+        given = ["run", str(tmp_path / "source"), "-o", str(folder), "--workflow", str(recipe)]
+        given += ["--set", "rva.evaluator=qwen3-vl", "--set", "rva.qwen.backoff_s=0"]
+        return invoke([*given, "--set", "rva.qwen.attempts=1", "--debug"], two_stages())
+
+    def failing(asked: Asked, before: int) -> Answer:
+        body = f"no: {asked.headers['Authorization']}".encode()
+        return Answer(status=500, body=body) if asked.frame == 3 else well(asked, before)
+
+    with vlm_server(failing) as log:
+        monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
+        assert run() == 3
+    with vlm_server() as log:
+        monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
+        assert run() == 0
+        assert log.frames() == [3]
+        assert run() == 0
+        assert log.frames() == [3], "a finished stage asks nobody"
+    with vlm_server(lambda asked, before: Answer(status=401, body=KEY.encode())) as log:
+        monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
+        monkeypatch.setenv("CLEARGS_VLM_MODEL", "other")
+        assert run() == 1
+    shown = capsys.readouterr()
+    assert "missing: rva: frame 3 (3.jpg) was not scored" in shown.err and "***" in shown.err
+    written = [file for file in folder.rglob("*") if file.is_file()]
+    assert f'model = "{MODEL}"' not in (folder / "run.toml").read_text(), "the last call named another"
+    assert any(MODEL.encode() in file.read_bytes() for file in written if file.name == "manifest.json")
+    for text in (shown.out.encode(), shown.err.encode(), *(file.read_bytes() for file in written)):
+        assert KEY.encode() not in text
+
+
+def test_the_model_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CLEARGS_VLM_MODEL", raising=False)
+    for qwen in ({}, {"model": "a", "model_dir": "b"}):
+        with pytest.raises(ValueError, match=r"either qwen\.model"):
+            RvaConfig.model_validate({"evaluator": "qwen3-vl", "qwen": qwen})
+    assert RvaConfig.model_validate({"qwen": {}}).qwen.model == ""
+
+
+def test_the_prompt_changes_with_its_version_only() -> None:
+    """Whoever changes a word raises prompt.VERSION and QwenConfig.prompt, and writes the new digest here."""
+    import hashlib
+
+    from cleargs.rva.config import QwenConfig
+    from cleargs.rva.vlm.prompt import VERSION, prompt_text, reply_schema
+
+    parts = [prompt_text(masked=False), prompt_text(masked=True), json.dumps(reply_schema())]
+    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    assert (VERSION, QwenConfig().prompt, digest) == (1, 1, "eaab1435dd11ef4c")
