@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import click
 
+from cleargs.cli.common import json_option, print_json
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import InputError
-from cleargs.synth.protocols import PROTOCOLS
+
+PROTOCOL_HELP = (
+    "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gsotm-mb, gsotm-rs, gsotm-mb-rs, gsotm-pn."
+)
 
 
 def _size(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int]:
@@ -23,28 +27,82 @@ def _size(context: click.Context, parameter: click.Parameter, value: str) -> tup
     epilog="""\b
 Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
-  cleargs run room -o run                        uses the exact poses
+  cleargs run room -o run                        uses the given poses
   cleargs run room -o run --set ingest.poses=sfm  starts from the images alone
+  cleargs synth blurred --protocol gs2e-medium --scene run/g0/scene.ply
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--protocol", default="mixed", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
+@click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
 @click.option(
     "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
 )
 @click.option("--size", default="480x270", show_default=True, callback=_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another room and walk.")
-def synth(out: Path, protocol: str, frames: int, size: tuple[int, int], seed: int) -> None:
-    """Make a synthetic handheld capture of a procedural room in the new folder OUT.
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    metavar="FILE.ply",
+    help="A trained Gaussian scene as the world, instead of the room.",
+)
+@click.option(
+    "--cameras",
+    type=click.Path(path_type=Path),
+    metavar="DIR|FILE",
+    help="Whose cameras the walk through the scene follows: a transforms.json, its folder, or a run. "
+    "Without it, those of the run that the scene lies in.",
+)
+@click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
+@json_option
+def synth(
+    out: Path,
+    protocol: str,
+    frames: int,
+    size: tuple[int, int],
+    seed: int,
+    scene: Path | None,
+    cameras: Path | None,
+    video: bool,
+    as_json: bool,
+) -> None:
+    """Make a synthetic handheld capture of a procedural room, or of a trained scene, in the new folder OUT.
 
-    OUT/images and OUT/transforms.json are a capture like any other; OUT/truth holds the sharp views,
-    views off the path, and what is wrong with each frame.
+    OUT/images and OUT/transforms.json are a capture like any other; OUT/truth holds the sharp views with
+    exact poses and depth, views off the path, and what is wrong with each frame.
     """
-    if protocol not in PROTOCOLS:
-        raise InputError(f"no protocol is called {protocol!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
+    if cameras is not None and scene is None:
+        raise click.UsageError("--cameras belongs to --scene")
     from cleargs.synth.capture import make_capture
 
-    make_capture(
-        out, protocol, frames=frames, width=size[0], height=size[1], seed=seed, reporter=make_reporter()
+    summary = make_capture(
+        out,
+        protocol,
+        frames=frames,
+        width=size[0],
+        height=size[1],
+        seed=seed,
+        reporter=make_reporter(),
+        scene=scene,
+        cameras=cameras,
+        video=video,
     )
+    if as_json:
+        print_json(summary)
+        return
     click.echo(f"{frames} frames of {protocol!r} in {out}; the truth in {out / 'truth'}")
+    click.echo(_line("true blur", summary["blur_px"], size[0]))
+    if summary["rolling_shutter_px"]["max"] > 0:
+        click.echo(_line("true rolling-shutter skew", summary["rolling_shutter_px"], size[0]))
+    if (noise := summary["pose_noise"]) is not None:
+        click.echo(
+            f"noise on the given poses: {noise['rotation_deg']:.2f} degrees about and "
+            f"{noise['translation']:.4f} world units along each axis"
+        )
+
+
+def _line(what: str, pixels: dict[str, Any], width: int) -> str:
+    quartiles = " ".join(f"{value:.1f}" for value in pixels["quartiles"])
+    return (
+        f"{what}: mean {pixels['mean']:.2f} px, quartiles {quartiles}, max {pixels['max']:.1f} "
+        f"(images {width} px wide)"
+    )

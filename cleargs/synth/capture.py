@@ -5,201 +5,220 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.files import atomic_path, write_json
-from cleargs.media.colour import srgb_from_linear
+from cleargs.files import write_json
+from cleargs.media.encode import require_even, write_video
 from cleargs.progress import Reporter
-from cleargs.synth.path import HandheldPath, exposure_poses, look_at, make_path
-from cleargs.synth.protocols import REFERENCE_WIDTH, Degradation, degradations
-from cleargs.synth.raycast import Passes, cast
-from cleargs.synth.room import Room, make_room
-from cleargs.tables import column, write_table
+from cleargs.synth.course import Course, orbit
+from cleargs.synth.motion import FrameMotion, follow
+from cleargs.synth.path import FPS, frame_times, make_path
+from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, Protocol, find_protocol, noisy_poses, plan
+from cleargs.synth.record import FRAMES, develop, write_depth, write_image, write_transforms
+from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, World, disc, phone_lens, still
+from cleargs.tables import write_table
 
-TRUTH_SCHEMA = pa.schema(
-    [
-        column("frame_id", pa.int32(), "number of the frame, as in images/"),
-        column("image", pa.string(), "file below the capture"),
-        column("time_s", pa.float64(), "middle of the exposure, seconds"),
-        column("blur_px", pa.float64(), "mean length of the motion path in the image, pixels"),
-        column("defocus_px", pa.float64(), "mean radius of the blur disc, pixels"),
-        column("exposure_ev", pa.float64(), "exposure error, stops"),
-        column("noise", pa.float64(), "deviation of the sensor noise at mid grey, sRGB units"),
-    ]
-)
-SHARP_PASSES = 8
-NEAR_FOCUS = 0.45
-"""Where a frame out of focus is focused, metres: in front of everything."""
+NEAR_FOCUS = 0.2
+"""Where a frame out of focus is focused, as a share of the mean distance: in front of everything."""
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Pinhole intrinsics in pixels, pixel centres at + 0.5."""
+class Setting:
+    """Where a capture is made."""
 
-    width: int
-    height: int
-
-    @property
-    def focal(self) -> float:
-        """65 degrees across the longer side, as a phone's main camera."""
-        return max(self.width, self.height) / 2 / math.tan(math.radians(65) / 2)
-
-    @property
-    def intrinsics(self) -> tuple[float, float, float, float]:
-        return self.focal, self.focal, self.width / 2, self.height / 2
+    name: str
+    world: World
+    course: Course
+    lens: Lens
 
 
-def _low_discrepancy(count: int) -> NDArray[np.float64]:
-    """[count, 2] points that cover the unit square evenly (Roberts' R2 sequence)."""
-    steps = np.array([0.7548776662466927, 0.5698402909980532])
-    return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0, np.float64)
+def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
+    """The procedural room of ``seed``, in metres, and a walk around its table."""
+    from cleargs.synth.raycast import RoomWorld
+    from cleargs.synth.room import make_room
+
+    room = make_room(seed)
+    return Setting("room", RoomWorld(room), orbit(room.focus, frames, seed), phone_lens(width, height))
 
 
-def _disc(count: int, radius: float) -> NDArray[np.float64]:
-    """[count, 2] points of a sunflower spiral on a disc."""
-    number = np.arange(count) + 0.5
-    angle = number * math.pi * (3 - math.sqrt(5))
-    disc = np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return np.asarray(radius * disc, np.float64)
+def scene_setting(scene: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
+    """A trained scene, in its own units, and a walk along its real cameras. Raises InputError."""
+    from cleargs.synth.scene import open_scene
 
-
-def _sharp(
-    room: Room, lens: Lens, pose: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    poses = np.broadcast_to(pose, (SHARP_PASSES, lens.height, 3, 4)).copy()
-    passes = Passes(poses, _low_discrepancy(SHARP_PASSES), np.zeros((SHARP_PASSES, 2)), 1.0)
-    return cast(room, passes, lens.intrinsics, lens.width, lens.height)
-
-
-def _blur_length(
-    lens: Lens, depth: NDArray[np.float64], poses: NDArray[np.float64], middle: NDArray[np.float64]
-) -> float:
-    """Mean length in pixels of the paths that the middle view's points take over ``poses`` [S, 3, 4]."""
-    fx, fy, cx, cy = lens.intrinsics
-    rows, columns = np.mgrid[0.5 : lens.height : 8, 0.5 : lens.width : 8]
-    z = depth[rows.astype(int), columns.astype(int)]
-    points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], -1).reshape(-1, 3)
-    world = points @ middle[:, :3].T + middle[:, 3]
-    tracks = []
-    for pose in poses:
-        local = (world - pose[:, 3]) @ pose[:, :3]
-        tracks.append(np.stack([fx * local[:, 0] / local[:, 2], fy * local[:, 1] / local[:, 2]], 1))
-    return float(np.linalg.norm(np.diff(tracks, axis=0), axis=2).sum(0).mean())
-
-
-def _degraded(
-    room: Room,
-    lens: Lens,
-    middle: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    fault: Degradation,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], float, float]:
-    """One frame as the camera records it (linear light, before noise), its blur length and disc radius."""
-    scale = lens.width / REFERENCE_WIDTH
-    blur, radius = fault.blur * scale, fault.defocus * scale
-    # Enough passes that neighbouring ghosts of an edge lie less than a pixel apart.
-    count = max(SHARP_PASSES, math.ceil(1.5 * blur), math.ceil(4 * radius**2))
-    instants = (np.arange(count) + 0.5) / count - 0.5
-    poses = exposure_poses(middle, instants, blur / lens.focal, rng)
-    mean_nearness = float(np.mean(1 / depth))
-    aperture = radius * 1.5 / (lens.focal * abs(1 / NEAR_FOCUS - mean_nearness))
-    rows = np.broadcast_to(poses[:, None], (count, lens.height, 3, 4)).copy()
-    lens_points = _disc(count, aperture)[rng.permutation(count)]
-    passes = Passes(rows, _low_discrepancy(count), lens_points, NEAR_FOCUS if radius else 1.0)
-    image, _ = cast(room, passes, lens.intrinsics, lens.width, lens.height)
-    # The mean radius of a uniform disc's points is 2/3 of its rim: `defocus` states the mean.
-    return image * 2.0**fault.exposure, _blur_length(lens, depth, poses, middle), radius
-
-
-def _record(image: NDArray[np.float64], noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Sensor noise, clipping, sRGB encoding, 8 bits: RGB [H, W, 3]."""
-    mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: carries the stated deviation into linear light
-    shot = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
-    noisy = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shot
-    return np.asarray(np.rint(srgb_from_linear(np.clip(noisy, 0, 1)) * 255), np.uint8)
-
-
-def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
-    with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), image[..., ::-1])
-
-
-def _write_transforms(folder: Path, lens: Lens, images: list[str], poses: list[NDArray[np.float64]]) -> None:
-    """``transforms.json`` as nerfstudio reads it: OpenGL camera to world."""
-    fx, fy, cx, cy = lens.intrinsics
-    frames = []
-    for image, pose in zip(images, poses, strict=True):
-        matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": image, "transform_matrix": matrix.tolist()})
-    camera = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    write_json(folder / "transforms.json", {**camera, "w": lens.width, "h": lens.height, "frames": frames})
-
-
-def _novel_poses(path: HandheldPath, count: int, seed: int) -> list[NDArray[np.float64]]:
-    """Poses off the path: nearer or farther, higher or lower, aimed at the same spot."""
-    rng = np.random.default_rng([seed, 14])
-    poses = []
-    for share in (np.arange(count) + 0.5) / count:
-        centre = path.pose(share * path.duration)[:, 3] + rng.uniform(-0.22, 0.22, 3)
-        poses.append(look_at(centre, path.focus + rng.uniform(-0.08, 0.08, 3)))
-    return poses
+    world, course, lens, name = open_scene(scene, cameras, frames, width, height)
+    return Setting(name, world, course, lens)
 
 
 def make_capture(
-    out: Path, protocol: str, *, frames: int, width: int, height: int, seed: int, reporter: Reporter
-) -> None:
-    """Write the capture ``protocol`` of the room of ``seed`` into ``out``.
+    out: Path,
+    protocol: str,
+    *,
+    frames: int,
+    width: int,
+    height: int,
+    seed: int,
+    reporter: Reporter,
+    scene: Path | None = None,
+    cameras: Path | None = None,
+    video: bool = False,
+) -> dict[str, Any]:
+    """Write the capture ``protocol`` into the new folder ``out``; returns what ``truth/capture.json`` says.
 
-    ``out/images`` and ``out/transforms.json`` are what a user would have; ``out/truth/observed`` and
-    ``out/truth/novel`` hold sharp views in the same form (at the frames' mid-exposure poses and off the path)
-    and ``out/truth/frames.parquet`` each frame's faults (`TRUTH_SCHEMA`). Images are 8-bit sRGB PNGs.
+    The world is the room of ``seed``, or the Gaussian scene in ``scene``, walked along its real cameras (see
+    `cleargs.synth.scene.open_scene`). ``out/images`` and ``out/transforms.json`` (and with ``video``
+    ``out/capture.mp4``) are what a user would have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
+    views in the same form, 8-bit sRGB PNGs, with exact poses: at the middle of the frames' exposures, with
+    ``depth/``, and off the path. ``out/truth/frames.parquet`` (`record.FRAMES`) has each frame's faults.
 
-    Raises InputError for an unknown protocol or a folder that already holds something.
+    Raises InputError for an unknown protocol, a folder that already holds something, or a scene or cameras
+    that cannot be used.
     """
-    faults = degradations(protocol, frames, seed)
-    if out.exists() and any(out.iterdir()):
+    rules = find_protocol(protocol)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="name a new folder for the capture")
-    room, lens = make_room(seed), Lens(width, height)
-    path = make_path(room.focus, frames, seed)
-    times = (np.arange(frames) + 0.5) / frames * path.duration
-    poses = [path.pose(float(time)) for time in times]
-    names = [f"images/{number:06d}.png" for number in range(frames)]
-    observed, novel = out / "truth" / "observed", out / "truth" / "novel"
-    for folder in (out, observed, novel):
-        (folder / "images").mkdir(parents=True, exist_ok=True)
-
-    rows = []
-    novel_poses = _novel_poses(path, max(4, frames // 4), seed)
-    with reporter.task(f"ray casting {protocol}", frames + len(novel_poses)) as task:
-        for number, (pose, fault) in enumerate(zip(poses, faults, strict=True)):
+    if video:
+        require_even(width, height)
+    if scene is None:
+        setting = room_setting(frames, width, height, seed)
+    else:
+        setting = scene_setting(scene, cameras, frames, width, height)
+    path, times = make_path(setting.course, frames, seed), frame_times(frames)
+    poses = path.poses(times)
+    novel = _novel_poses(setting.course, max(4, frames // 4), seed)
+    stems = [f"{number:06d}" for number in range(frames)]
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    with reporter.task(f"synth {protocol}", 2 * frames + len(novel)) as task:
+        motions, depths = [], []
+        _make_folder(out / "truth" / "observed")
+        (out / "truth" / "observed" / "depth").mkdir()
+        for stem, time, pose in zip(stems, times, poses, strict=True):
+            depth = setting.world.depth(pose, setting.lens)
+            write_depth(out / "truth" / "observed" / "depth" / f"{stem}.exr", depth)
+            _write_sharp(out / "truth" / "observed", stem, setting, pose)
+            motions.append(follow(path, float(time), depth, setting.lens))
+            depths.append(_Depths.of(depth))
+            task.advance()
+        faults = plan(rules, motions, seed)
+        images = [f"images/{stem}.{'png' if rules.jpeg is None else 'jpg'}" for stem in stems]
+        shots = []
+        for number, (motion, fault, depth_means) in enumerate(zip(motions, faults, depths, strict=True)):
             rng = np.random.default_rng([seed, 15, number])
-            sharp, depth = _sharp(room, lens, pose)
-            image, blur, radius = _degraded(room, lens, pose, depth, fault, rng)
-            _write_image(observed / names[number], _record(sharp, 0.0, rng))
-            _write_image(out / names[number], _record(image, fault.noise, rng))
-            rows.append(
-                {
-                    "frame_id": number,
-                    "image": names[number],
-                    "time_s": float(times[number]),
-                    "blur_px": blur,
-                    "defocus_px": radius,
-                    "exposure_ev": fault.exposure,
-                    "noise": fault.noise,
-                }
-            )
+            light = _expose(setting, motion, fault, depth_means, rng)
+            image = develop(light, stops=fault.stops, noise=fault.noise, rng=rng)
+            write_image(out / images[number], image, rules.jpeg)
+            shots.append(image)
             task.advance()
-        novel_names = [f"images/{number:06d}.png" for number in range(len(novel_poses))]
-        for name, pose in zip(novel_names, novel_poses, strict=True):
-            _write_image(novel / name, _record(_sharp(room, lens, pose)[0], 0.0, rng))
+        _make_folder(out / "truth" / "novel")
+        novel_stems = [f"{number:06d}" for number in range(len(novel))]
+        for stem, pose in zip(novel_stems, novel, strict=True):
+            _write_sharp(out / "truth" / "novel", stem, setting, pose)
             task.advance()
-    write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), TRUTH_SCHEMA)
-    _write_transforms(observed, lens, names, poses)
-    _write_transforms(novel, lens, novel_names, novel_poses)
-    _write_transforms(out, lens, names, poses)
+    if video:
+        write_video(out / "capture.mp4", shots, FPS)
+    rows = [_row(*item) for item in zip(range(frames), images, motions, faults, strict=True)]
+    write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
+    sharp = [f"images/{stem}.png" for stem in stems]
+    write_transforms(out / "truth" / "observed", setting.lens, sharp, poses)
+    write_transforms(out / "truth" / "novel", setting.lens, [f"images/{s}.png" for s in novel_stems], novel)
+    mean_depth = float(np.mean([depth.mean for depth in depths]))
+    given = noisy_poses(poses, rules, mean_depth, seed)
+    summary = {
+        "protocol": protocol,
+        "seed": seed,
+        "world": setting.name,
+        "frames": frames,
+        "width": width,
+        "height": height,
+        "fps": FPS,
+        "jpeg_quality": rules.jpeg,
+        "blur_px": _distribution([row["blur_px"] for row in rows]),
+        "rolling_shutter_px": _distribution([row["rolling_shutter_px"] for row in rows]),
+        "px_at_640": REFERENCE_WIDTH / width,
+        "mean_depth": mean_depth,
+        "pose_noise": _pose_noise(rules, mean_depth),
+    }
+    write_json(out / "truth" / "capture.json", summary)
+    write_transforms(out, setting.lens, images, given)
+    return summary
+
+
+@dataclass(frozen=True)
+class _Depths:
+    """Of the pixels that see something."""
+
+    mean: float
+    nearness: float
+    """Mean of 1 / depth."""
+
+    @staticmethod
+    def of(depth: Array) -> _Depths:
+        seen = depth[depth > 0]
+        return _Depths(float(seen.mean()), float((1 / seen).mean())) if seen.size else _Depths(1.0, 1.0)
+
+
+def _expose(
+    setting: Setting, motion: FrameMotion, fault: Fault, depths: _Depths, rng: np.random.Generator
+) -> Array:
+    """One frame as it falls on the sensor, in linear light."""
+    shutter, aperture = motion.shutter(fault.exposure, fault.readout), PINHOLE
+    if fault.defocus > 0:
+        # The mean radius of a uniform disc's points is 2/3 of its rim, and `defocus` states the mean.
+        focus = NEAR_FOCUS / depths.nearness
+        radius = 1.5 * fault.defocus / (setting.lens.fx * (1 / focus - depths.nearness))
+        # A disc of that many points has neighbours about a pixel apart.
+        shutter = _repeated(shutter, math.ceil(4 * fault.defocus**2))
+        aperture = Aperture(disc(shutter.samples, radius)[rng.permutation(shutter.samples)], focus)
+    return setting.world.render(shutter, setting.lens, aperture)
+
+
+def _repeated(shutter: Shutter, samples: int) -> Shutter:
+    """The shutter with at least so many samples, the same at each instant."""
+    return Shutter(shutter.poses, np.tile(shutter.index, (math.ceil(samples / shutter.samples), 1)))
+
+
+def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array) -> None:
+    image = setting.world.render(still(pose, setting.lens.height), setting.lens)
+    write_image(folder / "images" / f"{stem}.png", develop(image))
+
+
+def _make_folder(folder: Path) -> None:
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+
+
+def _novel_poses(course: Course, count: int, seed: int) -> Array:
+    rng = np.random.default_rng([seed, 14])
+    return np.stack([course.novel((number + 0.5) / count, rng) for number in range(count)])
+
+
+def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str, Any]:
+    return {
+        "frame_id": number,
+        "image": image,
+        "time_s": motion.time,
+        "blur_px": motion.blur(fault.exposure),
+        "defocus_px": fault.defocus,
+        "exposure_ev": fault.stops,
+        "noise": fault.noise,
+        "rolling_shutter_px": motion.skew(fault.readout),
+        "exposure_s": fault.exposure,
+        "readout_s": fault.readout,
+    }
+
+
+def _distribution(values: list[float]) -> dict[str, Any]:
+    low, middle, high = (float(value) for value in np.quantile(values, [0.25, 0.5, 0.75]))
+    return {"mean": float(np.mean(values)), "quartiles": [low, middle, high], "max": max(values)}
+
+
+def _pose_noise(protocol: Protocol, depth: float) -> dict[str, float] | None:
+    """Deviations about and along each axis; None for exact poses."""
+    if not protocol.rotation_noise and not protocol.translation_noise:
+        return None
+    return {
+        "rotation_deg": protocol.rotation_noise,
+        "translation": protocol.translation_noise * depth,
+    }

@@ -1,88 +1,99 @@
-"""A handheld walk around the room: smooth drift, pauses and swings, and the tremor of a hand (1-12 Hz)."""
+"""A handheld walk: a course, walked at an uneven pace by a hand that trembles and swings.
+
+One path gives every pose, those within an exposure included: blur and skew are what its speed makes of the
+exposure and the readout, and so frame quality varies along it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-UP = np.array([0.0, 1.0, 0.0])
+from cleargs.synth.course import Course
+from cleargs.synth.world import Array
+
+FPS = 6.0
+"""Frames a second: what a walk of a few degrees a frame needs."""
+FRAMES_A_PAUSE = 6.0
+PAUSE = 0.8
+"""The pace lies between 1 - PAUSE and 1 + PAUSE of its mean."""
 TREMOR_HZ = (1.0, 12.0)
-TREMOR_RADIANS = 0.004
-"""Deviation of the aim, about a quarter of a degree, as of a hand that tries to hold still."""
+TREMOR_RADIANS = 0.005
+"""Deviation of the aim, about a third of a degree, as of a hand that walks and tries to hold still."""
+FRAMES_A_SWING = 4.0
+SWING_SECONDS = 0.12
+SWING_RADIANS = (0.035, 0.085)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """Turns of the aim about the camera's axes. Tremor of position is left out: at more than a step's
+    distance the turn moves the image far more."""
+
+    frequencies: Array  # [harmonics, 3] Hz
+    phases: Array  # [harmonics, 3]
+    amplitudes: Array  # [harmonics, 3] radians
+    swing_times: Array  # [swings] seconds
+    swing_turns: Array  # [swings, 3] radians
+
+    def turns(self, times: Array) -> Array:  # [T]
+        """Rotation vectors [T, 3]."""
+        waves = np.sin(2 * np.pi * self.frequencies * times[:, None, None] + self.phases)
+        tremor = (self.amplitudes * waves).sum(1)
+        # Out to one side, through the middle at full speed, back from the other: 1 at the extremes.
+        share = (times[:, None] - self.swing_times) / SWING_SECONDS
+        swings = share * np.exp((1 - share**2) / 2)
+        return np.asarray(tremor + swings @ self.swing_turns, np.float64)
+
+
+def make_hand(duration: float, seed: int) -> Hand:
+    """A hand whose tremor has the same speed in each band from 1 to 12 Hz, and swings every few frames."""
+    rng = np.random.default_rng([seed, 12])
+    frequencies = np.geomspace(*TREMOR_HZ, 12)[:, None] * rng.uniform(0.92, 1.0, (12, 3))
+    amplitudes = 1 / frequencies
+    amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
+    count = max(1, round(duration * FPS / FRAMES_A_SWING))
+    times = (np.arange(count) + rng.uniform(0, 1, count)) / count * duration
+    direction = rng.uniform(0, 2 * np.pi, count)
+    axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
+    turns = rng.uniform(*SWING_RADIANS, (count, 1)) * axes
+    return Hand(frequencies, rng.uniform(0, 2 * np.pi, (12, 3)), amplitudes, times, turns)
 
 
 @dataclass(frozen=True)
 class HandheldPath:
-    """A camera path around ``focus``; poses are camera to world [3, 4] with OpenCV axes."""
+    """Where the camera is at any time."""
 
-    focus: NDArray[np.float64]  # [3] metres
-    arc: float
-    """Angle walked around the focus, radians."""
+    course: Course
+    hand: Hand
     duration: float
     """Seconds."""
-    phases: NDArray[np.float64]  # [3 axes, harmonics]
-    frequencies: NDArray[np.float64]  # [3 axes, harmonics] Hz
-    swing: NDArray[np.float64]  # [2] phases of height and distance
+    pauses: int
+    phase: float
+    """Of the pace, radians."""
 
-    def pose(self, time: float) -> NDArray[np.float64]:
-        """Where the camera is at ``time`` seconds."""
-        share = time / self.duration
-        # The walk speeds up and slows down: its speed is 1 + 0.8 cos, so that frames bunch at the pauses.
-        progress = share + 0.8 / (6 * np.pi) * np.sin(6 * np.pi * share)
-        angle = (progress - 0.5) * self.arc
-        distance = 2.15 + 0.2 * np.sin(2 * np.pi * share + self.swing[0])
-        height = 1.4 + 0.18 * np.sin(4 * np.pi * share + self.swing[1])
-        centre = self.focus + np.array([distance * np.sin(angle), 0, distance * np.cos(angle)])
-        centre[1] = height
-        tremor = np.sin(2 * np.pi * self.frequencies * time + self.phases).mean(1) * np.sqrt(2)
-        aim = Rotation.from_rotvec(TREMOR_RADIANS * np.sqrt(self.phases.shape[1]) * tremor)
-        return look_at(centre, self.focus) @ _homogeneous(aim.as_matrix())
+    def poses(self, times: Array) -> Array:  # [T] seconds
+        """Camera to world [T, 3, 4] with OpenCV axes."""
+        poses = self.course.poses(self.progress(times))
+        turns = Rotation.from_rotvec(self.hand.turns(times)).as_matrix()
+        return np.concatenate([poses[:, :, :3] @ turns, poses[:, :, 3:]], 2)
+
+    def progress(self, times: Array) -> Array:
+        """Share of the course walked: its speed is 1 + PAUSE cos, so that frames bunch at the pauses."""
+        share, turn = times / self.duration, 2 * np.pi * self.pauses
+        wave = np.sin(turn * share + self.phase) - np.sin(self.phase)
+        return np.asarray(share + PAUSE / turn * wave, np.float64)
 
 
-def _homogeneous(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
+def make_path(course: Course, frames: int, seed: int) -> HandheldPath:
+    """The walk of ``seed`` along ``course`` that takes ``frames`` frames at `FPS`."""
+    rng = np.random.default_rng([seed, 16])
+    duration, pauses = frames / FPS, max(1, round(frames / FRAMES_A_PAUSE))
+    return HandheldPath(course, make_hand(duration, seed), duration, pauses, rng.uniform(0, 2 * np.pi))
 
 
-def look_at(centre: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world pose [3, 4] (OpenCV axes) at ``centre`` that looks at ``target``, level."""
-    forward = target - centre
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, UP)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward, centre], 1)
-
-
-def make_path(focus: NDArray[np.float64], frames: int, seed: int) -> HandheldPath:
-    """A path on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
-    rng = np.random.default_rng([seed, 12])
-    arc = np.radians(min(4.0 * frames, 150.0))
-    frequencies = np.geomspace(*TREMOR_HZ, 12) * rng.uniform(0.9, 1.1, (3, 12))
-    phases = rng.uniform(0, 2 * np.pi, (3, 12))
-    return HandheldPath(focus, float(arc), frames / 4, phases, frequencies, rng.uniform(0, 2 * np.pi, 2))
-
-
-def exposure_poses(
-    middle: NDArray[np.float64],  # [3, 4]
-    instants: NDArray[np.float64],  # [S] in -0.5 ... 0.5 of the exposure
-    sweep: float,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:  # [S, 3, 4]
-    """Poses within one exposure: the aim sweeps ``sweep`` radians along a slightly bent path, and drifts.
-
-    The pose at the middle of the exposure is ``middle``.
-    """
-    direction = rng.uniform(0, 2 * np.pi)
-    along = np.array([np.sin(direction), np.cos(direction), rng.normal(0, 0.15)])
-    across = np.array([np.cos(direction), -np.sin(direction), 0.0]) * rng.normal(0, 0.35)
-    drift = rng.normal(0, 0.25, 3) * sweep
-    poses = np.empty((len(instants), 3, 4))
-    for number, instant in enumerate(instants):
-        turn = Rotation.from_rotvec(sweep * (along * instant + across * instant**2)).as_matrix()
-        poses[number] = middle @ _homogeneous(turn)
-        poses[number, :, 3] += middle[:, :3] @ (drift * instant)
-    return poses
+def frame_times(frames: int) -> Array:
+    """Middles of the exposures, seconds [frames]."""
+    return np.asarray((np.arange(frames) + 0.5) / FPS, np.float64)

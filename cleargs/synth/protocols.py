@@ -2,73 +2,144 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.synth.motion import FrameMotion, duration_for
 
 REFERENCE_WIDTH = 640
-"""Blur lengths and radii are stated in pixels at this image width."""
+"""Lengths in pixels are stated at this image width."""
+NOISE = 1.0 / 255
+"""Deviation of the sensor noise at mid grey of a well exposed frame, sRGB units."""
+SHARP_BLUR = 0.8
+"""Longest mean blur of a frame of `mixed` that counts as sharp, pixels."""
 
 
 @dataclass(frozen=True)
-class Degradation:
-    """The faults of one frame; lengths in pixels at `REFERENCE_WIDTH`."""
+class Protocol:
+    """One way to spoil a capture. Lengths in pixels at `REFERENCE_WIDTH`.
 
+    One exposure and one readout time serve the whole capture, chosen so that the means over its frames are
+    as stated; how they vary from frame to frame is the walk's doing.
+    """
+
+    summary: str
     blur: float = 0.0
-    """Mean length of the motion path in the image."""
-    defocus: float = 0.0
-    """Mean radius of the blur disc."""
-    exposure: float = 0.0
-    """Exposure error in stops."""
-    noise: float = 1.0 / 255
-    """Standard deviation of the sensor noise at mid grey, in sRGB units."""
+    """Mean over the frames of the mean length of the motion path in the image; 0 for instants."""
+    skew: float = 0.0
+    """Mean over the frames of the mean displacement between first and last row's pose; 0: global shutter."""
+    rotation_noise: float = 0.0
+    """Deviation about each axis of the given poses' rotation error, degrees."""
+    translation_noise: float = 0.0
+    """Deviation along each axis of the given poses' centre error, as a share of the capture's mean depth."""
+    mixed: bool = False
+    """Faults by frame instead: see `_mixed`."""
+    jpeg: int | None = None
+    """JPEG quality; None for lossless PNG."""
 
 
-def _sharp(frames: int, rng: np.random.Generator) -> list[Degradation]:
-    return [Degradation() for _ in range(frames)]
-
-
-def _blurred(mean: float) -> Callable[[int, np.random.Generator], list[Degradation]]:
-    """Motion blur of every frame, gamma-distributed (shape 4) about ``mean`` pixels, as in GS2E."""
-
-    def draw(frames: int, rng: np.random.Generator) -> list[Degradation]:
-        return [Degradation(blur=float(length)) for length in mean * rng.gamma(4, 1 / 4, frames)]
-
-    return draw
-
-
-def _mixed(frames: int, rng: np.random.Generator) -> list[Degradation]:
-    """What phones give: half the frames sharp; of the rest 60 % blurred, 20 % defocused, 20 % misexposed."""
-    bad = rng.permutation(np.arange(frames) % 2 == 1) if frames > 32 else np.arange(frames) % 2 == 1
-    result = []
-    for is_bad in bad:
-        fault = rng.uniform()
-        if not is_bad:
-            result.append(Degradation(blur=float(rng.uniform(0, 0.8))))
-        elif fault < 0.6:
-            result.append(Degradation(blur=float(rng.uniform(7, 22)), noise=2 / 255))
-        elif fault < 0.8:
-            result.append(Degradation(defocus=float(rng.uniform(3, 6))))
-        else:
-            stops = float(rng.choice([-1, 1]) * rng.uniform(1.3, 2.2))
-            result.append(Degradation(exposure=stops, noise=3 / 255))
-    return result
-
-
-PROTOCOLS: dict[str, Callable[[int, np.random.Generator], list[Degradation]]] = {
-    "sharp": _sharp,
-    "mixed": _mixed,
-    "gs2e-slight": _blurred(6),
-    "gs2e-medium": _blurred(12),
-    "gs2e-severe": _blurred(20),
+PROTOCOLS: dict[str, Protocol] = {
+    "sharp": Protocol("no fault but a little noise: the control that nothing may harm"),
+    "mixed": Protocol(
+        "half the frames sharp, the rest blurred, defocused or misexposed", mixed=True, jpeg=92
+    ),
+    "gs2e-slight": Protocol("motion blur of 6 px on average", blur=6),
+    "gs2e-medium": Protocol("motion blur of 12 px on average", blur=12),
+    "gs2e-severe": Protocol("motion blur of 20 px on average", blur=20),
+    "gsotm-mb": Protocol("motion blur of 8 px on average", blur=8),
+    "gsotm-rs": Protocol("rolling shutter, 12 px of skew on average", skew=12),
+    "gsotm-mb-rs": Protocol("motion blur of 8 px and rolling shutter of 12 px", blur=8, skew=12),
+    "gsotm-pn": Protocol("sharp, with noise on the given poses", rotation_noise=0.4, translation_noise=0.005),
 }
 
 
-def degradations(protocol: str, frames: int, seed: int) -> list[Degradation]:
-    """The faults of each frame. Raises InputError for a name that is not in `PROTOCOLS`."""
-    if protocol not in PROTOCOLS:
-        raise InputError(f"no protocol is called {protocol!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[protocol](frames, np.random.default_rng([seed, 13]))
+def find_protocol(name: str) -> Protocol:
+    """The protocol called ``name``. Raises InputError where there is none."""
+    if name not in PROTOCOLS:
+        raise InputError(f"no protocol is called {name!r}", hint=f"choose one of {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with one frame."""
+
+    exposure: float = 0.0
+    """Seconds that the shutter is open for a row."""
+    readout: float = 0.0
+    """Seconds from the first row's exposure to the last one's."""
+    defocus: float = 0.0
+    """Mean radius of the blur disc, pixels of the image."""
+    stops: float = 0.0
+    """Exposure error."""
+    noise: float = NOISE
+    """Deviation of the sensor noise at mid grey, sRGB units."""
+
+
+def plan(protocol: Protocol, motions: Sequence[FrameMotion], seed: int) -> list[Fault]:
+    """The fault of each frame of a walk."""
+    scale = motions[0].lens.width / REFERENCE_WIDTH
+    if protocol.mixed:
+        return _mixed(motions, scale, np.random.default_rng([seed, 13]))
+    exposure = duration_for(
+        protocol.blur * scale, lambda time: float(np.mean([motion.blur(time) for motion in motions]))
+    )
+    readout = duration_for(
+        protocol.skew * scale, lambda time: float(np.mean([motion.skew(time) for motion in motions]))
+    )
+    return [Fault(exposure, readout)] * len(motions)
+
+
+def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
+    """What phones give: of any two neighbours one is sharp (blur under `SHARP_BLUR`) and one is not.
+
+    Of the others the 60 % that move fastest are blurred by 7-22 px; of the rest every other one is defocused
+    by a disc of 3-6 px and misexposed by 1.3-2.2 stops in turn. The exposure of all drifts slowly by up to
+    0.1 stops, as automatic exposure does.
+    """
+    count = len(motions)
+    spoilt = _one_of_two(count, rng)
+    by_speed = sorted(spoilt, key=lambda number: -motions[number].blur(0.02))
+    blurred = by_speed[: round(0.6 * len(by_speed))]
+    defocused = sorted(by_speed[len(blurred) :])[::2]
+    drift = 0.1 * np.sin(2 * np.pi * (np.arange(count) / 24 + rng.uniform()))
+    faults = []
+    for number, motion in enumerate(motions):
+        blur, radius, stops = rng.uniform(0.1, SHARP_BLUR), 0.0, float(drift[number])
+        noise = NOISE
+        if number in blurred:
+            blur, noise = rng.uniform(7, 22), 2 * NOISE
+        elif number in defocused:
+            radius = rng.uniform(3, 6)
+        elif number in spoilt:
+            stops += float(rng.choice([-1, 1]) * rng.uniform(1.3, 2.2))
+            noise = 3 * NOISE
+        exposure = duration_for(blur * scale, motion.blur)
+        faults.append(Fault(exposure, 0.0, radius * scale, stops, noise))
+    return faults
+
+
+def _one_of_two(count: int, rng: np.random.Generator) -> list[int]:
+    """One of every two neighbouring numbers below ``count``."""
+    pairs = np.arange(0, count - 1, 2)
+    return [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
+
+
+def noisy_poses(
+    poses: NDArray[np.float64],  # [F, 3, 4] camera to world
+    protocol: Protocol,
+    depth: float,
+    seed: int,
+) -> NDArray[np.float64]:  # [F, 3, 4]
+    """The poses that the user is given, ``depth`` being the mean depth of the capture in world units."""
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng([seed, 18])
+    turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
+    shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))
+    rotations = poses[:, :, :3] @ Rotation.from_rotvec(turns).as_matrix()
+    return np.concatenate([rotations, poses[:, :, 3:] + shifts[..., None]], 2)

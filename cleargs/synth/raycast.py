@@ -1,8 +1,8 @@
 """A small ray caster for the room, in Numba.
 
 It shares nothing with the splatting core, so that the truth it makes cannot share that core's errors. Every
-image is the mean of passes; a pass casts one jittered ray a pixel with its own camera pose a row and its own
-point on the lens. Anti-aliasing, motion blur, rolling shutter and defocus are therefore one mechanism.
+image is the mean of samples; a sample casts one jittered ray a pixel with its own camera pose a row and its
+own point on the lens. Anti-aliasing, motion blur, rolling shutter and defocus are therefore one mechanism.
 """
 
 from __future__ import annotations
@@ -16,32 +16,23 @@ from numpy.typing import NDArray
 
 from cleargs.synth.room import BOX, SPHERE, Room
 from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
-
-Array = NDArray[np.float64]
+from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
 
 MISS = 1e30
 AMBIENT = 0.42
 LAMP = 1.9
+PENUMBRA, CONTACT = 0.1, 0.015
+"""Half width of a shadow's soft rim: a share of the distance to what casts it, and metres."""
+OCCLUSION = 0.8
 
 
-@dataclass(frozen=True)
-class Passes:
-    """How the rays of each pass start."""
-
-    poses: NDArray[np.float64]  # [S, H, 3, 4] camera to world (OpenCV axes), of each row in each pass
-    jitter: NDArray[np.float64]  # [S, 2] offset inside the pixel, in [0, 1)
-    lens: NDArray[np.float64]  # [S, 2] point on the lens, metres; zero for a pinhole
-    focus: float
-    """Distance in focus, metres."""
-
-
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy")
 def _dot(a: Array, b: Array) -> float:
     total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
     """Distance to a box of half sides ``half`` at the origin, from outside or from inside."""
     near, far, near_axis, far_axis = -MISS, MISS, 0, 0
@@ -64,7 +55,7 @@ def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
     return far if inside else near
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> float:
     half = _dot(origin, ray)
     root = half * half - _dot(origin, origin) + radius * radius
@@ -78,7 +69,7 @@ def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> floa
     return distance
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, normal: Array) -> float:
     """An open cylinder about the y axis."""
     a = ray[0] * ray[0] + ray[2] * ray[2]
@@ -95,7 +86,7 @@ def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, norma
     return distance
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv: Array) -> None:
     """Metres along the surface; each face of a box sees another part of its texture."""
     if kind == BOX:
@@ -116,7 +107,7 @@ def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv
         uv[1] = point[1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sample(
     texels: NDArray[np.float32],
     offsets: NDArray[np.int64],
@@ -144,27 +135,7 @@ def _sample(
                 colour[channel] += weight * texels[start + offsets[mip] + texel, channel]
 
 
-@njit(cache=True)
-def _shadow(point: Array, to_light: Array, reach: float, primitives: NDArray[np.void], own: int) -> float:
-    """Share of the lamp that the bounding spheres leave, soft at their rims (0 dark, 1 lit)."""
-    lit = 1.0
-    for number in range(1, primitives.shape[0]):
-        item = primitives[number]
-        if item["shade"] == 0.0 or number == own:
-            continue
-        centre = item["centre"]
-        x, y, z = centre[0] - point[0], centre[1] - point[1], centre[2] - point[2]
-        along = x * to_light[0] + y * to_light[1] + z * to_light[2]
-        if along <= 0.0 or along >= reach:
-            continue
-        distance = math.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
-        penumbra = 0.15 * along + 0.02
-        cover = min(max((item["shade"] + penumbra - distance) / (2 * penumbra), 0.0), 1.0)
-        lit *= 1 - 0.8 * cover * cover * (3 - 2 * cover)
-    return lit
-
-
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _to_local(item: np.void, vector: Array, shift: bool, local: Array) -> None:
     """A direction, or with ``shift`` a point, in the primitive's own axes."""
     centre, rotation = item["centre"], item["rotation"]
@@ -175,7 +146,79 @@ def _to_local(item: np.void, vector: Array, shift: bool, local: Array) -> None:
         local[axis] = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def _cover_of_sphere(to_centre: Array, radius: float, to_light: Array, reach: float) -> float:
+    """How much of the lamp a ball hides from a point, 0 to 1, soft at its rim."""
+    along = _dot(to_centre, to_light)
+    if along <= 0.0 or along >= reach:
+        return 0.0
+    distance = math.sqrt(max(_dot(to_centre, to_centre) - along * along, 0.0))
+    penumbra = PENUMBRA * along + CONTACT
+    return min(max((radius + penumbra - distance) / (2 * penumbra), 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _cover_of_box(point: Array, ray: Array, half: Array, reach: float) -> float:
+    """How much of the lamp a box hides from ``point``, 0 to 1; both vectors in the box's axes.
+
+    By the room that the box leaves on the side where the ray passes its middle: soft over the penumbra, or
+    over the box's own thickness where that is less.
+    """
+    near, far = -MISS, MISS
+    for axis in range(3):
+        speed = ray[axis] if abs(ray[axis]) > 1e-9 else 1e-9
+        first, last = (-half[axis] - point[axis]) / speed, (half[axis] - point[axis]) / speed
+        near, far = max(near, min(first, last)), min(far, max(first, last))
+    along = 0.5 * (near + far)
+    if along <= 0.0 or along >= reach:
+        return 0.0
+    penumbra = PENUMBRA * along + CONTACT
+    cover = 1.0
+    for axis in range(3):
+        room = half[axis] - abs(point[axis] + along * ray[axis])
+        cover = min(cover, room / min(2 * penumbra, 2 * half[axis]) + 0.5)
+    return min(max(cover, 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _light_at(
+    point: Array,
+    normal: Array,
+    to_light: Array,
+    reach: float,
+    primitives: NDArray[np.void],
+    own: int,
+    scratch: Array,  # [3, 3]
+) -> tuple[float, float]:
+    """Share of the lamp and share of the ambient light that the primitives leave (0 dark, 1 lit)."""
+    lit, ambient = 1.0, 1.0
+    to_centre, local_point, local_ray = scratch[0], scratch[1], scratch[2]
+    for number in range(1, primitives.shape[0]):
+        item = primitives[number]
+        if item["shade"] == 0.0 or number == own:
+            continue
+        centre, radius = item["centre"], item["shade"]
+        for axis in range(3):
+            to_centre[axis] = centre[axis] - point[axis]
+        away = _dot(to_centre, to_centre)
+        rise = _dot(to_centre, normal)
+        if rise > 0.0:  # what a ball of that size hides of a clear sky
+            ambient *= 1 - OCCLUSION * min(radius * radius / away, 1.0) * rise / math.sqrt(away)
+        along = _dot(to_centre, to_light)
+        margin = item["bound"] + PENUMBRA * max(along, 0.0) + CONTACT
+        if away - along * along > margin * margin:
+            continue
+        if item["kind"] == BOX:
+            _to_local(item, point, True, local_point)
+            _to_local(item, to_light, False, local_ray)
+            cover = _cover_of_box(local_point, local_ray, item["size"], reach)
+        else:
+            cover = _cover_of_sphere(to_centre, radius, to_light, reach)
+        lit *= 1 - 0.85 * cover * cover * (3 - 2 * cover)
+    return lit, ambient
+
+
+@njit(cache=True, error_model="numpy")
 def _passes_by(item: np.void, origin: Array, ray: Array) -> bool:
     """Whether the ray misses the sphere around the primitive."""
     centre = item["centre"]
@@ -185,7 +228,7 @@ def _passes_by(item: np.void, origin: Array, ray: Array) -> bool:
     return bool(x * x + y * y + z * z - along * along > bound * bound)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _trace(
     origin: Array,
     ray: Array,
@@ -196,7 +239,7 @@ def _trace(
     stride: int,
     light: Array,
     colour: Array,
-    scratch: Array,  # [7, 3], so that a ray allocates nothing
+    scratch: Array,  # [10, 3], so that a ray allocates nothing
 ) -> float:
     """Radiance along one ray into ``colour``; returns the distance."""
     best, hit = MISS, 0
@@ -234,12 +277,12 @@ def _trace(
     _texture_coordinates(item["kind"], local_point, best_normal, item["size"], local_ray)
     _sample(texels, offsets, item["texture"] * stride, local_ray, best * pixel_angle / facing, colour)
 
-    lit = _shadow(point, to_light, reach, primitives, hit)
+    lit, ambient = _light_at(point, world_normal, to_light, reach, primitives, hit, scratch[7:10])
     diffuse = max(_dot(world_normal, to_light), 0.0) * lit * LAMP / (1 + 0.25 * reach * reach)
-    corner = 1.0  # ambient light fades towards the room's edges
+    # Ambient light also fades towards the room's edges.
     for axis in range(3):
         gap = primitives[0]["size"][axis] - abs(point[axis] - primitives[0]["centre"][axis])
-        corner *= 1 - 0.35 * math.exp(-max(gap, 0.0) / 0.25)
+        ambient *= 1 - 0.35 * math.exp(-max(gap, 0.0) / 0.25)
     highlight = 0.0
     if item["gloss"] > 0:  # Blinn-Phong
         facing_half, norm = 0.0, 0.0
@@ -249,15 +292,15 @@ def _trace(
             facing_half += world_normal[k] * half
         highlight = 0.6 * item["gloss"] * lit * max(facing_half / math.sqrt(norm), 0.0) ** 40
     for channel in range(3):
-        colour[channel] = colour[channel] * (AMBIENT * corner + diffuse) + highlight
+        colour[channel] = colour[channel] * (AMBIENT * ambient + diffuse) + highlight
     return best
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _render(
-    poses: Array,
-    jitter: Array,
-    lens: Array,
+    poses: Array,  # [S, H, 3, 4] camera to world, of each row in each sample
+    jitter: Array,  # [S, 2] offset inside the pixel, in [0, 1)
+    lens: Array,  # [S, 2] point on the lens, metres; zero for a pinhole
     focus: float,
     fx: float,
     fy: float,
@@ -278,7 +321,7 @@ def _render(
             np.zeros(3),
             np.zeros(3),
             np.zeros(3),
-            np.zeros((7, 3)),
+            np.zeros((10, 3)),
         )
         for column in range(width):
             for number in range(passes):
@@ -299,17 +342,32 @@ def _render(
                     image[row, column, channel] += colour[channel] / passes
 
 
-def cast(
-    room: Room, passes: Passes, intrinsics: tuple[float, float, float, float], width: int, height: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Image [H, W, 3] in linear light (1 is sensor white) and mean depth [H, W] in metres along the axis.
+@dataclass(frozen=True)
+class RoomWorld:
+    """The room as a `cleargs.synth.world.World`; lengths in metres."""
 
-    ``intrinsics`` are fx, fy, cx, cy in pixels, pixel centres at + 0.5.
-    """
-    image, depth = np.zeros((height, width, 3)), np.zeros((height, width))
-    textures = room.textures
-    _render(
-        passes.poses, passes.jitter, passes.lens, passes.focus, *intrinsics, room.primitives,
-        textures.texels, textures.level_offsets, textures.stride, room.light, image, depth,
-    )  # fmt: skip
-    return image, depth
+    room: Room
+
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+        """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
+        points = np.broadcast_to(aperture.points, (shutter.samples, 2))
+        return self._cast(
+            shutter.poses[shutter.index], low_discrepancy(shutter.samples), points, aperture.focus, lens
+        )[0]
+
+    def depth(self, pose: Array, lens: Lens) -> Array:
+        """Exact depth through the pixel centres."""
+        poses = np.broadcast_to(pose, (1, lens.height, 3, 4))
+        return self._cast(poses, np.full((1, 2), 0.5), np.zeros((1, 2)), 1.0, lens)[1]
+
+    def _cast(
+        self, poses: Array, jitter: Array, points: Array, focus: float, lens: Lens
+    ) -> tuple[Array, Array]:
+        image, depth = np.zeros((lens.height, lens.width, 3)), np.zeros((lens.height, lens.width))
+        textures = self.room.textures
+        _render(
+            np.ascontiguousarray(poses), jitter, np.ascontiguousarray(points), focus,
+            lens.fx, lens.fy, lens.cx, lens.cy, self.room.primitives,
+            textures.texels, textures.level_offsets, textures.stride, self.room.light, image, depth,
+        )  # fmt: skip
+        return image, depth

@@ -20,7 +20,10 @@ PRIMITIVE = np.dtype(
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
         ("bound", np.float64),  # radius of the bounding sphere
-        ("shade", np.float64),  # radius of the sphere that casts its soft shadow, 0 for none
+        (
+            "shade",
+            np.float64,
+        ),  # radius of a ball of its volume, that hides ambient light; 0: it casts no shadow
     ]
 )
 
@@ -36,6 +39,8 @@ class Room:
 
 
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
+FLOOR = 0.004
+"""Half the thickness of the floor's covering."""
 SURFACES, PRINTS = 8, 6
 
 
@@ -66,6 +71,8 @@ def make_room(seed: int) -> Room:
         return int(rng.integers(SURFACES))
 
     items = [_primitive(BOX, (0, HEIGHT / 2, 0), (WIDTH / 2, HEIGHT / 2, DEPTH / 2), 0, shadow=False)]
+    floor = (WIDTH / 2, FLOOR, DEPTH / 2)
+    items.append(_primitive(BOX, (0, FLOOR, 0), floor, 1, gloss=0.15, shadow=False))
 
     for number in range(5):  # posters on the back wall and on both side walls
         poster = SURFACES + number % PRINTS

@@ -1,0 +1,86 @@
+"""From light to files: the sensor, and the folders of a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from OpenImageIO import FLOAT, ImageOutput, ImageSpec
+
+from cleargs.errors import StoreError
+from cleargs.files import atomic_path, write_bytes, write_json
+from cleargs.media.colour import srgb_from_linear
+from cleargs.synth.world import Array, Lens
+from cleargs.tables import column
+
+FRAMES = pa.schema(
+    [
+        column("frame_id", pa.int32(), "number of the frame, as in images/"),
+        column("image", pa.string(), "file below the capture"),
+        column("time_s", pa.float64(), "middle of the exposure, of the middle row, seconds"),
+        column("blur_px", pa.float64(), "mean length of the motion path in the image, pixels"),
+        column("defocus_px", pa.float64(), "mean radius of the blur disc, pixels"),
+        column("exposure_ev", pa.float64(), "exposure error, stops"),
+        column("noise", pa.float64(), "deviation of the sensor noise at mid grey, sRGB units"),
+        column(
+            "rolling_shutter_px", pa.float64(), "mean distance in the image between first and last row's pose"
+        ),
+        column("exposure_s", pa.float64(), "time that the shutter is open for a row, seconds; 0: an instant"),
+        column("readout_s", pa.float64(), "time from first to last row, seconds; 0: global shutter"),
+    ]
+)
+"""``truth/frames.parquet``; pixels are those of the capture's own images."""
+
+
+def develop(
+    image: Array, *, stops: float = 0.0, noise: float = 0.0, rng: np.random.Generator | None = None
+) -> NDArray[np.uint8]:
+    """Exposure error, sensor noise, clipping, sRGB encoding, 8 bits: RGB [H, W, 3] from linear light.
+
+    The noise is signal-dependent: ``noise`` is its deviation in sRGB units at mid grey of a frame exposed
+    by ``stops``, of whose square 70 % is shot noise and the rest is read noise.
+    """
+    image = image * 2.0**stops
+    if rng is not None:
+        mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: carries the stated deviation into linear light
+        shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
+        image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
+    return np.asarray(np.rint(srgb_from_linear(np.clip(image, 0, 1)) * 255), np.uint8)
+
+
+def write_image(path: Path, image: NDArray[np.uint8], jpeg: int | None = None) -> None:
+    """Write RGB [H, W, 3] in the format of the ending, as JPEG of quality ``jpeg``. Raises StoreError."""
+    options = [] if jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, jpeg]
+    ok, data = cv2.imencode(path.suffix, image[..., ::-1], options)
+    if not ok:
+        raise ValueError(f"cannot encode {path.suffix}")
+    write_bytes(path, data.tobytes())
+
+
+def write_depth(path: Path, depth: Array) -> None:
+    """Write depth [H, W] as an EXR of one float32 channel ``Z``. Raises StoreError."""
+    spec = ImageSpec(depth.shape[1], depth.shape[0], 1, FLOAT)
+    spec.channelnames = ("Z",)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
+    with atomic_path(path) as temporary:
+        output = ImageOutput.create(str(temporary))
+        pixels = np.ascontiguousarray(depth[..., None], np.float32)
+        if output is None or not (
+            output.open(str(temporary), spec) and output.write_image(pixels) and output.close()
+        ):
+            raise StoreError(f"cannot write {path}", hint="check the free space and the permissions")
+
+
+def write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: Array) -> None:  # [F, 3, 4]
+    """``transforms.json`` as nerfstudio reads it: OpenGL camera to world."""
+    frames = []
+    for image, pose in zip(images, poses, strict=True):
+        matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": image, "transform_matrix": matrix.tolist()})
+    camera = {"camera_model": "OPENCV", "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    write_json(folder / "transforms.json", {**camera, "w": lens.width, "h": lens.height, "frames": frames})

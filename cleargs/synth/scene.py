@@ -1,0 +1,171 @@
+"""A trained Gaussian scene as the world of a capture, as GS2E does, and the walk along its real cameras."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cleargs.capture.tables import load_frames
+from cleargs.capture.transforms import read_transforms
+from cleargs.errors import InputError, StoreError
+from cleargs.media.colour import linear_from_srgb
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.ply import read_ply
+from cleargs.splat.scene import Scene
+from cleargs.synth.course import CameraCourse, camera_course
+from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter
+
+OPAQUE = 0.5
+"""Alpha from which a pixel has a depth."""
+
+
+@dataclass(frozen=True)
+class RealCamera:
+    """A camera of the capture that a scene was trained on, in the scene's world."""
+
+    lens: Lens
+    pose: Array  # [3, 4] camera to world, OpenCV axes
+
+
+class SplatWorld:
+    """A Gaussian scene as a `cleargs.synth.world.World`; its lengths are the scene's own.
+
+    The splatting core renders each pose once, with its own pixel filter; rows are taken from the pictures
+    of their poses. Averages are taken of what a display would show, clipped to [0, 1], in linear light.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._engine = Engine()
+
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+        """The mean over the samples. Off the optical axis the principal point moves with the lens, so that
+        what is in focus stays where it is."""
+        points = np.broadcast_to(aperture.points, (shutter.samples, 2))
+        shares: defaultdict[tuple[int, float, float], Array] = defaultdict(lambda: np.zeros(lens.height))
+        for row_poses, (right, down) in zip(shutter.index, points, strict=True):
+            for number in np.unique(row_poses):
+                shares[int(number), float(right), float(down)] += (row_poses == number) / shutter.samples
+        total = np.zeros((lens.height, lens.width, 3))
+        for (number, right, down), share in shares.items():
+            pose = shutter.poses[number].copy()
+            pose[:, 3] += pose[:, :2] @ np.array([right, down])
+            moved = Lens(
+                lens.width,
+                lens.height,
+                lens.fx,
+                lens.fy,
+                lens.cx + lens.fx * right / aperture.focus,
+                lens.cy + lens.fy * down / aperture.focus,
+            )
+            rows = share > 0
+            total[rows] += share[rows, None, None] * linear_from_srgb(self._picture(pose, moved)[rows])
+        return total
+
+    def depth(self, pose: Array, lens: Lens) -> Array:
+        """The expected depth of the render; 0 where it is mostly transparent."""
+        rendered = self._engine.forward(
+            self._scene.gaussians, _camera(pose, lens), antialias=self._scene.antialias, depth=True
+        )
+        assert rendered.depth is not None
+        alpha = rendered.alpha.numpy().astype(np.float64)
+        mean = rendered.depth.numpy() / np.maximum(alpha, OPAQUE)
+        return np.where(alpha >= OPAQUE, mean, 0.0)
+
+    def _picture(self, pose: Array, lens: Lens) -> Array:
+        """sRGB in [0, 1]."""
+        rendered = self._engine.forward(
+            self._scene.gaussians,
+            _camera(pose, lens),
+            background=self._scene.background,
+            antialias=self._scene.antialias,
+        )
+        return np.clip(rendered.image.numpy().astype(np.float64), 0, 1)
+
+
+def open_scene(
+    path: Path, cameras: Path | None, frames: int, width: int, height: int
+) -> tuple[SplatWorld, CameraCourse, Lens, str]:
+    """The scene in ``path`` as a world, ``frames`` of its real cameras as a course, their lens, and its name.
+
+    The cameras are those that ``cameras`` names (`read_cameras`), else those of the run that ``path`` lies
+    in: RUN/STAGE/scene.ply. The lens fills ``width`` x ``height`` and is that of the first camera.
+
+    Raises InputError when the file is no scene, empty, or the cameras are missing or too few.
+    """
+    run = path.absolute().parent.parent  # not resolved: RUN/STAGE is a link into the store
+    if cameras is None and not (run / "ingest" / "frames.parquet").is_file():
+        if not path.is_file():
+            raise InputError(f"there is no scene {path}", hint="give a scene.ply")
+        raise InputError(
+            f"{path} does not lie in a run, so its cameras are not known",
+            hint="give --cameras DIR, a folder with a transforms.json in the scene's world",
+        )
+    world = SplatWorld(_read_scene(path))
+    real = read_cameras(run if cameras is None else cameras)
+    course = camera_course([camera.pose for camera in real], frames)
+    return world, course, real[0].lens.fitted(width, height), path.stem if cameras is not None else run.name
+
+
+def read_cameras(source: Path) -> list[RealCamera]:
+    """Cameras in frame order: of a run, of a transforms.json, or of the folder that holds one.
+
+    Raises InputError when there are none.
+    """
+    table = source / "ingest" / "frames.parquet"
+    if table.is_file():
+        return _cameras_of_run(table.parent)
+    transforms = source / "transforms.json" if source.is_dir() else source
+    if not transforms.is_file():
+        raise InputError(
+            f"{source} holds no cameras", hint="give a transforms.json, a folder that holds one, or a run"
+        )
+    return _cameras_of_transforms(transforms)
+
+
+def _cameras_of_run(ingest: Path) -> list[RealCamera]:
+    cameras = []
+    for frame in load_frames(ingest):
+        pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
+        numbers = [value for value in pose if value is not None]
+        if frame.registered and len(numbers) == 7:
+            lens = Lens(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy)
+            camera = Camera.from_quaternion(
+                *numbers, width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
+            )
+            rotation = camera.world_to_camera[:3, :3].T
+            cameras.append(RealCamera(lens, np.column_stack([rotation, camera.centre])))
+    return cameras
+
+
+def _cameras_of_transforms(path: Path) -> list[RealCamera]:
+    cameras = []
+    for frame in read_transforms(path, poses=True):
+        assert frame.camera is not None and frame.pose is not None
+        (fx, fy), (cx, cy) = frame.camera.focal, frame.camera.centre
+        pose = np.column_stack([frame.pose.rotation.T, frame.pose.centre])
+        cameras.append(RealCamera(Lens(frame.camera.width, frame.camera.height, fx, fy, cx, cy), pose))
+    return cameras
+
+
+def _read_scene(path: Path) -> Scene:
+    hint = "give a scene.ply with Gaussians in the layout of the Inria code"
+    try:
+        scene = read_ply(path)
+    except StoreError as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise InputError(f"{path} is not a Gaussian scene: {reason}", hint=hint) from error
+    if scene.gaussians.num == 0:
+        raise InputError(f"{path} holds no Gaussians", hint=hint)
+    return scene
+
+
+def _camera(pose: Array, lens: Lens) -> Camera:
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = pose[:, :3].T
+    world_to_camera[:3, 3] = -pose[:, :3].T @ pose[:, 3]
+    return Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, world_to_camera)

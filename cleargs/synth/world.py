@@ -1,0 +1,103 @@
+"""What a capture looks at: any world that a camera can be exposed in.
+
+Protocols and degradations know a world only through `World`. Poses are camera to world [3, 4], OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]
+
+MIN_SAMPLES = 8
+"""Samples of a picture without motion: they also smooth the edges of a world that is sampled by rays."""
+FIELD_OF_VIEW = math.radians(65)
+"""Across the longer side, as a phone's main camera."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole intrinsics in pixels, pixel centres at + 0.5."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def fitted(self, width: int, height: int) -> Lens:
+        """The lens of the same view scaled to fill ``width`` x ``height``, cropped about its middle."""
+        scale = max(width / self.width, height / self.height)
+        left, top = (self.width * scale - width) / 2, (self.height * scale - height) / 2
+        cx, cy = self.cx * scale - left, self.cy * scale - top
+        return Lens(width, height, self.fx * scale, self.fy * scale, cx, cy)
+
+
+def phone_lens(width: int, height: int) -> Lens:
+    """The main camera of a phone."""
+    focal = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
+    return Lens(width, height, focal, focal, width / 2, height / 2)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """Which pose each row of the sensor sees in each sample of its exposure.
+
+    Global shutter: all rows of a sample share a pose. Rolling shutter: a window that slides over the poses.
+    """
+
+    poses: Array  # [T, 3, 4] in the order of time
+    index: NDArray[np.intp]  # [S, H] into poses
+
+    @property
+    def samples(self) -> int:
+        return len(self.index)
+
+
+def still(pose: Array, height: int) -> Shutter:  # [3, 4]
+    """An instant: one pose for all rows."""
+    return Shutter(pose[None], np.zeros((MIN_SAMPLES, height), np.intp))
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A thin lens: the points of the aperture that the samples look through, one a sample."""
+
+    points: Array = field(default_factory=lambda: np.zeros((1, 2)))  # [S or 1, 2] world units
+    focus: float = 1.0
+    """Distance in focus, world units."""
+
+
+PINHOLE = Aperture()
+
+
+class World(Protocol):
+    """Something to photograph."""
+
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+        """The mean over the samples in linear light, [H, W, 3]; 1 is sensor white."""
+        ...
+
+    def depth(self, pose: Array, lens: Lens) -> Array:
+        """Distance along the optical axis through the pixel centres, [H, W]; 0 where there is nothing."""
+        ...
+
+
+def low_discrepancy(count: int) -> Array:
+    """[count, 2] points that cover the unit square evenly (Roberts' R2 sequence)."""
+    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0, np.float64)
+
+
+def disc(count: int, radius: float) -> Array:
+    """[count, 2] points that cover a disc evenly (sunflower spiral)."""
+    number = np.arange(count) + 0.5
+    angle = number * math.pi * (3 - math.sqrt(5))
+    unit = np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return np.asarray(radius * unit, np.float64)
