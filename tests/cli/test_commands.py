@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pyarrow as pa
@@ -258,6 +259,7 @@ def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
     )
     assert process.stdout is not None
     process.stdout.readline()
+    time.sleep(1)  # until it is in the call
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and "the same command goes on" in errors
