@@ -1,13 +1,16 @@
 # make demo   a synthetic capture through all five stages
 # make test   the whole test suite
+# make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
+# make test-convert  the tests of those conversions
 # TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
 
 PYTHON ?= python3
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint convert-env test-convert clean
 
 demo: .venv/demo.stamp demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
@@ -19,6 +22,11 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy cleargs stages
+
+convert-env: .venv-convert/stamp
+
+test-convert: convert-env
+	.venv-convert/bin/python -m pytest tests/models
 
 demo/capture/transforms.json: | .venv/demo.stamp
 	rm -rf demo/capture
@@ -39,5 +47,11 @@ demo/capture/transforms.json: | .venv/demo.stamp
 	$(PIP) -e '.[test,dev]'
 	touch $@
 
+.venv-convert/stamp: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv-convert
+	.venv-convert/bin/$(PIP_INSTALL) -e '.[convert]' pytest hypothesis
+	.venv-convert/bin/$(PIP_INSTALL) --no-deps pyiqa==0.1.16 openai-clip==1.0.1
+	touch $@
+
 clean:
-	rm -rf demo build dist *.egg-info .venv
+	rm -rf demo build dist *.egg-info .venv .venv-convert

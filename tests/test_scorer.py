@@ -107,8 +107,8 @@ def test_refuses_other_shapes(scorer: Scorer, shape: tuple[int, ...]) -> None:
 
 
 def test_unknown_scorers(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="musiq") as caught:
-        load_scorer("musiq")
+    with pytest.raises(InputError, match="musik") as caught:
+        load_scorer("musik")
     assert CLARITY in caught.value.hint
     with pytest.raises(InputError, match="does not exist"):
         load_scorer(str(tmp_path / "none.onnx"))

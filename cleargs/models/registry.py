@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tomllib
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -13,25 +14,36 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cleargs.errors import InputError
 
-State = Literal["shipped", "installed", "not installed", "incomplete"]
+Role = Literal["expert", "scorer", "metric"]
+Converter = Literal["lpips", "maxim", "spandrel", "musiq", "clip-iqa"]
+
+_SHA256 = r"^[0-9a-f]{64}$"
 
 
 class Source(BaseModel):
-    """A published source distribution that carries the weights."""
+    """The published file that carries the weights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    package: str = Field(description="Name of the Python package.")
-    version: str = Field(description="The one version that is accepted.")
-    size: int = Field(gt=0, description="Bytes of the archive.")
-    sha256: str = Field(
-        pattern=r"^[0-9a-f]{64}$", description="Digest of the archive, checked before it is read."
+    spec: str = Field(
+        pattern=r"^(pypi:[\w.-]+==[\w.]+|npm:(@[\w-]+/)?[\w.-]+@[\w.-]+|file)$",
+        description="``pypi:NAME==VERSION`` (a source distribution), ``npm:NAME@VERSION``, or ``file``: one "
+        "that the user fetches and gives with --from.",
+    )
+    file: str = Field(description="Name of the file.")
+    origin: str | None = Field(None, description="Who publishes a ``file``.")
+    size: int | None = Field(None, gt=0, description="Bytes; None where the publisher states none.")
+    sha256: str | None = Field(
+        None,
+        pattern=r"^[0-9a-f]{8,64}$",
+        description="Digest, or as much of its beginning as the publisher states, checked before the file is "
+        "read; None where none is stated.",
     )
 
     @property
     def label(self) -> str:
-        """How a listing names the source."""
-        return f"pypi:{self.package}=={self.version}"
+        """How messages name the source."""
+        return f"{self.file} of {self.origin}" if self.origin else self.spec
 
 
 class InstalledFile(BaseModel):
@@ -40,8 +52,11 @@ class InstalledFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(description="File name in the model folder.")
-    digest: str = Field(
-        pattern=r"^[0-9a-f]{64}$", description="SHA-256 over the names and values of its tensors."
+    digest: str | None = Field(
+        None,
+        pattern=_SHA256,
+        description="What `installed.file_digest` must give; None where it depends on the file that the user "
+        "gives: the receipt then holds it.",
     )
 
 
@@ -50,25 +65,20 @@ class Model(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str = Field(description="What the commands call it.")
+    name: str = Field(description="What commands and settings call it.")
+    role: Role = Field(description="What it can be used as.")
     task: str = Field(description="What it does, in one line.")
     licence: str = Field(description="Licence of the weights.")
+    commercial: bool = Field(description="Whether the licence allows commercial use.")
     inputs: str = Field(description="What it takes: layout, range, colour space.")
     outputs: str = Field(description="What it returns.")
     shipped: str | None = Field(
         None, description="File inside cleargs/models of a model that comes with ClearGS."
     )
     source: Source | None = Field(None, description="Where a model that does not come with ClearGS is from.")
+    converter: Converter | None = Field(None, description="What makes the installed files of the source.")
+    options: Mapping[str, int | float | str] = Field({}, description="Arguments of the converter.")
     files: tuple[InstalledFile, ...] = Field((), description="What its installation writes.")
-
-    def state(self, directory: Path) -> State:
-        """Whether the model can be used, judged by its files in ``directory`` alone."""
-        if self.shipped is not None:
-            return "shipped"
-        present = [(directory / file.name).is_file() for file in self.files]
-        if all(present):
-            return "installed"
-        return "incomplete" if any(present) else "not installed"
 
 
 def load_registry() -> tuple[Model, ...]:

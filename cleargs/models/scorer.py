@@ -16,8 +16,10 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError
+from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import OnnxModel
+from cleargs.models.registry import load_registry
 from cleargs.models.tile_mean import Image, mean_over_tiles
 
 CLARITY = "clarity-net"
@@ -87,26 +89,38 @@ class LearnedScorer:
 def scorer_path(spec: str) -> Path | None:
     """The file, absolute, that holds the weights of the scorer that a setting names; None for no such name.
 
-    Its content stands for the scorer in the keys of the store. It need not exist.
+    Its content stands for the scorer in the keys of the store. A path need not exist; raises InputError when
+    a scorer of the registry is not installed.
     """
     models = Path(str(files("cleargs.models"))).absolute()
     if spec == CLARITY:
         return models / "weights" / "scorer.onnx"
     if spec == NATURALNESS:
         return models / COEFFICIENTS
-    return Path(spec).absolute() if spec.endswith(".onnx") else None
+    if spec.endswith(".onnx"):
+        return Path(spec).absolute()
+    return installed_file(spec, "scorer")
 
 
 def load_scorer(spec: str) -> Scorer:
-    """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, or the path of an ONNX file.
+    """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, one of the registry that is
+    installed, or the path of an ONNX file.
 
-    Raises InputError for any other name or an unusable file.
+    Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
     path = scorer_path(spec)
     if spec == NATURALNESS:
         return StatisticsScorer(NATURALNESS)
-    if path is not None:
-        return LearnedScorer(path, CLARITY, _TRAINED_ON) if spec == CLARITY else LearnedScorer(path)
-    raise InputError(
-        f"no scorer is called {spec!r}", hint=f"use {CLARITY}, {NATURALNESS} or the path of an .onnx file"
-    )
+    if path is None:
+        known = [model.name for model in load_registry() if model.role == "scorer"]
+        raise InputError(
+            f"no scorer is called {spec!r}", hint=f"use {', '.join(known)} or the path of an .onnx file"
+        )
+    if model := installable(spec, "scorer"):
+        verify(model, path.parent)
+        if model.converter == "musiq":
+            from cleargs.models.musiq import MusiqScorer  # torch, which naming a scorer must not import
+
+            return MusiqScorer(path, spec)
+        return LearnedScorer(path, spec)
+    return LearnedScorer(path, CLARITY, _TRAINED_ON) if spec == CLARITY else LearnedScorer(path)

@@ -44,7 +44,7 @@ class RivrConfig(BaseModel):
     )
     expert: str = Field(
         "embedded",
-        description="restoration expert: embedded, or the path of an ONNX file",
+        description="restoration expert: embedded, a name of `cleargs models list`, or an ONNX file",
         json_schema_extra={"key": False},  # its content is in the key
     )
     primary_scorer: str = Field(
