@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,15 @@ from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.report.contact import Tile, contact_sheet
 
-PLOTTED = ("psnr", "ssim", "lpips_alex", "clarity-net")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PLOTTED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
-    """Write a PNG: a row a set of views, a panel a metric; a point a variant and column, bars for the spread
-    over the samples."""
+    """Write a PNG of the differences to the first variant: a row a metric, a panel a set of views; a point a
+    variant and column, with the spread of the paired difference where there are several samples."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -28,44 +32,43 @@ def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None
 
     metrics = [metric for metric in PLOTTED if metric in cells.metrics()]
     sets = cells.view_sets()
-    width = max(4.0, 1.1 * max(len(cells.columns(views)) for views in sets))
+    widths = [2.5 + len(cells.columns(views)) for views in sets]
     figure, panels = pyplot.subplots(
-        len(sets), len(metrics), squeeze=False, figsize=(width * len(metrics), 3.6 * len(sets))
+        len(metrics),
+        len(sets),
+        squeeze=False,
+        figsize=(max(9.0, sum(widths)), 2.6 * len(metrics) + 0.8),
+        width_ratios=widths,
+        layout="constrained",
     )
-    for row, views in zip(panels, sets, strict=True):
-        for panel, metric in zip(row, metrics, strict=True):
+    for row, metric in zip(panels, metrics, strict=True):
+        for panel, views in zip(row, sets, strict=True):
             _panel(panel, cells, labels, views, metric)
     handles, names = panels[0][0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="lower center", ncols=4, frameon=False)
-    figure.tight_layout(rect=(0, 0.06 + 0.02 / len(sets), 1, 1))
+    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+        figure.savefig(temporary, format="png", dpi=100)
     pyplot.close(figure)
 
 
-def _panel(panel: object, cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> None:
-    from matplotlib.axes import Axes
-
-    assert isinstance(panel, Axes)
-    columns, variants = cells.columns(views), cells.variants()
-    for number, variant in enumerate(variants):
-        found = [cells.spread(views, column, variant, metric) for column in columns]
-        places = [
-            place + (number - (len(variants) - 1) / 2) * 0.09
-            for place, value in enumerate(found)
-            if value is not None
-        ]
-        values = [value for value in found if value is not None]
+def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> None:
+    columns, (baseline, *others) = cells.columns(views), cells.variants()
+    for number, variant in enumerate(others):
+        found = [cells.difference(views, column, variant, baseline, metric) for column in columns]
+        shown = [(place, value) for place, value in enumerate(found) if value is not None]
         panel.errorbar(
-            places,
-            [value.mean for value in values],
-            [value.deviation or 0.0 for value in values],
+            [place + (number - (len(others) - 1) / 2) * 0.1 for place, _ in shown],
+            [value.mean for _, value in shown],
+            [value.deviation or 0.0 for _, value in shown],
             fmt="o",
             markersize=4,
             label=labels[variant],
         )
+    panel.axhline(0.0, color="black", linewidth=0.8)
     panel.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
-    panel.set_title(f"{metric_title(metric)}  {TITLES[views].split(',')[0]}", fontsize=9)
+    panel.set_xlim(-0.6, len(columns) - 0.4)
+    panel.set_ylabel(f"{metric_title(metric)}, minus {labels[baseline]}", fontsize=8)
+    panel.set_title(TITLES[views].split(",")[0], fontsize=9)
     panel.grid(axis="y", alpha=0.3)
 
 
