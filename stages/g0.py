@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 1
+VERSION = 2
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
@@ -143,14 +143,16 @@ def _start(
 def _exposure(
     config: G0Config, views: list[View], sparse: SparsePoints
 ) -> tuple[Exposure | None, float | None]:
-    """Affines to learn, or None; and the measured spread of the frames' gains where it decides."""
+    """Affines to learn, or None; and the measured spread of the frames' gains."""
     from cleargs.splat.compensation import Exposure, frame_gains, gain_spread
 
-    frame_ids = [view.frame_id for view in views]
-    if config.exposure != "auto":
-        return (Exposure.identity(frame_ids) if config.exposure == "on" else None), None
-    spread = gain_spread(frame_gains(views, sparse))
-    return (Exposure.identity(frame_ids) if spread > config.exposure_threshold else None), spread
+    if config.exposure == "off":
+        return None, None
+    gains = frame_gains(views, sparse)
+    spread = gain_spread(gains)
+    if config.exposure == "auto" and spread <= config.exposure_threshold:
+        return None, spread
+    return Exposure.from_gains([view.frame_id for view in views], gains), spread
 
 
 def _mean(values: list[float]) -> float | None:

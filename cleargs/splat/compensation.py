@@ -1,7 +1,8 @@
 """Exposure compensation: one affine on sRGB per frame, learned beside the scene where a capture needs it.
 
-The pixel operations are `cleargs.splat.exposure`; here are the affines themselves. Their mean, weighted as
-the frames are, stays the identity, so that scene and affines cannot drift apart together.
+The pixel operations are `cleargs.splat.exposure`; here are the affines themselves. They start from the gains
+that the sparse points show. Their median, weighted as the frames are, stays the identity: scene and affines
+cannot drift apart together, and a few badly exposed frames do not make the scene darker or brighter.
 """
 
 from __future__ import annotations
@@ -39,6 +40,16 @@ class Exposure:
         unique = np.unique(np.asarray(frame_ids, np.int32))
         return cls(unique, np.tile(IDENTITY, (len(unique), 1, 1)))
 
+    @classmethod
+    def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
+        """Exposure that brightens each of these distinct frames by its gain (NaN: not at all) over the median
+        one."""
+        known = gains[np.isfinite(gains)]
+        relative = gains / np.median(known) if len(known) else gains
+        order = np.argsort(np.asarray(frame_ids))
+        start = np.where(np.isfinite(relative), relative, 1.0)[order, None, None] * IDENTITY
+        return cls(np.asarray(frame_ids, np.int32)[order], start)
+
     @property
     def enabled(self) -> bool:
         """Whether any affine differs from the identity."""
@@ -51,12 +62,15 @@ class Exposure:
 
 
 def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The affines [F, 3, 4] shifted so that their mean, weighted by ``weights`` [F], is the identity."""
+    """The affines [F, 3, 4] shifted so that the (lower) median of each entry, weighted by ``weights`` [F], is
+    the identity's."""
     total = weights.sum()
     if total <= 0.0:
         return affines
-    mean: NDArray[np.float64] = np.einsum("f,fij->ij", weights, affines) / total
-    return affines - (mean - IDENTITY)
+    order = np.argsort(affines, axis=0, kind="stable")
+    middle = (np.cumsum(weights[order], axis=0) >= 0.5 * total).argmax(axis=0)[None]
+    median = np.take_along_axis(affines, np.take_along_axis(order, middle, axis=0), axis=0)
+    return np.asarray(affines - (median - IDENTITY), np.float64)
 
 
 def frame_gains(views: Sequence[View], sparse: SparsePoints) -> NDArray[np.float64]:

@@ -76,7 +76,7 @@ def step_gaussians(
 
 
 class ExposureOptimiser:
-    """Learns the affines; only the frame just seen moves, and the weighted mean stays the identity."""
+    """Learns the affines; only the frame just seen moves, and the weighted median stays the identity."""
 
     def __init__(self, exposure: Exposure, weights: NDArray[np.float64], rate: float) -> None:
         self.frame_ids = exposure.frame_ids
