@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,9 +22,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that becomes ``path`` when the block ends without an error.
 
     The temporary file keeps the extension of ``path`` (image writers choose their format by it). A writer
-    that dies leaves ``path`` as it was. Raises StoreError when the disk is full or not writable.
+    that dies leaves ``path`` as it was, and of several writers at once, in threads, processes or on nodes
+    that share the disk, the last one wins. Raises StoreError when the disk is full or not writable.
     """
-    temporary = path.with_name(f".{os.getpid()}{PARTIAL_SUFFIX}.{path.name}")
+    temporary = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     try:
         yield temporary
         with temporary.open("rb") as written:

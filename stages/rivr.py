@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import RivrConfig
 
-VERSION = 2
+VERSION = 3
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -73,16 +73,15 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     """Candidates -> scores -> choice -> distillation, for every round; then the check for harm."""
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.candidates import Image
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.gates import judge_harm
+    from cleargs.rivr.restoring import Restorations
     from cleargs.rivr.results import summary
-    from cleargs.rivr.rounds import Rules, cached_observation, pseudo_view, restore_observations, run_round
+    from cleargs.rivr.rounds import Rules, pseudo_view, run_round
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision
     from cleargs.rivr.tables import write_selection
     from cleargs.splat.kernels.runtime import set_threads
-    from cleargs.splat.views import View
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
@@ -98,14 +97,13 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         threads=threads,
     )
 
-    cache = context.checkpoints / "restored"
-    if config.use_observation:
-        restore_observations(targets, lambda image: expert.restore(image, threads=threads), cache, reporter)
-
-    def restored(view: View, render: Image) -> Image:
-        if config.use_observation:
-            return cached_observation(cache, view)
-        return expert.restore(render, threads=threads)
+    restored = Restorations(
+        lambda image: expert.restore(image, threads=threads),
+        context.checkpoints / "restored",
+        use_observation=config.use_observation,
+        prefer_sharper=config.prefer_sharper,
+    )
+    restored.prepare(targets, reporter)
 
     g0 = current = Snapshot(context.inputs["g0"])
     rows, repairs, trainings = [], [], []

@@ -9,7 +9,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rva.config import RvaConfig
 
-VERSION = 2
+VERSION = 3
 CONFIG = RvaConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
@@ -60,9 +60,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]
     observations = Observations(*load_observations(ingest))
 
-    evaluator = make_evaluator(
-        config, seed=context.seed, device=context.device, cache=context.checkpoints / "scores"
-    )
+    evaluator = make_evaluator(config, seed=context.seed, device=context.device, cache=context.kept)
     views = [
         View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames

@@ -21,7 +21,11 @@ Examples:
 )
 @click.argument("run", required=False, type=click.Path(file_okay=False, path_type=Path))
 @store_option
-@click.option("--checkpoints", is_flag=True, help="Remove the checkpoints of interrupted work too.")
+@click.option(
+    "--checkpoints",
+    is_flag=True,
+    help="Remove the checkpoints of interrupted work, and what is kept about single frames, too.",
+)
 @click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
 @json_option
 @click.pass_obj

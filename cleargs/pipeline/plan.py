@@ -163,6 +163,7 @@ class Planner:
             externals=externals,
             out=out,
             checkpoints=checkpoints,
+            kept=self.store.kept(name),
             seed=self.run.config.seed,
             device=self.run.device,
             threads=self.threads,

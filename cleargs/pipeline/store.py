@@ -4,6 +4,7 @@
 
     STORE/<stage>/<key>/                  finished: every output and manifest.json; never written again
     STORE/work/<key>/{out,checkpoints}/   unfinished: survives kill -9, the next try goes on from it
+    STORE/kept/<stage>/                   findings about single items, by digest; safe to delete
     STORE/locks/  STORE/roots/  STORE/digests.sqlite
 """
 
@@ -181,6 +182,10 @@ class Store:
             raise disk_error(error, folder) from error
         shutil.rmtree(rubbish, ignore_errors=True)
 
+    def kept(self, stage: str) -> Path:
+        """Where ``stage`` keeps what it found out about single items."""
+        return self.root / "kept" / stage
+
     # -- links from runs -------------------------------------------------------------------------------
 
     def link(self, run: Path, stage: str, key: str) -> None:
@@ -217,7 +222,8 @@ class Store:
     # -- clearing --------------------------------------------------------------------------------------
 
     def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
-        """Remove the finished folders that no run links to; with ``checkpoints`` unfinished work too.
+        """Remove the finished folders that no run links to; with ``checkpoints`` unfinished work and what is
+        kept about single items too.
 
         Raises StoreError when a run is at work in the store.
         """
@@ -236,6 +242,11 @@ class Store:
                     found.append(Garbage(folder, "rubbish", _size(folder)))
                 elif checkpoints:
                     found.append(Garbage(folder, "unfinished", _size(folder)))
+            if checkpoints:
+                found += [
+                    Garbage(folder, "kept", _size(folder))
+                    for folder in sorted((self.root / "kept").glob("*"))
+                ]
             if not dry_run:
                 for garbage in found:
                     self.discard(garbage.folder)
@@ -257,7 +268,7 @@ class Garbage:
     """A folder that nothing needs."""
 
     folder: Path
-    kind: Literal["finished", "unfinished", "rubbish"]
+    kind: Literal["finished", "unfinished", "kept", "rubbish"]
     bytes: int
 
 

@@ -66,6 +66,11 @@ class RivrConfig(BaseModel):
     use_observation: bool = Field(
         True, description="false: the ablation whose expert restores the render instead of the raw frame"
     )
+    prefer_sharper: bool = Field(
+        True,
+        description="with use_observation: the expert restores the render where it shows more detail than "
+        "the raw frame; false: the paper's",
+    )
     use_fused: bool = Field(True, description="false: the ablation without the fused candidate")
     distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")

@@ -13,7 +13,7 @@ from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
 from cleargs.rivr.gates import Fidelity
-from cleargs.rivr.rounds import observation
+from cleargs.rivr.restoring import observation
 from cleargs.rivr.selection import hide_masked
 from cleargs.splat.compensation import Exposure, read_exposure, write_exposure
 from cleargs.splat.config import DistilConfig

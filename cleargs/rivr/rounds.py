@@ -17,8 +17,9 @@ from cleargs.errors import StoreError
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, fuse
+from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, Source, fuse
 from cleargs.rivr.gates import refusal
+from cleargs.rivr.restoring import observation
 from cleargs.rivr.selection import choose, hide_masked
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import Mask, View
@@ -28,8 +29,8 @@ PREFIX = "cleargs:"
 
 Renderer = Callable[[View], Image]
 """The current scene at a view, through the frame's exposure: R_t."""
-Restorer = Callable[[View, Image], Image]
-"""D_t, given the view and its render R_t."""
+Restorer = Callable[[View, Image], tuple[Image, Source]]
+"""D_t, given the view and its render R_t, and which of O_t and R_t it was made from."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ def run_round(
             row = recorded_row(out, exr)
             if row is None:
                 rendered = render(view)
-                row, image = repair(number, view, exr, rendered, restore(view, rendered), rules)
+                restored, source = restore(view, rendered)
+                row, image = repair(number, view, exr, rendered, restored, source, rules)
                 write_exr(out / exr, image)
             rows.append(row)
             task.update(done=len(rows), note=_tally(rows))
@@ -71,7 +73,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: View, exr: str, rendered: Image, restored: Image, rules: Rules
+    number: int, view: View, exr: str, rendered: Image, restored: Image, source: Source, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -104,6 +106,7 @@ def repair(
         tiebreak_render=tiebreak["render"],
         tiebreak_restored=tiebreak["restored"],
         tiebreak_fused=tiebreak.get("fused"),
+        restored_from=source,
         chosen=choice.chosen,
         accepted=refused is None,
         reason=refused or choice.reason,
@@ -132,38 +135,6 @@ def _attributes(row: Selection) -> dict[str, int | float | str]:
     return {f"{PREFIX}{name}": value for name, value in values.items()}
 
 
-def restore_observations(
-    targets: Sequence[View], restore: Callable[[Image], Image], cache: Path, reporter: Reporter
-) -> None:
-    """Restore the raw frame O_t of every target once, into ``cache``; what is there is kept."""
-    cache.mkdir(exist_ok=True)
-    with reporter.task("restoring", total=len(targets)) as task:
-        for view in targets:
-            path = restored_path(cache, view)
-            if not _readable(path):
-                restored = to_layer(restore(observation(view)[0]))
-                write_exr(path, LayeredImage({"restored": restored}, {}))
-            task.advance()
-
-
-def cached_observation(cache: Path, view: View) -> Image:
-    """D_t as `restore_observations` left it."""
-    return from_layer(read_exr(restored_path(cache, view)).layers["restored"])
-
-
-def restored_path(cache: Path, view: View) -> Path:
-    """Where D_t of a frame is kept."""
-    return cache / f"{view.frame_id:06d}.exr"
-
-
-def observation(view: View) -> tuple[Image, Mask | None]:
-    """O_t as float32 sRGB, and its mask."""
-    pixels, mask = view.load()
-    if pixels.dtype == np.uint8:
-        return pixels.astype(np.float32) / np.float32(255.0), mask
-    return pixels.astype(np.float32), mask
-
-
 def pseudo_view(target: View, row: Selection, out: Path) -> View:
     """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
@@ -176,14 +147,6 @@ def pseudo_view(target: View, row: Selection, out: Path) -> View:
 def _score(scorer: Scorer, image: Image, threads: int) -> float:
     """In single precision, as the EXR holds it."""
     return float(np.float32(scorer.score(image, threads=threads)))
-
-
-def _readable(path: Path) -> bool:
-    try:
-        read_exr(path)
-    except StoreError:
-        return False
-    return True
 
 
 def _tally(rows: Sequence[Selection]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from cleargs.rivr.candidates import CandidateName
+from cleargs.rivr.candidates import CandidateName, Source
 from cleargs.tables import column, read_table, write_table
 
 
@@ -28,6 +28,7 @@ SELECTION = pa.schema(
         column("exr", pa.string(), "layers render, restored, fused, observed; relative to the rivr folder"),
         *_scores("primary", "decides"),
         *_scores("tiebreak", "decides among the candidates within rivr.margin of the best primary score"),
+        column("restored_from", pa.string(), "what the expert restored to D_t: observation or render"),
         column("chosen", pa.string(), "render, restored or fused"),
         column("accepted", pa.bool_(), "whether the chosen candidate became a pseudo observation"),
         column("reason", pa.string(), "why it was chosen, or why a gate refused it"),
@@ -59,6 +60,7 @@ class Selection:
     tiebreak_render: float
     tiebreak_restored: float
     tiebreak_fused: float | None
+    restored_from: Source
     chosen: CandidateName
     accepted: bool
     reason: str

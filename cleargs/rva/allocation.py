@@ -11,9 +11,22 @@ import numpy as np
 import numpy.typing as npt
 
 from cleargs.rva.config import RvaConfig
-from cleargs.rva.scores import Bools, Floats, is_reliable
+from cleargs.rva.scores import Floats, is_reliable
 
 Roles = npt.NDArray[np.str_]
+
+_ROUNDING = 1e-9  # 0.55 * 20 is 11 frames, not 12
+
+
+class Rule(StrEnum):
+    """What a suppressed frame was reactivated for."""
+
+    COVERAGE = "coverage"
+    """Its bin had no active frame (the paper's Trajectory Coverage Compensation)."""
+    BIN_FLOOR = "bin_floor"
+    """Its bin had fewer active frames than `RvaConfig.bin_floor`."""
+    ACTIVE_SHARE = "active_share"
+    """Fewer frames than `RvaConfig.active_share` of all were active."""
 
 
 class Role(StrEnum):
@@ -37,11 +50,6 @@ def standard_roles(R: Floats, B: Floats, G: Floats, config: RvaConfig) -> Roles:
     )
 
 
-def uncovered_bins(roles: Roles, bins: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Bins that hold suppressed frames only (an empty bin has nothing to reactivate)."""
-    return np.setdiff1d(bins, bins[roles != Role.SUPPRESSED])
-
-
 def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: RvaConfig) -> Floats:
     """lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z (paper, eq. tca_selection)."""
     quality = config.lambda_R * R + config.lambda_B * (1.0 - B)
@@ -52,13 +60,29 @@ def reactivate(
     roles: Roles,  # [N] standard roles, in trajectory order
     bins: npt.NDArray[np.int32],  # [N]
     gain: Floats,  # [N] from `reactivation_gain`
-) -> Bools:  # [N]
-    """The frame i*_m of every uncovered bin: the one of largest gain; ties go to the earlier frame."""
-    chosen = np.zeros(len(roles), dtype=bool)
-    for index in uncovered_bins(roles, bins):
+    config: RvaConfig,
+) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
+    """Which suppressed frames supervise after all, and why.
+
+    Every bin without an active frame gets the frame i*_m of the largest gain, as in the paper; then every bin
+    gets as many as ``bin_floor`` asks for, where it has them; then the capture gets the best of all its bins,
+    up to ``active_share``. The largest gain goes first, and ties go to the earlier frame.
+    """
+    rules = np.full(len(roles), "", dtype=f"<U{max(map(len, Rule))}")
+    active = roles != Role.SUPPRESSED
+
+    def wake(members: npt.NDArray[np.intp], wanted: int, rule: Rule) -> None:
+        asleep = members[~active[members]]
+        missing = max(wanted - int(np.count_nonzero(active[members])), 0)
+        best = asleep[np.argsort(-gain[asleep], kind="stable")[:missing]]
+        rules[best], active[best] = rule.value, True
+
+    for index in np.unique(bins):
         members = np.flatnonzero(bins == index)
-        chosen[members[np.argmax(gain[members])]] = True
-    return chosen
+        wake(members, 1, Rule.COVERAGE)
+        wake(members, config.bin_floor, Rule.BIN_FLOOR)
+    wake(np.arange(len(roles)), math.ceil(config.active_share * len(roles) - _ROUNDING), Rule.ACTIVE_SHARE)
+    return rules
 
 
 def supervision_weights(roles: Roles, R: Floats, G: Floats, config: RvaConfig) -> Floats:  # w [N] in [0, 1]

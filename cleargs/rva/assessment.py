@@ -67,6 +67,7 @@ class Assessment:
     bin: npt.NDArray[np.int32]
     Z: Floats
     role: Roles
+    reactivated_for: Roles  # a `Rule`, "" where the frame is not reactivated
     weight: Floats
     covered: Bools  # [bins] active frames before reactivation
     bin_edges: Floats  # [bins + 1] cumulative pose motion
@@ -104,14 +105,17 @@ def assess(
     bins = cut_into_bins(cumulative_motion(centres, directions, config), config.frames_per_bin)
     roles = standard_roles(r, b, G, config)
     covered = np.isin(np.arange(len(bins.edges) - 1), bins.index[roles != Role.SUPPRESSED])
+    rules = np.full_like(roles, "")
     if config.coverage and config.weighting == "graded":
         gain = reactivation_gain(r, b, G, bins.centrality, config)
-        roles = np.where(reactivate(roles, bins.index, gain), Role.REACTIVATED.value, roles)
+        rules = reactivate(roles, bins.index, gain, config)
+        roles = np.where(rules != "", Role.REACTIVATED.value, roles)
     weight = supervision_weights(roles, r, G, config)
     if config.weighting == "binary":
         roles, weight = keep_sharp(r, b, config.binary_share, config)
     if not config.enabled:
         roles, weight = np.full_like(roles, Role.STRONG.value), np.ones(len(rows))
+        rules = np.full_like(rules, "")
 
     def spread(values: npt.NDArray[S], elsewhere: object) -> npt.NDArray[S]:
         """Rows of the trajectory back to the rows of the arguments; ``elsewhere`` for unregistered frames."""
@@ -132,6 +136,7 @@ def assess(
         bin=spread(bins.index, -1),
         Z=spread(bins.centrality, nan),
         role=spread(roles, Role.SUPPRESSED.value),
+        reactivated_for=spread(rules, ""),
         weight=spread(weight, 0.0),
         covered=covered,
         bin_edges=bins.edges,

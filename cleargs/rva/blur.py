@@ -1,16 +1,15 @@
-"""Blur from the widths of edges, direction by direction.
+"""Blur from what is left of fine detail, direction by direction.
 
 Source: the re-blur ratio of Zhuo and Sim, "Defocus map estimation from a single image" (Pattern Recognition
-2011). A step edge under a blur of standard deviation s has, seen through a Gaussian of standard deviation
-sigma, a peak gradient proportional to 1 / sqrt(sigma^2 + s^2). The ratio of the peaks at two scales therefore
-gives s whatever the contrast of the edge. Here the derivative is taken along each of several directions: a
-motion blur of length L acts along its own direction only, where s = L / sqrt(12), while defocus acts along
-all.
+2011), taken over all pixels of a tile and along directions. With T(sigma) the mean structure tensor of the
+image smoothed by a Gaussian of standard deviation sigma, u' T(sigma) u is the energy of the derivative along
+u. For content whose energy goes as sigma^-2p (p = 1/2 for step edges, 1 for fine texture) under a blur of
+standard deviation s along u it goes as (sigma^2 + s^2)^-p. The ratio of the energies at two scales therefore
+gives s whatever the contrast, once p is known, and p is what sharper views of the same content tell. A motion
+of length L acts along its own direction only, where s = L / sqrt(12), while defocus acts along all.
 """
 
 from __future__ import annotations
-
-import math
 
 import cv2
 import numpy as np
@@ -24,78 +23,69 @@ length.
 """
 FINE, COARSE = 1.0, 3.0
 """Standard deviations, px, of the two scales. Finer is noise; coarser mixes neighbouring edges."""
-EDGE_SHARE = 0.03
-"""Share of the pixels, those of the largest derivative, that are taken for edges."""
+STEP_EDGES = COARSE / FINE
+"""The ratio of a sharp image of step edges (p = 1/2)."""
 LARGEST_EXTENT = 6.0
 """Extents, px, beyond which the ratio of the two scales says nothing more."""
 
+TILE = 40
+"""px: parallax and roll blur a frame unevenly, so each tile is measured and each counts the same; over all
+pixels at once the parts of strongest contrast would speak for the whole."""
+
 _NOISE_GAIN = 0.2  # standard deviation of a derivative at sigma = 1 over that of white noise: 1 / sqrt(8 pi)
-_NOISE_CLEARANCE = 4.0  # an edge stands this many standard deviations above the noise
-_LEAST_EDGES = 50  # pixels; fewer do not make a median
-_MARGIN = 9  # px: the support of the coarse scale
+_LEAST_ENERGY = 1.0  # squared levels a pixel, at the coarse scale: a tile with less has no structure
+_LEAST_SHARE = 0.25  # of a tile's pixels; with fewer in view it is not measured
+_MARGIN = 13  # px: the support of the coarse scale, four deviations and the difference
 
 
-def derivatives(luminance: Plane, sigma: float) -> tuple[Plane, Plane]:  # [h, w] -> d/dx, d/dy [h, w]
-    """Central differences of the image smoothed by a Gaussian of standard deviation ``sigma``."""
-    smooth = cv2.GaussianBlur(luminance, (0, 0), sigma)
-    return 0.5 * cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1), 0.5 * cv2.Sobel(
-        smooth, cv2.CV_32F, 0, 1, ksize=1
-    )
+def detail_ratios(luminance: Plane, valid: Mask, noise: float) -> Floats:  # [h, w], [h, w] -> [DIRECTIONS]
+    """Mean over the tiles of u' T(FINE) u / u' T(COARSE) u along each direction k pi / DIRECTIONS.
 
-
-def blur_extents(luminance: Plane, valid: Mask, noise: float) -> Floats:  # [h, w], [h, w] -> [DIRECTIONS] px
-    """Standard deviation s of the blur along each direction k pi / DIRECTIONS, in [0, LARGEST_EXTENT] px.
-
-    The median over the edges of a direction: those pixels whose derivative along it is among the largest
-    EDGE_SHARE and clear of the noise. A direction without edges, or a frame without structure, gets
-    LARGEST_EXTENT: what cannot be seen to be sharp is not trusted.
+    The noise's own share is taken off; ``noise`` in levels of 255. About 3 for a sharp scene of step edges,
+    up to 9 for fine texture, towards 1 the stronger the blur; 0 without structure along a direction: what
+    cannot be seen to be sharp is not trusted.
 
     Failure modes: content that is soft by itself (shadows, clouds, out-of-focus background) reads as blur,
-    fine texture as sharper than a step (s = 0); both are what neighbouring frames of a video share, see
-    `statistics`.
+    which is what neighbouring frames of a video share, see `statistics`; dense noise or grain in the dark
+    reads as detail where `degradations.noise_level` misses it.
     """
     inner = away_from_masked(valid, _MARGIN)
-    fine_x, fine_y = (plane[inner] for plane in derivatives(luminance, FINE))
-    coarse_x, coarse_y = (plane[inner] for plane in derivatives(luminance, COARSE))
-    extents = np.full(DIRECTIONS, LARGEST_EXTENT)
-    edges = int(EDGE_SHARE * fine_x.size)
-    if edges < _LEAST_EDGES:
-        return extents
-    for k in range(DIRECTIONS):
-        cos, sin = np.float32(np.cos(np.pi * k / DIRECTIONS)), np.float32(np.sin(np.pi * k / DIRECTIONS))
-        fine = np.abs(cos * fine_x + sin * fine_y)
-        strongest = np.argpartition(fine, -edges)[-edges:]
-        strongest = strongest[fine[strongest] > _NOISE_CLEARANCE * _NOISE_GAIN * noise]
-        if len(strongest) >= _LEAST_EDGES:
-            coarse = np.abs(cos * coarse_x[strongest] + sin * coarse_y[strongest])
-            extents[k] = extent_from_ratio(float(np.median(fine[strongest] / np.maximum(coarse, 1e-3))))
-    return extents
+    share = _tile_means(inner.astype(np.float32))
+    fine, coarse = (_directional_energy(luminance, inner, share, noise, sigma) for sigma in (FINE, COARSE))
+    measured = (share > _LEAST_SHARE)[:, None] & (coarse > _LEAST_ENERGY)
+    ratio = np.clip(fine / np.where(measured, coarse, 1.0), 1.0, (COARSE / FINE) ** 2)
+    counts = np.count_nonzero(measured, axis=0)
+    return np.where(counts > 0, np.sum(ratio, axis=0, where=measured) / np.maximum(counts, 1), 0.0)
 
 
-def extent_from_ratio(ratio: float) -> float:
-    """Solve ratio^2 = (COARSE^2 + s^2) / (FINE^2 + s^2) for s, px, within [0, LARGEST_EXTENT]."""
-    if ratio <= 1.0:
-        return LARGEST_EXTENT
-    square = (COARSE**2 - (ratio * FINE) ** 2) / (ratio**2 - 1.0)
-    return min(math.sqrt(max(square, 0.0)), LARGEST_EXTENT)
-
-
-def fine_detail(luminance: Plane, valid: Mask, noise: float) -> float:
-    """Mean squared gradient at the fine scale over that at the coarse one, the noise's own share taken off.
-
-    About 9 for fine texture, 3 for a scene of step edges, towards 1 the stronger the blur; 0 without
-    structure. Unlike `blur_extents` it counts all pixels, so weak texture as well as the strongest edges.
-    """
-    inner = away_from_masked(valid, _MARGIN)
-    if not inner.any():
-        return 0.0
-    fine, coarse = (
-        float(
-            sum(np.mean(np.square(plane[inner], dtype=np.float64)) for plane in derivatives(luminance, sigma))
-        )
-        for sigma in (FINE, COARSE)
+def _directional_energy(
+    luminance: Plane, inner: Mask, share: Floats, noise: float, sigma: float
+) -> Floats:  # [tiles, DIRECTIONS]
+    """u' T(sigma) u of each tile, in squared levels a pixel."""
+    smooth = cv2.GaussianBlur(luminance, (0, 0), sigma)
+    x, y = (0.5 * cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=1) * inner for dx in (1, 0))
+    xx, xy, yy = (_tile_means(a * b) / np.maximum(share, _LEAST_SHARE) for a, b in ((x, x), (x, y), (y, y)))
+    white = (_NOISE_GAIN * noise / sigma**2) ** 2
+    angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(
+        np.outer(xx - white, cos**2) + np.outer(2.0 * xy, cos * sin) + np.outer(yy - white, sin**2)
     )
-    white = 2.0 * (_NOISE_GAIN * noise) ** 2  # both components
-    fine -= white / FINE**4
-    coarse -= white / COARSE**4
-    return max(fine, 0.0) / coarse if coarse > 1e-2 else 0.0
+
+
+def _tile_means(plane: Plane) -> Floats:  # [h, w] -> [tiles]
+    height, width = plane.shape
+    size = max(1, round(width / TILE)), max(1, round(height / TILE))
+    return cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
+
+
+def extents_from_ratios(
+    ratio: Floats,  # [...] as `detail_ratios`
+    content: Floats,  # [...] > 1: what sharp views of the same content have
+) -> Floats:  # [...] px, in [0, LARGEST_EXTENT]
+    """Standard deviation s of the blur: solves ratio = ((COARSE^2 + s^2) / (FINE^2 + s^2))^p with the p that
+    ``content`` has at s = 0."""
+    p = np.log(content) / np.log(COARSE**2 / FINE**2)
+    quotient = np.maximum(ratio, 1.0) ** (1.0 / p)
+    square = (COARSE**2 - quotient * FINE**2) / np.maximum(quotient - 1.0, 1e-6)
+    return np.asarray(np.sqrt(np.clip(square, 0.0, LARGEST_EXTENT**2)))

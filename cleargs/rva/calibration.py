@@ -22,23 +22,25 @@ class Calibration:
 
     neighbours: int = 4
     """Frames before and after whose best is taken for what the content itself looks like."""
-    content_extent: float = 0.7
-    """Content explains at most this much blur extent, however soft the neighbours: what sharp photographs
-    show in their worst direction (median 0.6). More would excuse a capture that is blurred throughout."""
-    sharpness_half: float = 1.4
-    """Excess extent in the worst direction at which r_sharpness is 1/2 (a motion of about 5 px)."""
-    structure_half: float = 1.2
-    """Excess extent, mean over the directions, at which r_structure is 1/2."""
-    motion_half: float = 8.0
-    """Length of motion, px, at which b_motion_blur is 1/2."""
-    defocus_half: float = 1.5
-    """Excess extent in the best direction at which b_defocus is 1/2 (a disk of radius 3 px)."""
+    content_detail: tuple[float, float] = (3.0, 5.0)
+    """Bounds of the detail ratio that content may have: step edges (softer neighbours do not excuse a frame)
+    and rich texture (a crisper neighbour shows something else)."""
+    sharpness_half: float = 0.8
+    """Extent in the worst direction, px, at which r_sharpness is 1/2."""
+    structure_half: float = 0.7
+    """Mean extent over the directions at which r_structure is 1/2."""
     steepness: float = 3.0
     """Exponent of the blur curves."""
-    detail_floor: float = 3.0
-    """Fine detail of a scene of plain step edges; a softer best neighbour does not excuse a frame."""
-    detail_range: tuple[float, float] = (0.10, 0.75)
-    """Share of the best neighbour's fine detail at which r_texture is 0 and 1: content alone varies it."""
+    noticeable: float = 0.5
+    """Extent, px, that sharp frames reach by their content alone."""
+    motion_half: float = 1.2
+    """Visible extent in the worst direction at which b_motion_blur is 1/2."""
+    defocus_half: float = 1.2
+    """Visible extent in the best direction at which b_defocus is 1/2."""
+    isotropy_range: tuple[float, float] = (0.80, 0.92)
+    """Least extent over largest at which a blur is taken for a motion's, and for a disc's."""
+    detail_range: tuple[float, float] = (0.10, 1.0)
+    """Share of the content's fine detail at which r_texture is 0 and 1: content alone varies it."""
     contrast_range: tuple[float, float] = (0.02, 0.10)
     """Spread of the luma (of 1) at which texture is not to be relied on at all, and fully."""
     noise_half: float = 8.0

@@ -113,7 +113,20 @@ class RvaConfig(BaseModel):
         "frame beyond it",
     )
     coverage: bool = Field(
-        True, description="reactivate one suppressed frame in every uncovered trajectory bin"
+        True, description="reactivate suppressed frames where the trajectory would have a hole"
+    )
+    bin_floor: int = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="with coverage: every bin has at least so many active frames, where it has so many; "
+        "1: the paper's",
+    )
+    active_share: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="with coverage: at least this share of the registered frames is active; 0: the paper's",
     )
     evaluator: Literal["statistics", "qwen3-vl"] = Field(
         "statistics",
@@ -170,9 +183,7 @@ class RvaConfig(BaseModel):
     lambda_Z: float = Field(
         0.10, ge=0.0, le=1.0, description="weight of the centrality Z when a frame to reactivate is chosen"
     )
-    reactivated_weight: float = Field(
-        0.12, gt=0.0, le=1.0, description="weight of a coverage-reactivated frame"
-    )
+    reactivated_weight: float = Field(0.12, gt=0.0, le=1.0, description="weight of a reactivated frame")
 
     strong_base: float = Field(0.80, gt=0.0, le=1.0, description="weight of a strong frame: base + gain R")
     strong_gain: float = Field(0.20, ge=0.0, le=1.0, description="weight of a strong frame: base + gain R")

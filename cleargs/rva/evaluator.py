@@ -59,13 +59,14 @@ def make_evaluator(
 ) -> Evaluator:
     """The evaluator that the settings name.
 
-    ``cache`` is a folder in which a slow evaluator keeps the scores of single frames; ``qwen3-vl`` needs one.
+    ``cache`` is a folder in which the evaluator keeps what it found out about single frames; ``qwen3-vl``
+    needs one.
     Raises InputError when the evaluator cannot be had: a bad address or key of its server, say.
     """
     if config.evaluator == "statistics":
         from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
 
-        return StatisticsEvaluator()
+        return StatisticsEvaluator(cache)
     from cleargs.rva.vlm.evaluator import QwenEvaluator
 
     if cache is None:

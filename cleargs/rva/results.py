@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from cleargs.rva.allocation import Role, effective_sample_size
+from cleargs.rva.allocation import Role, Rule, effective_sample_size
 from cleargs.rva.assessment import Assessment, Poses
 from cleargs.rva.scores import Floats
 from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
@@ -77,6 +77,7 @@ def frames_table(
         "role": result.role.tolist(),
         "weight": result.weight,
         "stand_in": result.stand_in,
+        "reactivated_for": [rule or None for rule in result.reactivated_for.tolist()],
     }
     return pa.table(columns, schema=FRAMES)
 
@@ -86,9 +87,9 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
     count = len(result.covered)
     placed = result.bin[result.bin >= 0]
     active = result.bin[(result.bin >= 0) & (result.weight > 0.0)]
-    reactivated: list[int | None] = [None] * count
+    reactivated: list[list[int]] = [[] for _ in range(count)]
     for row in np.flatnonzero(result.role == Role.REACTIVATED):
-        reactivated[result.bin[row]] = int(frame_id[row])
+        reactivated[result.bin[row]].append(int(frame_id[row]))
     return pa.table(
         {
             "bin": np.arange(count, dtype=np.int32),
@@ -97,7 +98,7 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
             "n_frames": np.bincount(placed, minlength=count).astype(np.int32),
             "n_active": np.bincount(active, minlength=count).astype(np.int32),
             "covered": result.covered,
-            "reactivated": pa.array(reactivated, type=pa.int32()),
+            "reactivated": pa.array(reactivated, type=pa.list_(pa.int32())),
         },
         schema=BINS,
     )
@@ -107,13 +108,14 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
     """Figures for the manifest: frames a role, weights in steps of 0.1, reliable frames, effective sample
     size.
     """
-    roles = Counter(result.role.tolist())
+    roles, rules = Counter(result.role.tolist()), Counter(result.reactivated_for.tolist())
     histogram, _ = np.histogram(result.weight, bins=_WEIGHT_STEPS, range=(0.0, 1.0))
     return {
         "evaluator": evaluator,
         "frames": len(result.R),
         "registered": int(np.count_nonzero(result.bin >= 0)),
         "roles": {role.value: roles[role.value] for role in Role},
+        "reactivated_for": {rule.value: rules[rule.value] for rule in Rule},
         "active": int(np.count_nonzero(result.weight)),
         "reliable": int(np.count_nonzero(result.reliable)),
         "stand_in": int(np.count_nonzero(result.stand_in)),

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from cleargs.progress import Reporter
 from cleargs.rva import degradations
-from cleargs.rva.blur import DIRECTIONS, blur_extents, fine_detail
+from cleargs.rva.blur import DIRECTIONS, detail_ratios, extents_from_ratios
 from cleargs.rva.calibration import Calibration, decay, ramp
 from cleargs.rva.evaluator import View
+from cleargs.rva.kept import KeptRows, view_digest
 from cleargs.rva.luminance import Luminance, load_luminance
 from cleargs.rva.scores import Floats
 
@@ -26,8 +29,7 @@ from cleargs.rva.scores import Floats
 class Measures:
     """Raw measures of n frames, in trajectory order."""
 
-    extents: Floats  # [n, DIRECTIONS] px, see blur.blur_extents
-    detail: Floats  # [n] see blur.fine_detail
+    detail: Floats  # [n, DIRECTIONS] see blur.detail_ratios
     noise: Floats  # [n] levels of 255
     blocking: Floats  # [n]
     ringing: Floats  # [n] levels of 255
@@ -37,16 +39,20 @@ class Measures:
     spread: Floats  # [n] luma, of 1
 
 
+MEASURE_COLUMNS = (
+    *(f"detail_{k}" for k in range(DIRECTIONS)),
+    *(field.name for field in fields(Measures) if field.name != "detail"),
+)
+"""Names of the numbers in a row of `measure`."""
+
+
 def measure(luminance: Luminance) -> Floats:
-    """All raw measures of one frame as a row: the extents, then the other fields of `Measures` in their
-    order.
-    """
+    """All raw measures of one frame as a row, in the order of `MEASURE_COLUMNS`."""
     image, valid = luminance.reduced, luminance.valid
     noise = degradations.noise_level(image, valid)
     return np.array(
         [
-            *blur_extents(image, valid, noise),
-            fine_detail(image, valid, noise),
+            *detail_ratios(image, valid, noise),
             noise,
             degradations.blocking(luminance.full),
             degradations.ringing(image, valid, noise),
@@ -65,10 +71,11 @@ class StatisticsEvaluator:
     """Evaluator ``statistics``: no network, no weights, the same cues for any number of threads."""
 
     name = "statistics"
-    version = 1
+    version = 2
 
-    def __init__(self, calibration: Calibration | None = None) -> None:
-        self._calibration = calibration or Calibration()
+    def __init__(self, cache: Path | None = None) -> None:
+        """``cache`` is a folder in which the measures of single frames are kept."""
+        self._kept = KeptRows(cache, MEASURE_COLUMNS) if cache else None
 
     def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
         """See `Evaluator.evaluate`. Raises StoreError when an image cannot be read."""
@@ -76,27 +83,37 @@ class StatisticsEvaluator:
             return np.zeros((0, 11))
         rows = []
         with ThreadPoolExecutor(max(1, threads)) as pool, reporter.task("cues", total=len(views)) as task:
-            for row in pool.map(lambda view: measure(load_luminance(view)), views):
+            for row in pool.map(self._measure, views):
                 rows.append(row)
                 task.advance()
-        return cues_from_measures(as_measures(np.stack(rows)), self._calibration)
+        return cues_from_measures(as_measures(np.stack(rows)), Calibration())
+
+    def _measure(self, view: View) -> Floats:
+        if self._kept is None:
+            return measure(load_luminance(view))
+        digest = view_digest([self.name, self.version, cv2.__version__], view)
+        row = self._kept.find(digest)
+        if row is None:
+            row = measure(load_luminance(view))
+            self._kept.add(digest, row)
+        return row
 
 
 def cues_from_measures(m: Measures, c: Calibration) -> Floats:  # [n, 11] in [0, 1]
     """The cues in the order of `tables.CUE_COLUMNS`; each column's function says what it is."""
-    excess = excess_extents(m, c)
+    extents = blur_extents(m, c)
     texture = texture_reliability(m, c)
     artifacts = artifact_freedom(m, c)
     exposed = exposure_quality(m, c)
     return np.stack(
         [
-            sharpness(excess, c),
-            structure(excess, c),
+            sharpness(extents, c),
+            structure(extents, c),
             texture,
             cleanness(m, artifacts, c),
             exposed,
-            motion_blur(excess, c),
-            defocus(excess, c),
+            motion_blur(extents, c),
+            defocus(extents, c),
             ghosting(m, c),
             exposure_failure(exposed),
             unreliable_texture(m, texture, c),
@@ -112,39 +129,41 @@ def around(values: Floats, pick: Callable[..., Floats], reach: int) -> Floats:  
     return np.stack([pick(values[max(0, i - reach) : i + reach + 1], axis=0) for i in range(n)])
 
 
-def excess_extents(m: Measures, c: Calibration) -> Floats:  # [n, DIRECTIONS] px
-    """Blur extent along each direction beyond what the content shows.
+def content_detail(m: Measures, c: Calibration) -> Floats:  # [n, DIRECTIONS]
+    """What the frame's content shows where it is sharp: the best ratio among the neighbours, direction by
+    direction, within `content_detail`.
 
-    The least extent among the neighbours, at most `content_extent`, is the content's; variances of successive
-    blurs add, so they subtract. Failure modes: a cut in the video, or neighbours so far apart that they show
-    other things (the bound limits the damage); content softer than the bound in every neighbour.
+    Failure modes: a cut in the video, or neighbours so far apart that they show other things (the upper bound
+    limits the damage); a capture that is blurred throughout (the lower bound keeps it from being excused).
     """
-    content = np.minimum(around(m.extents, np.min, c.neighbours), c.content_extent)
-    return np.asarray(np.sqrt(np.maximum(m.extents**2 - content**2, 0.0)))
+    return np.clip(around(m.detail, np.max, c.neighbours), *c.content_detail)
 
 
-def sharpness(excess: Floats, c: Calibration) -> Floats:
+def blur_extents(m: Measures, c: Calibration) -> Floats:  # [n, DIRECTIONS] px
+    """Standard deviation of the blur along each direction, given the content (`blur.extents_from_ratios`)."""
+    return extents_from_ratios(m.detail, content_detail(m, c))
+
+
+def sharpness(extents: Floats, c: Calibration) -> Floats:
     """r_sharpness: 1 where no direction is blurred, 1/2 at `sharpness_half` in the worst one."""
-    return decay(excess.max(axis=1), c.sharpness_half, c.steepness)
+    return decay(extents.max(axis=1), c.sharpness_half, c.steepness)
 
 
-def structure(excess: Floats, c: Calibration) -> Floats:
+def structure(extents: Floats, c: Calibration) -> Floats:
     """r_structure: clarity of edges and corners of any orientation, by the blur's mean over the directions.
 
     A motion leaves the edges along it intact, so structure suffers less from it than from an equal defocus.
     """
-    return decay(excess.mean(axis=1), c.structure_half, c.steepness)
+    return decay(extents.mean(axis=1), c.structure_half, c.steepness)
 
 
 def texture_reliability(m: Measures, c: Calibration) -> Floats:
-    """r_texture: share of the best neighbour's fine detail that the frame keeps, where it has contrast at
-    all.
+    """r_texture: share of the content's fine detail that the frame keeps, where it has contrast at all.
 
-    Detail is counted from 1, what a fully blurred image shows (`blur.fine_detail`). Failure mode: content
-    that changes faster than the neighbourhood, such as a pan from foliage to a wall.
+    Detail is counted from 1, what a fully blurred image shows (`blur.detail_ratios`). Failure modes: as for
+    `content_detail`.
     """
-    best = np.maximum(around(m.detail, np.max, c.neighbours), c.detail_floor)
-    kept = np.maximum(m.detail - 1.0, 0.0) / (best - 1.0)
+    kept = (m.detail.mean(axis=1) - 1.0) / (content_detail(m, c).mean(axis=1) - 1.0)
     return ramp(kept, c.detail_range) * ramp(m.spread, c.contrast_range)
 
 
@@ -177,19 +196,31 @@ def exposure_failure(quality: Floats) -> Floats:
     return loss * loss * (3.0 - 2.0 * loss)
 
 
-def motion_blur(excess: Floats, c: Calibration) -> Floats:
-    """b_motion_blur: the length sqrt(12 (worst^2 - best^2)) of the motion that makes one direction blurrier.
+def visible(extents: Floats, c: Calibration) -> Floats:
+    """Extents beyond `noticeable`, as variances subtract: 0 for all that content alone may explain."""
+    return np.asarray(np.sqrt(np.maximum(extents**2 - c.noticeable**2, 0.0)))
+
+
+def isotropy(extents: Floats, c: Calibration) -> Floats:
+    """Whether a blur is a disc's (1) or a motion's (0), by the least extent over the largest."""
+    return ramp(extents.min(axis=1) / np.maximum(extents.max(axis=1), 1e-9), c.isotropy_range)
+
+
+def motion_blur(extents: Floats, c: Calibration) -> Floats:
+    """b_motion_blur: the visible blur of the worst direction, where it is not the same in all.
 
     Failure modes: a rotation about the optical axis or a curved path blurs all directions and reads as
-    defocus; a moving object in a sharp scene shows only if it owns the strongest edges.
+    defocus; a moving object in a sharp scene shows only if it has much of the frame's detail.
     """
-    length = np.sqrt(12.0 * (excess.max(axis=1) ** 2 - excess.min(axis=1) ** 2))
-    return 1.0 - decay(length, c.motion_half, c.steepness)
+    blurred = 1.0 - decay(visible(extents.max(axis=1), c), c.motion_half, c.steepness)
+    return (1.0 - isotropy(extents, c)) * blurred
 
 
-def defocus(excess: Floats, c: Calibration) -> Floats:
-    """b_defocus: the blur that even the best direction has. Failure modes: as for `motion_blur`."""
-    return 1.0 - decay(excess.min(axis=1), c.defocus_half, c.steepness)
+def defocus(extents: Floats, c: Calibration) -> Floats:
+    """b_defocus: the visible blur that even the best direction has, where it is the same in all. Failure
+    modes: as for `motion_blur`."""
+    blurred = 1.0 - decay(visible(extents.min(axis=1), c), c.defocus_half, c.steepness)
+    return isotropy(extents, c) * blurred
 
 
 def ghosting(m: Measures, c: Calibration) -> Floats:

@@ -59,6 +59,13 @@ FRAMES = pa.schema(
             "no frame is reliable and this one is among the best by R - B that stand in for the set A "
             "in C, D and O (roles do not change)",
         ),
+        column(
+            "reactivated_for",
+            pa.string(),
+            "why a suppressed frame is active after all: coverage (its bin had none), bin_floor (its bin had "
+            "too few) or active_share (the capture had too few); null for any other",
+            nullable=True,
+        ),
     ]
 )
 
@@ -70,6 +77,6 @@ BINS = pa.schema(
         column("n_frames", pa.int32(), "registered training frames in the bin"),
         column("n_active", pa.int32(), "of these, with a weight above 0, reactivation included"),
         column("covered", pa.bool_(), "had an active frame before reactivation"),
-        column("reactivated", pa.int32(), "frame_id of the reactivated frame, null for none", nullable=True),
+        column("reactivated", pa.list_(pa.int32()), "frame_id of the reactivated frames, in ascending order"),
     ]
 )

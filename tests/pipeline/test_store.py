@@ -138,6 +138,7 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
     with DigestMemo(bench.store / "digests.sqlite") as memo:
         store = Store(bench.store, memo)
         (bench.store / "work" / "abc" / "checkpoints").mkdir(parents=True)
+        store.kept("square").mkdir(parents=True)
         shown = {(bench.folder / name).resolve() for name in bench.dag.names}
         assert {item.kind for item in store.collect(bench.dag.names, checkpoints=False, dry_run=True)} == {
             "finished"
@@ -146,7 +147,8 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
         assert sorted(item.folder.parent.name for item in removed) == ["square", "total"]
         assert {folder for name in bench.dag.names for folder in (bench.store / name).iterdir()} == shown
         assert [item.kind for item in store.collect(bench.dag.names, checkpoints=True, dry_run=False)] == [
-            "unfinished"
+            "unfinished",
+            "kept",
         ]
         with (
             file_lock(bench.store / "locks" / "store.lock", shared=True),

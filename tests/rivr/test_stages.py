@@ -130,6 +130,30 @@ def test_without_the_observation_the_expert_restores_the_render(capture: Capture
     )
 
 
+def test_the_render_is_restored_where_it_shows_more(
+    capture: Capture, expert: Sharpen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared: list[float] = []
+
+    def every_other(render: np.ndarray, observed: np.ndarray, mask: np.ndarray | None) -> bool:
+        assert render.shape == observed.shape
+        compared.append(float(render.sum()))
+        return len(compared) % 2 == 0
+
+    monkeypatch.setattr("cleargs.rivr.restoring.shows_more", every_other)
+    context = capture.context("rivr", tiny_rivr(prefer_sharper=True, rounds=1))
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    sources = [row.restored_from for row in rows]
+    assert sources == ["observation", "render"] * (len(TARGETS) // 2) + ["observation"] * (len(TARGETS) % 2)
+    for row in rows:
+        exr = read_exr(context.out / row.exr, "cleargs:")
+        assert exr.attributes["cleargs:restored_from"] == row.restored_from
+        source = from_layer(exr.layers["render" if row.restored_from == "render" else "observed"])
+        # As in the test above: the expert saw what the EXR holds in half floats.
+        np.testing.assert_allclose(from_layer(exr.layers["restored"]), expert.restore(source), atol=4e-3)
+
+
 def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(use_fused=False, rounds=1))
     rivr.run(context)
@@ -258,9 +282,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
 @pytest.mark.parametrize(
     ("where", "after"),
     [
-        ("cleargs.rivr.rounds.write_exr", 3),  # while restoring
-        ("cleargs.rivr.rounds.write_exr", 10),  # inside round 1
-        ("cleargs.rivr.rounds.write_exr", 17),  # inside round 2
+        ("cleargs.rivr.restoring.write_exr", 3),
+        ("cleargs.rivr.rounds.write_exr", 3),  # inside round 1
+        ("cleargs.rivr.rounds.write_exr", 10),  # inside round 2
         ("cleargs.splat.trainer.Trainer.step", 8),  # inside the distillation of round 1
         ("cleargs.splat.trainer.Trainer.step", 12),  # after it, before its files
         ("cleargs.splat.trainer.Trainer.step", 20),  # inside the distillation of round 2

@@ -96,6 +96,7 @@ class Capture:
             externals={},
             out=out,
             checkpoints=checkpoints,
+            kept=checkpoints / "kept",
             seed=0,
             device="cpu",
             threads=threads,
@@ -104,9 +105,10 @@ class Capture:
 
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
-    """Two rounds of a few steps, with harm margins that nothing exceeds."""
+    """Two rounds of a few steps, with harm margins that nothing exceeds; D_t comes from the raw frame."""
     settings: dict[str, Any] = {
         "rounds": 2,
+        "prefer_sharper": False,
         "distil": {"steps": 12, "checkpoint_interval": 5},
         "harm": {"psnr_margin": 100, "score_margin": 100},
     }
@@ -213,6 +215,7 @@ def rva_row(k: int) -> dict[str, Any]:
         "role": ROLES[k],
         "weight": WEIGHTS[k],
         "stand_in": False,
+        "reactivated_for": None,
     }
     return {name: known.get(name, 0.0) for name in RVA_FRAMES.names}
 

@@ -110,7 +110,7 @@ def test_agree_leaves_the_run_as_it_is(shell: Shell, monkeypatch: pytest.MonkeyP
     document = json.loads(out)
     assert json.loads((shell.folder / "agree" / "agreement.json").read_text()) == document
     (pair,) = document["pairs"]
-    assert pair["evaluators"] == ["statistics-1", "qwen3-vl:qwen3-vl:8b:prompt-1"]
+    assert pair["evaluators"] == ["statistics-2", "qwen3-vl:qwen3-vl:8b:prompt-1"]
     assert pair["frames"] == FRAMES
     assert set(pair["spearman"]) == {"R", "B", "R-B", *CUE_COLUMNS}
     gaps = [item["gap"] for item in pair["disagreements"]]

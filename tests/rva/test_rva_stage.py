@@ -98,6 +98,7 @@ def run(ingest_dir: Path, out: Path, config: RvaConfig, threads: int = 1) -> dic
         externals={},
         out=out,
         checkpoints=out,
+        kept=out / "kept",
         seed=0,
         device="cpu",
         threads=threads,
@@ -111,14 +112,14 @@ def run(ingest_dir: Path, out: Path, config: RvaConfig, threads: int = 1) -> dic
 def test_tables_of_a_small_capture(ingest_dir: Path, tmp_path: Path) -> None:
     summary = run(ingest_dir, tmp_path / "rva", RvaConfig())
     table = read_table(tmp_path / "rva" / "frames.parquet", FRAMES)
-    assert table.column_names == [*DESIGN_COLUMNS, "stand_in"]
+    assert table.column_names == [*DESIGN_COLUMNS, "stand_in", "reactivated_for"]
     rows = {row["frame_id"]: row for row in table.to_pylist()}
     assert sorted(rows) == [0, 1, 2, 3, 4, 5, 7]  # the held-out frame has no row
     assert rows[UNREGISTERED]["G"] is None
     assert rows[UNREGISTERED]["role"] == "suppressed"
     assert rows[BLURRED]["R"] < 0.70
     assert {rows[k]["role"] for k in (0, 1, 3, 5, 7)} == {"strong"}
-    assert rows[0]["evaluator"] == "statistics-1"
+    assert rows[0]["evaluator"] == "statistics-2"
     assert summary["reliable"] == 5
     bins = read_table(tmp_path / "rva" / "bins.parquet", BINS).to_pylist()
     assert sum(row["n_frames"] for row in bins) == 6

@@ -57,6 +57,7 @@ class Bench:
             externals={},
             out=self.root / "out",
             checkpoints=self.root / "checkpoints",
+            kept=self.root / "kept",
             seed=7,
             device="cpu",
             threads=1,
@@ -260,7 +261,7 @@ def test_no_score_at_all_is_a_failure(bench: Bench) -> None:
 def test_a_damaged_kept_score_is_asked_for_again(bench: Bench) -> None:
     with vlm_server() as log:
         bench.run(log.url)
-        torn, wild, *_ = sorted((bench.root / "checkpoints" / "scores").iterdir())
+        torn, wild, *_ = sorted((bench.root / "kept").iterdir())
         torn.write_text('{"r_sharpness": 0.5')
         wild.write_text(wild.read_text().replace('"r_sharpness": ', '"r_sharpness": 3'))
         assert_complete(*bench.run(log.url))

@@ -99,6 +99,23 @@ def test_roles_and_weights(result: Assessment) -> None:
     assert result.weight.tolist() == near(0.972, 0.439291875, 0.4227, 0.12, 0.0)
 
 
+def test_floors_wake_the_best_of_the_suppressed_frames() -> None:
+    floors = CONFIG.model_copy(update={"bin_floor": 2, "active_share": 1.0})
+    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), floors)
+    # Bin 1 = {3, 4}: 3 for the paper's coverage, 4 for the floor of 2. Bin 0 has three active frames.
+    assert result.reactivated_for.tolist() == ["", "", "", "coverage", "bin_floor"]
+    assert result.role.tolist() == ["strong", "geometric", "auxiliary", "reactivated", "reactivated"]
+    assert result.weight[4] == CONFIG.reactivated_weight
+    # Without the floor the share does it: ceil(0.9 x 5) = 5 frames are wanted, 4 are active.
+    share = CONFIG.model_copy(update={"active_share": 0.9})
+    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), share)
+    assert result.reactivated_for.tolist() == ["", "", "", "coverage", "active_share"]
+    # 4 of 5 are 0.8: enough.
+    share = CONFIG.model_copy(update={"active_share": 0.8})
+    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), share)
+    assert result.reactivated_for.tolist() == ["", "", "", "coverage", ""]
+
+
 def test_without_coverage_the_bin_stays_empty() -> None:
     bare = assess(
         FRAME_ID, cues(), POSES, observations_of(POINTS), CONFIG.model_copy(update={"coverage": False})
@@ -148,7 +165,8 @@ def test_tables(result: Assessment) -> None:
     bins = bins_table(FRAME_ID, result).to_pylist()
     assert [row["n_frames"] for row in bins] == [3, 2]
     assert [row["n_active"] for row in bins] == [3, 1]
-    assert [row["reactivated"] for row in bins] == [None, 3]
+    assert [row["reactivated"] for row in bins] == [[], [3]]
+    assert frames.column("reactivated_for").to_pylist() == [None, None, None, "coverage", None]
     assert [row["covered"] for row in bins] == [True, False]
 
 

@@ -77,7 +77,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
             judged.append(
                 dict.fromkeys(RVA_FRAMES.names, 0.5)
                 | {"frame_id": frame_id, "name": image, "evaluator": "toy-1", "bin": 0}
-                | {"reliable": frame_id in ACTIVE, "stand_in": False, "weight": ACTIVE.get(frame_id, 0.0)}
+                | {"reliable": frame_id in ACTIVE, "stand_in": False, "reactivated_for": None}
+                | {"weight": ACTIVE.get(frame_id, 0.0)}
                 | {"role": "strong" if ACTIVE.get(frame_id, 0.0) > 0.8 else "suppressed"}
             )
     write_table(root / "ingest" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
@@ -103,6 +104,7 @@ def context(capture: Path, work: Path, config: G0Config = CONFIG, threads: int =
         externals={},
         out=work / "out",
         checkpoints=work / "checkpoints",
+        kept=work / "kept",
         seed=3,
         device="cpu",
         threads=threads,

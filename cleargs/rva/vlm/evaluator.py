@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -11,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from cleargs.errors import StageError
-from cleargs.files import write_json
 from cleargs.progress import Reporter
 from cleargs.rva.evaluator import View
+from cleargs.rva.kept import KeptRows, view_digest
 from cleargs.rva.scores import Floats
 from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.rva.vlm.judge import Judge, UnscoredError
-from cleargs.rva.vlm.picture import Picture, load_picture
+from cleargs.rva.vlm.picture import load_picture
 from cleargs.rva.vlm.prompt import VERSION
 
 
@@ -32,7 +30,7 @@ class QwenEvaluator:
     def __init__(self, judge: Judge, *, image_size: int, cache: Path) -> None:
         self._judge = judge
         self._image_size = image_size
-        self._cache = cache
+        self._kept = KeptRows(cache, CUE_COLUMNS)
 
     @property
     def name(self) -> str:
@@ -46,7 +44,6 @@ class QwenEvaluator:
         """
         cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
         faults: dict[int, str] = {}
-        self._cache.mkdir(parents=True, exist_ok=True)
         pool = ThreadPoolExecutor(self._judge.workers)
         try:
             with reporter.task("cues", total=len(views)) as task:
@@ -72,27 +69,10 @@ class QwenEvaluator:
         return cues
 
     def _score(self, view: View) -> Floats:
-        picture = load_picture(view, self._image_size)
-        file = self._cache / f"{_digest(self._judge.identity, picture)}.json"
-        kept = _read(file)
-        if kept is not None:
+        digest = view_digest([self._judge.identity, VERSION, self._image_size], view)
+        kept = self._kept.find(digest)
+        if kept is not None and bool(((kept >= 0.0) & (kept <= 1.0)).all()):
             return kept
-        cues = self._judge.score(picture)
-        write_json(file, dict(zip(CUE_COLUMNS, cues.tolist(), strict=True)))
+        cues = self._judge.score(load_picture(view, self._image_size))
+        self._kept.add(digest, cues)
         return cues
-
-
-def _digest(identity: str, picture: Picture) -> str:
-    """Names the scores by all that decides them."""
-    facts = [identity, VERSION, picture.rgb.shape, picture.masked]
-    return hashlib.sha256(json.dumps(facts).encode() + picture.rgb.tobytes()).hexdigest()
-
-
-def _read(file: Path) -> Floats | None:
-    """Kept scores; None where there are none, or where the file is damaged."""
-    try:
-        kept = json.loads(file.read_text(encoding="utf-8"))
-        cues = np.array([kept[column] for column in CUE_COLUMNS], dtype=np.float64)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return cues if bool(((cues >= 0.0) & (cues <= 1.0)).all()) else None
