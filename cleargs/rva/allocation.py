@@ -23,8 +23,6 @@ class Rule(StrEnum):
 
     COVERAGE = "coverage"
     """Its bin had no active frame (the paper's Trajectory Coverage Compensation)."""
-    BIN_FLOOR = "bin_floor"
-    """Its bin had fewer active frames than `RvaConfig.bin_floor`."""
     ACTIVE_SHARE = "active_share"
     """Fewer frames than `RvaConfig.active_share` of all were active."""
 
@@ -64,9 +62,8 @@ def reactivate(
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
     """Which suppressed frames supervise after all, and why.
 
-    Every bin without an active frame gets the frame i*_m of the largest gain, as in the paper; then every bin
-    gets as many as ``bin_floor`` asks for, where it has them; then the capture gets the best of all its bins,
-    up to ``active_share``. The largest gain goes first, and ties go to the earlier frame.
+    Every bin without an active frame gets the frame i*_m of the largest gain, as in the paper; then the
+    capture gets the best of all its bins, up to ``active_share``. Ties go to the earlier frame.
     """
     rules = np.full(len(roles), "", dtype=f"<U{max(map(len, Rule))}")
     active = roles != Role.SUPPRESSED
@@ -78,9 +75,7 @@ def reactivate(
         rules[best], active[best] = rule.value, True
 
     for index in np.unique(bins):
-        members = np.flatnonzero(bins == index)
-        wake(members, 1, Rule.COVERAGE)
-        wake(members, config.bin_floor, Rule.BIN_FLOOR)
+        wake(np.flatnonzero(bins == index), 1, Rule.COVERAGE)
     wake(np.arange(len(roles)), math.ceil(config.active_share * len(roles) - _ROUNDING), Rule.ACTIVE_SHARE)
     return rules
 

@@ -91,7 +91,7 @@ class QwenConfig(BaseModel):
 
 
 class RvaConfig(BaseModel):
-    """Reliability-aware View Allocation. The defaults are the paper's."""
+    """Reliability-aware View Allocation. The defaults are the paper's but for `active_share`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -115,18 +115,12 @@ class RvaConfig(BaseModel):
     coverage: bool = Field(
         True, description="reactivate suppressed frames where the trajectory would have a hole"
     )
-    bin_floor: int = Field(
-        1,
-        ge=1,
-        le=10_000,
-        description="with coverage: every bin has at least so many active frames, where it has so many; "
-        "1: the paper's",
-    )
     active_share: float = Field(
-        0.0,
+        1.0,
         ge=0.0,
         le=1.0,
-        description="with coverage: at least this share of the registered frames is active; 0: the paper's",
+        description="with coverage: suppressed frames are reactivated until this share of the registered "
+        "frames is active; 0: the paper's",
     )
     evaluator: Literal["statistics", "qwen3-vl"] = Field(
         "statistics",

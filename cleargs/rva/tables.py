@@ -62,8 +62,8 @@ FRAMES = pa.schema(
         column(
             "reactivated_for",
             pa.string(),
-            "why a suppressed frame is active after all: coverage (its bin had none), bin_floor (its bin had "
-            "too few) or active_share (the capture had too few); null for any other",
+            "why a suppressed frame is active after all: coverage (its bin had none) or active_share (the "
+            "capture had too few); null for any other",
             nullable=True,
         ),
     ]

@@ -12,7 +12,7 @@ from cleargs.rva.geometry import coverage_gain, redundancy, visibility
 from cleargs.rva.results import frames_table
 from cleargs.rva.trajectory import cut_into_bins
 
-CONFIG = RvaConfig()
+CONFIG = RvaConfig(active_share=0.0)
 
 
 def ids(n: int) -> np.ndarray:

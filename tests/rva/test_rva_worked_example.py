@@ -22,7 +22,7 @@ POSES = poses_at(along_x([0.0, 1.5, 2.0, 6.0, 10.0]), np.stack([FORWARD, *[BACKW
 POINTS = {0: [1, 2, 3, 4, 5], 1: [6, 7, 8], 2: [4, 9], 3: [4, 10], 4: [4, 11, 12]}
 
 # frames_per_bin = 2 gives M = round(5 / 2) = round(2.5) = 2 bins (half to even).
-CONFIG = RvaConfig(frames_per_bin=2)
+CONFIG = RvaConfig(frames_per_bin=2, active_share=0.0)
 
 
 def cues() -> np.ndarray:
@@ -99,21 +99,24 @@ def test_roles_and_weights(result: Assessment) -> None:
     assert result.weight.tolist() == near(0.972, 0.439291875, 0.4227, 0.12, 0.0)
 
 
-def test_floors_wake_the_best_of_the_suppressed_frames() -> None:
-    floors = CONFIG.model_copy(update={"bin_floor": 2, "active_share": 1.0})
-    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), floors)
-    # Bin 1 = {3, 4}: 3 for the paper's coverage, 4 for the floor of 2. Bin 0 has three active frames.
-    assert result.reactivated_for.tolist() == ["", "", "", "coverage", "bin_floor"]
-    assert result.role.tolist() == ["strong", "geometric", "auxiliary", "reactivated", "reactivated"]
-    assert result.weight[4] == CONFIG.reactivated_weight
-    # Without the floor the share does it: ceil(0.9 x 5) = 5 frames are wanted, 4 are active.
-    share = CONFIG.model_copy(update={"active_share": 0.9})
-    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), share)
-    assert result.reactivated_for.tolist() == ["", "", "", "coverage", "active_share"]
-    # 4 of 5 are 0.8: enough.
-    share = CONFIG.model_copy(update={"active_share": 0.8})
-    result = assess(FRAME_ID, cues(), POSES, observations_of(POINTS), share)
-    assert result.reactivated_for.tolist() == ["", "", "", "coverage", ""]
+@pytest.mark.parametrize(
+    ("share", "rule", "role", "weight"),
+    [
+        (0.8, "", "suppressed", 0.0),  # 4 of 5 are active: enough
+        (0.81, "active_share", "reactivated", 0.12),  # ceil(0.81 x 5) = 5 frames are wanted
+    ],
+)
+def test_a_share_of_the_frames_is_active(share: float, rule: str, role: str, weight: float) -> None:
+    result = assess(
+        FRAME_ID,
+        cues(),
+        POSES,
+        observations_of(POINTS),
+        CONFIG.model_copy(update={"active_share": share}),
+    )
+    assert result.reactivated_for.tolist() == ["", "", "", "coverage", rule]
+    assert result.role.tolist() == ["strong", "geometric", "auxiliary", "reactivated", role]
+    assert result.weight[4] == weight
 
 
 def test_without_coverage_the_bin_stays_empty() -> None:
