@@ -25,7 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
-    "rva": ("cleargs.cli.rva", "Compare evaluators of frames."),
+    "rva": ("cleargs.cli.rva", "Compare evaluators of frames, and check them."),
     "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
     "bench": ("cleargs.cli.bench", "Measure the splatting core on this machine."),

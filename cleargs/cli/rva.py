@@ -21,6 +21,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress import make_reporter
+from cleargs.cli.rva_check import check
 from cleargs.errors import InputError
 from cleargs.pipeline.config import Config, check_document, merge, parse_override
 from cleargs.pipeline.dag import Dag
@@ -45,6 +46,9 @@ _TILE_WIDTH = 480  # px
 @click.group()
 def rva() -> None:
     """Look into how frames are judged."""
+
+
+rva.add_command(check)
 
 
 def _names(context: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
