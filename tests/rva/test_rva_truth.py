@@ -65,5 +65,5 @@ def test_check_reads_the_truth_of_the_capture(tmp_path: Path, capsys: pytest.Cap
     assert "B ~ blur" in head
     assert row.split()[:2] == [str(run), "6"]
     (capture / "truth" / "frames.parquet").unlink()
-    assert cleargs(["rva", "check", str(run)]) == 3
+    assert cleargs(["rva", "check", str(run)]) == 2
     assert "has no truth/frames.parquet" in capsys.readouterr().err
