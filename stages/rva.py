@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
@@ -68,9 +67,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
     scored = np.asarray(~np.isnan(cues).any(axis=1))
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
-    poses = poses_from(frames)
-    poses = replace(poses, registered=poses.registered & scored)
-    result = assess(frame_id, cues, poses, observations, config)
+    result = assess(frame_id, cues, poses_from(frames), observations, config)
 
     names = [frame.name for frame in frames]
     write_table(

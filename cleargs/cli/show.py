@@ -11,11 +11,15 @@ from cleargs.cli.common import json_option, print_json, run_argument
 from cleargs.cli.summary import describe_table, sampled_rows
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+PLOT = "rva-plot.png"
+"""The picture of ``--plot`` in the run's folder, unless another is named."""
 
 
 @click.command(
@@ -24,6 +28,7 @@ Examples:
   cleargs show room                 all stages: state, time, size, figures
   cleargs show room rva             roles, weights and scores, column by column
   cleargs show room g0 --rows 12    rows of each table, evenly spread
+  cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
 """
 )
 @run_argument
@@ -31,10 +36,35 @@ Examples:
 @click.option(
     "--rows", type=click.IntRange(min=0), help="How many rows of each table.  [default: 8 of step tables]"
 )
+@click.option(
+    "--plot",
+    is_flag=True,
+    help="With rva, in place of its tables: draw the trajectory, scores, roles, weights and telling frames.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help=f"Picture of --plot (.png).  [default: RUN/{PLOT}]",
+)
 @json_option
 @click.pass_obj
-def show(dag: Dag, run: Path, stage: str | None, rows: int | None, as_json: bool) -> None:
+def show(
+    dag: Dag,
+    run: Path,
+    stage: str | None,
+    rows: int | None,
+    plot: bool,
+    output: Path | None,
+    as_json: bool,
+) -> None:
     """Show what the stages of RUN found, or the tables of one STAGE."""
+    if plot and stage != "rva":
+        raise InputError("--plot draws the stage rva", hint=f"cleargs show {run} rva --plot")
+    if output is not None and (not plot or output.suffix.lower() != ".png"):
+        raise InputError(
+            "--output names the PNG of --plot", hint=f"cleargs show {run} rva --plot -o FILE.png"
+        )
     if not (run / RUN_FILE).is_file():
         raise InputError(f"{run} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`")
     if stage is None:
@@ -48,6 +78,13 @@ def show(dag: Dag, run: Path, stage: str | None, rows: int | None, as_json: bool
     manifest = linked_manifest(run, stage)
     if manifest is None:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs explain {run}")
+    if plot:
+        picture = _plot(run, manifest, output or run / PLOT)
+        if as_json:
+            print_json({"stage": stage, "plot": str(picture)})
+        else:
+            click.echo(f"written: {picture}")
+        return
     tables = {
         name: _read(run / stage / name)
         for name in sorted(manifest.files)
@@ -66,6 +103,23 @@ def show(dag: Dag, run: Path, stage: str | None, rows: int | None, as_json: bool
         wanted = rows if rows is not None else 8 if "step" in table.column_names else 0
         if wanted and table.num_rows:
             _print_rows(console, table, wanted)
+
+
+def _plot(run: Path, rva: Manifest, picture: Path) -> Path:
+    """Draw RUN/rva with the poses and images that it was made from. Raises InputError, StoreError."""
+    from cleargs.report.allocation import load_allocation, plot_allocation
+
+    made_from, ingest = rva.parts.inputs["ingest"], linked_manifest(run, "ingest")
+    if ingest is None or any(
+        tree_digest(ingest.under(name)) != made_from[name] for name in ("frames.parquet", "images")
+    ):
+        raise InputError(
+            f"rva was made from another ingest than the one in {run}",
+            hint=f"run it again: cleargs stage rva {run}",
+        )
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_allocation(picture, load_allocation(run / "rva", run / "ingest"), run.resolve().name)
+    return picture
 
 
 def _read(path: Path) -> Any:

@@ -54,7 +54,8 @@ class Observations:
 
 @dataclass(frozen=True)
 class Assessment:
-    """One entry a frame, in the order given; geometry is NaN (bin -1) where the frame is unregistered."""
+    """One entry a frame, in the order given; geometry is NaN (bin -1) where the frame is unregistered
+    or not scored."""
 
     R: Floats
     B: Floats
@@ -75,7 +76,7 @@ class Assessment:
 
 def assess(
     frame_id: Ints,  # [N] distinct; orders the trajectory
-    cues: Floats,  # [N, 11] in [0, 1]
+    cues: Floats,  # [N, 11] in [0, 1]; NaN in the row of a frame that could not be scored
     poses: Poses,
     observations: Observations,
     config: RvaConfig,
@@ -83,13 +84,15 @@ def assess(
     """Scores, geometry, bins, roles and weights of the training frames.
 
     Observations by other frames (held-out ones, say) and by unregistered frames are ignored: neither P_rel
-    nor n_p knows of them. Permuting the rows of the arguments permutes the result. With ``config.enabled``
+    nor n_p knows of them. A frame that could not be scored is treated like one without a pose, its points
+    included. Permuting the rows of the arguments permutes the result. With ``config.enabled``
     false every registered frame is strong with weight 1, with ``config.weighting`` "binary" the better ones
     are; all other columns stay what they are.
     """
     R, B = appearance_scores(cues, config)
     by_id = np.argsort(frame_id, kind="stable")
-    rows = by_id[poses.registered[by_id]]  # the trajectory: registered frames by frame_id
+    usable = poses.registered & ~np.isnan(cues).any(axis=1)
+    rows = by_id[usable[by_id]]  # the trajectory: registered and scored frames by frame_id
     r, b = R[rows], B[rows]
 
     reliable = is_reliable(r, b, config)
@@ -118,7 +121,7 @@ def assess(
         rules = np.full_like(rules, "")
 
     def spread(values: npt.NDArray[S], elsewhere: object) -> npt.NDArray[S]:
-        """Rows of the trajectory back to the rows of the arguments; ``elsewhere`` for unregistered frames."""
+        """Rows of the trajectory back to the rows of the arguments; ``elsewhere`` for the other frames."""
         whole = np.full(len(frame_id), elsewhere, dtype=values.dtype)
         whole[rows] = values
         return whole

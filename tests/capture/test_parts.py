@@ -68,7 +68,7 @@ def test_a_pinhole_is_not_resampled() -> None:
 
 
 @given(st.floats(0.1, 3), st.floats(-1, 1), st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_normalised_world(scale: float, tilt: float, seed: int) -> None:
     random = np.random.default_rng(seed)
     poses = []

@@ -184,7 +184,7 @@ def test_patterns_bind_names_to_one_thing() -> None:
     assert match(("Add", ("Mul", "a", "b"), 2.001), shifted) is None
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.permutations(range(4)), st.permutations(range(4)))
 def test_layouts_in_a_row_merge(first: list[int], second: list[int]) -> None:
     x = ex.source((2, 3, 1, 5))

@@ -1,15 +1,18 @@
-"""Captures at the edge (nothing reliable, one frame, no motion, no poses, no points), and the sparse sums."""
+"""Captures at the edge (nothing reliable, one frame; no motion, poses, points or scores), and sparse sums."""
 
 from __future__ import annotations
+
+import tracemalloc
 
 import numpy as np
 import pytest
 from rva_scenes import along_x, observations_of, poses_at, uniform_cues
 
-from cleargs.rva.assessment import assess
+from cleargs.rva.assessment import Observations, assess
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.geometry import coverage_gain, redundancy, visibility
-from cleargs.rva.results import frames_table
+from cleargs.rva.results import frames_table, summary
+from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.rva.trajectory import cut_into_bins
 
 CONFIG = RvaConfig(active_share=0.0)
@@ -72,6 +75,51 @@ def test_unregistered_frames_have_no_geometry_and_no_say() -> None:
     assert [row[name] for name in ("C", "D", "O", "G", "bin", "Z")] == [None] * 6
 
 
+def test_a_blurred_camera_that_does_not_move_keeps_one_frame() -> None:
+    cues = uniform_cues([0.1, 0.1, 0.2, 0.2], [0.9] * 4)
+    result = assess(ids(4), cues, poses_at(along_x([2.0] * 4)), observations_of({}), CONFIG)
+    # One bin, G = 0 and Z = 1 for all: R decides, and of the tied frames 2 and 3 the earlier.
+    assert result.role.tolist() == ["suppressed", "suppressed", "reactivated", "suppressed"]
+    assert result.weight.tolist() == [0.0, 0.0, 0.12, 0.0]
+
+
+def test_unscored_frames_have_no_geometry_and_no_say() -> None:
+    cues = uniform_cues([0.8, 0.9, 0.8], [0.1, 0.1, 0.1])
+    cues[1] = np.nan
+    points = observations_of({0: [1, 2], 1: [2, 3], 2: [3, 4]})
+    result = assess(ids(3), cues, poses_at(along_x([0.0, 99.0, 1.0])), points, CONFIG)
+    assert np.isnan([getattr(result, name)[1] for name in ("R", "B", "C", "D", "O", "G", "Z")]).all()
+    assert (result.bin[1], result.role[1], result.weight[1]) == (-1, "suppressed", 0.0)
+    assert not result.reliable[1]
+    assert result.D[0] == 0.65  # the largest distance is 1: frame 1's place does not count
+    assert result.O.tolist()[::2] == [0.0, 0.0]  # nor do its points, which touch both others'
+    row = frames_table(ids(3), ["a", "b", "c"], "hand-1", cues, result).to_pylist()[1]
+    assert [row[name] for name in (*CUE_COLUMNS, "R", "B", "C", "D", "O", "G", "bin", "Z")] == [None] * 19
+
+
+def test_an_unscored_frame_is_not_reactivated() -> None:
+    """It has no gain to compare; the NaN must not win the bin."""
+    cues = uniform_cues([0.1, 0.1, 0.1], [0.9, 0.9, 0.9])
+    cues[0] = np.nan
+    result = assess(ids(3), cues, poses_at(along_x([0.0, 1.0, 2.0])), observations_of({}), CONFIG)
+    assert result.role.tolist()[0] == "suppressed"
+    assert sorted(result.role.tolist()[1:]) == ["reactivated", "suppressed"]
+
+
+def test_no_frame_is_scored() -> None:
+    cues = np.full((2, 11), np.nan)
+    result = assess(ids(2), cues, poses_at(along_x([0.0, 1.0])), observations_of({0: [1], 1: [1]}), CONFIG)
+    assert result.weight.tolist() == [0.0, 0.0]
+    assert not result.stand_in.any()
+
+
+def test_no_frames() -> None:
+    result = assess(ids(0), uniform_cues([], []), poses_at(along_x([])), observations_of({}), CONFIG)
+    assert len(result.weight) == 0
+    assert frames_table(ids(0), [], "hand-1", uniform_cues([], []), result).num_rows == 0
+    assert summary(result, "hand-1")["effective_frames"] == 0.0
+
+
 def test_no_frame_is_registered() -> None:
     poses = poses_at(along_x([0.0, 1.0]), registered=[False, False])
     result = assess(ids(2), uniform_cues([0.9, 0.9], [0.1, 0.1]), poses, observations_of({}), CONFIG)
@@ -123,3 +171,29 @@ def test_sparse_sums_equal_sets() -> None:
         ]
         assert coverage_gain(seen, reference)[i] == pytest.approx(gained / total if own else 0.0)
         assert redundancy(seen, reference)[i] == pytest.approx(max(overlaps, default=0.0))
+
+
+def test_a_long_capture_needs_no_square_array() -> None:
+    """The peak of all arrays stays far below one of T x T or T x P entries.
+
+    5,000 frames of 40 points, half of which each shares with the next frame: 100,000 points, 200,000
+    observations. One T x T array of float64 has 200 MB, one T x P array of single bytes 500 MB. Blocks of
+    2^20 pairs take 8 MB an array, and a few of them are alive at a time.
+    """
+    count, points = 5_000, 40
+    frame = np.repeat(ids(count), points)
+    seen = np.arange(points)[None, :] + (points // 2) * np.arange(count)[:, None]
+    good = np.arange(count) % 3 > 0  # most frames are reliable, so that most pairs are looked at
+    cues = uniform_cues(np.where(good, 0.9, 0.3), np.where(good, 0.1, 0.7))
+    poses = poses_at(along_x(np.linspace(0.0, 1.0, count)))
+    observations = Observations(frame, seen.ravel())
+    tracemalloc.start()
+    try:
+        result = assess(ids(count), cues, poses, observations, CONFIG)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 100e6
+    # Frame 0 (not reliable) shares 20 points with frame 1 (reliable): 20 / (40 + 40 - 20).
+    assert result.O[0] == pytest.approx(1 / 3)
+    assert result.C[0] > 0.0

@@ -32,12 +32,15 @@ class Capture:
 
 @st.composite
 def captures(draw: st.DrawFn) -> Capture:
-    """Up to 24 frames whose quality comes in levels (so that all roles and ties occur), some unregistered."""
+    """Up to 24 frames whose quality comes in levels (so that all roles and ties occur), some without a pose,
+    some without scores.
+    """
     n = draw(st.integers(1, 24))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     level = draw(st.sampled_from([0.2, 0.5, 0.8, 1.0]))  # the best quality of the capture
     cues = np.round(rng.uniform(0.0, 1.0, (n, 11)) ** 0.5 * 4) / 4
     cues[:, :5] *= level
+    cues[rng.random(n) >= draw(st.sampled_from([0.8, 1.0]))] = np.nan
     rotations = Rotation.random(n, random_state=int(rng.integers(2**31))).as_matrix()
     centres = np.cumsum(rng.normal(size=(n, 3)), axis=0) * draw(st.sampled_from([0.0, 1e-3, 1.0]))
     if draw(st.booleans()):
@@ -108,6 +111,20 @@ def test_permuting_the_rows_permutes_the_table(capture: Capture, random: Random)
     one, other = capture.assess(), shuffled.assess()
     for name in PER_FRAME:
         np.testing.assert_array_equal(getattr(one, name)[order], getattr(other, name), err_msg=name)
+
+
+@given(captures())
+def test_frames_without_pose_or_scores_have_no_say(capture: Capture) -> None:
+    """The others get the same rows, bit for bit, and the same bins when such frames are left out."""
+    result = capture.assess()
+    kept = capture.poses.registered & ~np.isnan(capture.cues[:, 0])
+    poses = Poses(*(getattr(capture.poses, f.name)[kept] for f in fields(Poses)))
+    without = replace(capture, frame_id=capture.frame_id[kept], cues=capture.cues[kept], poses=poses).assess()
+    for name in PER_FRAME:
+        np.testing.assert_array_equal(getattr(result, name)[kept], getattr(without, name), err_msg=name)
+    np.testing.assert_array_equal(result.covered, without.covered)
+    np.testing.assert_array_equal(result.bin_edges, without.bin_edges)
+    assert not result.weight[~kept].any()
 
 
 @given(captures(), st.integers(0, 23), st.integers(0, 23))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rva_scenes import BACKWARD, FORWARD, along_x, observations_of, poses_at, uniform_cues
 
-from cleargs.rva.allocation import effective_sample_size
+from cleargs.rva.allocation import effective_sample_size, reactivation_gain
 from cleargs.rva.assessment import Assessment, assess
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.results import bins_table, frames_table, summary
@@ -91,7 +91,9 @@ def test_roles_and_weights(result: Assessment) -> None:
     # 0: R >= 0.70 and B <= 0.60: strong. 1: G >= 0.60 and B <= 0.80: geometric (R < 0.35).
     # 2: R >= 0.35, G >= 0.25, B <= 0.75: auxiliary (G < 0.60). 3 and 4: B > 0.80, nothing holds.
     # Bin 1 = {3, 4} is uncovered. Gains 0.35 G + 0.25 R + 0.30 (1 - B) + 0.10 Z:
-    # 3: 0.17815 + 0.025 + 0.03 + 0.096 = 0.32915; 4: 0.35 (0.71 - 0.3/7) + 0.025 + 0.03 + 0 = 0.2885
+    # 3: 0.17815 + 0.025 + 0.03 + 0.096 = 0.32915; 4: 0.2485 - 0.015 + 0.025 + 0.03 + 0 = 0.2885
+    gain = reactivation_gain(result.R, result.B, result.G, result.Z, CONFIG)
+    assert gain[3:].tolist() == near(0.32915, 0.2885)
     assert result.role.tolist() == ["strong", "geometric", "auxiliary", "reactivated", "suppressed"]
     # w_0 = 0.80 + 0.20 x 0.86 = 0.972
     # w_1 = 0.30 + 0.30 (0.35 x 0.2 + 0.65 x 0.606625) = 0.30 + 0.30 x 0.46430625 = 0.439291875

@@ -1,0 +1,91 @@
+"""``cleargs show RUN rva --plot``: the picture of a run, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from vlm_server import two_stages
+
+from cleargs.cli.main import invoke
+from cleargs.pipeline.manifest import read_manifest, write_manifest
+
+
+class Shell:
+    """A run of six flat frames, and ``show`` on it."""
+
+    def __init__(self, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder = root / "walk"
+        self.capsys = capsys
+        self.root = root
+        (root / "empty.toml").touch()
+        (root / "source").mkdir()
+        assert self(
+            "run", str(root / "source"), "-o", str(self.folder), "--workflow", str(root / "empty.toml")
+        )
+
+    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+        code = invoke(list(arguments), two_stages())
+        streams = self.capsys.readouterr()
+        return code, streams.out, streams.err
+
+    def plot(self, *options: str, stage: str = "rva") -> tuple[int, str, str]:
+        return self("show", str(self.folder), stage, *options)
+
+    def files(self) -> dict[str, bytes]:
+        return {str(file): file.read_bytes() for file in self.folder.rglob("*") if file.is_file()}
+
+
+@pytest.fixture
+def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Shell:
+    monkeypatch.delenv("CLEARGS_STORE", raising=False)
+    return Shell(tmp_path, capsys)
+
+
+def test_the_picture_lies_in_the_run_and_changes_nothing_else(shell: Shell) -> None:
+    before = shell.files()
+    code, out, err = shell.plot("--plot")
+    picture = shell.folder / "rva-plot.png"
+    assert (code, out, err) == (0, f"written: {picture}\n", "")
+    assert cv2.imread(str(picture)) is not None
+    after = shell.files()
+    assert set(after) - set(before) == {str(picture)}
+    assert {name: after[name] for name in before} == before
+
+
+def test_the_picture_can_go_elsewhere(shell: Shell) -> None:
+    elsewhere = shell.root / "new" / "a.png"
+    code, out, _ = shell.plot("--plot", "-o", str(elsewhere), "--json")
+    assert code == 0 and json.loads(out) == {"stage": "rva", "plot": str(elsewhere)}
+    assert elsewhere.is_file() and not (shell.folder / "rva-plot.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("stage", "options", "words"),
+    [
+        ("ingest", ["--plot"], "--plot draws the stage rva"),
+        ("rva", ["-o", "a.png"], "--output names the PNG of --plot"),
+        ("rva", ["--plot", "-o", "a.jpg"], "--output names the PNG of --plot"),
+    ],
+)
+def test_wrong_usage(shell: Shell, stage: str, options: list[str], words: str) -> None:
+    code, out, err = shell.plot(*options, stage=stage)
+    assert (code, out) == (2, "")
+    assert err.splitlines()[0] == f"error: {words}" and err.splitlines()[1].startswith("hint: cleargs show ")
+
+
+@pytest.mark.parametrize("name", ["frames.parquet", "images/000002.png"])
+def test_scores_of_another_ingest_are_not_drawn_over_this_one(shell: Shell, name: str) -> None:
+    """After ``cleargs stage ingest`` with other settings RUN/rva still holds the scores of the old frames."""
+    link, other = shell.folder / "ingest", shell.root / "other"
+    manifest = read_manifest(link)
+    changed = manifest.files[name].model_copy(update={"digest": "0" * 64})
+    other.mkdir()
+    write_manifest(other, manifest.model_copy(update={"files": {**manifest.files, name: changed}}))
+    link.unlink()
+    link.symlink_to(other)
+    code, _, err = shell.plot("--plot")
+    assert code == 2 and "another ingest" in err and "cleargs stage rva" in err
+    assert not (shell.folder / "rva-plot.png").exists()
