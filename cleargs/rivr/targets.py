@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 Targets: TypeAlias = Literal["all", "degraded"]
@@ -37,15 +38,24 @@ def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collec
 
 
 def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
-    """A fixed eighth (at least one) of the reliable frames, spread evenly over them; in order.
+    """A fixed eighth (at least one) of the reliable frames: the best by R - B of each of as many equal parts
+    of the trajectory (ties: the one nearest to the part's middle); in order.
 
     Where no frame is reliable, the stand-in set takes their place. These frames get no repairs, and judge
-    the scene distilled from those of the others. Empty when RVA names neither.
+    the scene distilled from those of the others: a frame that is itself a little soft would call every gain
+    in sharpness a loss. Empty when RVA names neither.
     """
-    references = [frame.frame_id for frame in frames if frame.reliable]
-    if not references:
-        references = [frame.frame_id for frame in frames if frame.stand_in]
+    references = [frame for frame in frames if frame.reliable] or [
+        frame for frame in frames if frame.stand_in
+    ]
     if not references:
         return []
     count = max(1, len(references) // 8)
-    return [references[(2 * k + 1) * len(references) // (2 * count)] for k in range(count)]
+    borders = [k * len(references) // count for k in range(count + 1)]
+    return [_best(references[start:end]).frame_id for start, end in pairwise(borders)]
+
+
+def _best(frames: Sequence[Appraisal]) -> Appraisal:
+    middle = len(frames) // 2
+    ranked = sorted(enumerate(frames), key=lambda item: (item[1].B - item[1].R, abs(item[0] - middle)))
+    return ranked[0][1]

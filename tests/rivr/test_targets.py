@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from cleargs.rivr.targets import Appraisal, held_back_frames, target_frames
@@ -39,6 +41,15 @@ def test_an_eighth_of_the_strong_frames_is_held_back(strong: int, expected: int)
 
 def test_held_back_frames_are_spread_over_the_strong_ones() -> None:
     assert held_back_frames(appraised(["strong"] * 16)) == [14, 22]
+
+
+def test_the_sharpest_of_each_part_is_held_back() -> None:
+    """A soft frame would call a sharper scene worse."""
+    frames = appraised(["strong"] * 16)
+    frames[2] = replace(frames[2], R=0.9)
+    frames[9] = replace(frames[9], R=0.6)
+    frames[14] = replace(frames[14], B=0.1)
+    assert held_back_frames(frames) == [12, 24]
 
 
 def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
