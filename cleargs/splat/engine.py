@@ -107,7 +107,7 @@ class Engine:
 
         Raises:
             InputError: when the parameters are not float32 or the SH degree is not stored.
-            StageError: when there are more than 2^31 - 1 (tile, splat) pairs.
+            StageError: when there are more (tile, splat) pairs than 2^31 - 1, or than fit in memory.
         """
         if gaussians.means.dtype != torch.float32:
             raise InputError(

@@ -31,7 +31,7 @@ def render(
 
     Raises:
         InputError: when there is no back end for the device or the SH degree is not stored.
-        StageError: when there are more than 2^31 - 1 (tile, splat) pairs.
+        StageError: when there are more (tile, splat) pairs than 2^31 - 1, or than fit in memory.
     """
     if gaussians.means.dtype == torch.float64:
         from cleargs.splat.kernels import reference

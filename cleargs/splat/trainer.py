@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.errors import StageError
+from cleargs.errors import InputError, StageError
 from cleargs.progress import Reporter, Task
 from cleargs.splat import strategy
 from cleargs.splat.compensation import Exposure
@@ -58,6 +58,9 @@ _LOG = np.dtype(
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar."""
 
+_CHECK_INTERVAL = 10
+"""Steps between looks for NaN and infinity (under 1 ms for 50,000 Gaussians)."""
+
 
 @dataclass(frozen=True)
 class Trained:
@@ -93,7 +96,8 @@ def train(
     go on being learned. A share ``pseudo_share`` of the steps draws a pseudo view, whose loss is multiplied
     by ``pseudo_weight``. Goes on from ``checkpoint`` where there is one, to the same result bit for bit.
 
-    Raises InputError when no view has a weight, StageError when a parameter or the loss is not finite.
+    Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
+    loss ceases to be finite.
     """
     trainer = Trainer(
         scene,
@@ -115,10 +119,12 @@ def train(
         progress = _Progress(task, trainer)
         while trainer.done < config.steps:
             trainer.step()
+            due = trainer.done % config.checkpoint_interval == 0 and trainer.done < config.steps
             if trainer.done % _NOTE_INTERVAL == 0:
                 progress.show()
-            if trainer.done % config.checkpoint_interval == 0 and trainer.done < config.steps:
+            if due or trainer.done % _CHECK_INTERVAL == 0:
                 trainer.check_finite()
+            if due:
                 save_state(checkpoint, trainer.state())
         trainer.check_finite()
         progress.show()
@@ -150,6 +156,11 @@ class Trainer:
         self._seed = tuple(seed)
         self._scene = scene
         self._gaussians = scene.gaussians.detach().clone()
+        if fault := _fault(self._gaussians):
+            raise InputError(
+                f"the scene to start from is damaged: {fault}",
+                hint="run the stage that made it again with --force",
+            )
         self._moments = Moments.zeros(self._gaussians)
         self._rates = Rates(config, self._gaussians.sh.shape[1])
         self._budget = config.budget or strategy.budget_from_pixels(
@@ -222,7 +233,7 @@ class Trainer:
         )
         if not math.isfinite(loss.loss):
             self.check_finite()
-            raise self._not_finite("the loss")
+            raise self._stopped("the loss is not finite")
         slope = loss.grad_image
         if self._exposure is not None:
             slope, affine_slope = affine_backward(render.image, affine, slope)
@@ -238,9 +249,10 @@ class Trainer:
 
     def check_finite(self) -> None:
         """Raise StageError, naming the step and the group, when a parameter is NaN or infinite."""
-        for name, tensor in self._gaussians.tensors().items():
-            if not np.isfinite(tensor.numpy()).all():
-                raise self._not_finite(name)
+        if fault := _fault(self._gaussians):
+            raise self._stopped(fault)
+        if self._exposure is not None and not np.isfinite(self._exposure.affines).all():
+            raise self._stopped("exposure is not finite")
 
     def state(self) -> dict[str, Tensor]:
         """All that a training needs to go on: parameters, moments, affines, step and the log so far."""
@@ -312,6 +324,7 @@ class Trainer:
             step % config.refine_interval == 0
             and config.refine_start * config.steps <= step <= config.refine_stop * config.steps
         ):
+            self.check_finite()  # relocation takes a Gaussian whose opacity is NaN for dead, and hides it
             rng = self._rng(_REFINE, step)
             arrays = {name: tensor.numpy() for name, tensor in self._gaussians.tensors().items()}
             moments = [
@@ -351,11 +364,21 @@ class Trainer:
     def _rng(self, purpose: int, count: int) -> np.random.Generator:
         return np.random.default_rng([*self._seed, purpose, count])
 
-    def _not_finite(self, what: str) -> StageError:
+    def _stopped(self, fault: str) -> StageError:
         return StageError(
-            f"{what} is not finite at step {self.done}; the last good checkpoint is kept",
+            f"{fault} at step {self.done}; the last good checkpoint is kept",
             hint="lower the rates (lr_scales, lr_means), or give another --seed",
         )
+
+
+def _fault(gaussians: Gaussians) -> str | None:
+    """The first parameter that holds NaN or infinity, and in how many Gaussians; None where none does."""
+    for name, tensor in gaussians.tensors().items():
+        finite = np.isfinite(tensor.numpy())
+        if not finite.all():
+            sound = finite.reshape(gaussians.num, -1).all(axis=1).sum()
+            return f"{name} is not finite in {gaussians.num - sound} of {gaussians.num} Gaussians"
+    return None
 
 
 def render_view(

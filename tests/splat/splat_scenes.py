@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -54,6 +55,39 @@ def make_gaussians(
         sh,
     )
     return Gaussians(*(torch.tensor(array, dtype=torch.float32) for array in arrays))
+
+
+def at(camera: Camera, local: npt.NDArray[np.float64]) -> Tensor:
+    """World positions [N, 3] of camera coordinates ``local`` [N, 3]."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    return torch.tensor((local - translation) @ rotation, dtype=torch.float32)
+
+
+def make_needles(
+    camera: Camera, n: int, *, length_px: float, aspect: float, distance: float = 0.0
+) -> Gaussians:
+    """``n`` needles at random angles through random pixels, their centres ``distance`` px from these.
+
+    They lie parallel to the image and have a standard deviation of ``length_px`` along and, before the
+    dilation, of ``length_px`` / ``aspect`` across.
+    """
+    gaussians = make_gaussians(camera, n, opacity=(0.1, 0.9))
+    rng = np.random.default_rng(n)
+    angle, z = rng.uniform(0, 2 * np.pi, n), rng.uniform(2, 10, n)
+    focal = np.array([camera.fx, camera.fy])
+    along = np.stack([np.cos(angle), np.sin(angle)], 1)  # px
+    centre = rng.uniform(0, [camera.width, camera.height], (n, 2)) + distance * along
+    plane = (centre - [camera.cx, camera.cy]) / focal * z[:, None]
+    gaussians.means[:] = at(camera, np.column_stack([plane, z]))
+    axis = np.column_stack([along / focal * z[:, None], np.zeros(n)]) @ camera.world_to_camera[:3, :3]
+    world_px = np.linalg.norm(axis, axis=1)  # world units for a px along the needle
+    axis /= world_px[:, None]
+    # The rotation that takes the x axis to ``axis``: w = 1 + x · axis, (x, y, z) = x × axis.
+    turn = np.column_stack([1 + axis[:, 0], np.zeros(n), -axis[:, 2], axis[:, 1]])
+    gaussians.rotations[:] = torch.tensor(turn)
+    sizes = length_px * world_px[:, None] / np.array([1.0, aspect, aspect])
+    gaussians.log_scales[:] = torch.tensor(np.log(sizes))
+    return gaussians
 
 
 @dataclass

@@ -82,8 +82,10 @@ def test_weight_one_is_unweighted_and_weight_zero_is_nothing():
     image, target, _ = images(20, 30)
     plain = photometric_loss(image, target, ssim_lambda=0.2)
     weighted = photometric_loss(image, target, ssim_lambda=0.2, weight=1.0)
-    assert plain.loss == weighted.loss
+    assert plain.loss == weighted.loss == (1.0 - 0.2) * plain.l1 + 0.2 * (1.0 - plain.ssim)
     assert torch.equal(plain.grad_image, weighted.grad_image)
+    absolute = photometric_loss(image, target, ssim_lambda=0.0, weight=1.0)
+    assert torch.equal(absolute.grad_image, (image - target).sign() * torch.tensor(1.0 / 1800))
     nothing = photometric_loss(image, target, ssim_lambda=0.2, weight=0.0)
     assert nothing.loss == 0.0
     assert not nothing.grad_image.any()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians
+from splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians, make_needles
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
@@ -15,10 +15,16 @@ from cleargs.splat.kernels.cpu import binning, projection
 from cleargs.splat.kernels.cpu.layout import SPLAT_COLUMNS, TILE
 from cleargs.splat.render import render
 
+PARAMETERS = ["means", "log_scales", "rotations", "logit_opacities", "sh"]
+
 
 @pytest.mark.parametrize("antialias", [False, True])
-@pytest.mark.parametrize("name", ["means", "log_scales", "rotations", "logit_opacities", "sh"])
-def test_gradient_equals_finite_differences(name, antialias):
+@pytest.mark.parametrize(
+    ("name", "output"),
+    [(name, "image") for name in PARAMETERS]
+    + [(name, output) for name in PARAMETERS[:-1] for output in ("alpha", "depth")],  # colour is in neither
+)
+def test_gradient_equals_finite_differences(name, output, antialias):
     """Central differences of the oracle along random directions, against the kernels' gradient.
 
     The image jumps where an alpha crosses 1/255, so only pixels well away from that count. With a step of
@@ -31,8 +37,14 @@ def test_gradient_equals_finite_differences(name, antialias):
     assert safe.double().mean() > 0.6
     generator = torch.Generator().manual_seed(3)
     weights = torch.randn(24, 32, 3, generator=generator, dtype=torch.float64) * safe[..., None]
+    weights = weights if output == "image" else weights[..., 0]
+
+    def functional(scene):
+        result = render(scene, camera, background=BACKGROUND, antialias=antialias)
+        return (getattr(result, output) * weights).sum()
+
     live = leaves(gaussians, torch.float32)
-    (render(live, camera, background=BACKGROUND, antialias=antialias).image * weights).sum().backward()
+    functional(live).backward()
     gradient = getattr(live, name).grad.double()
     errors = []
     for _ in range(3):
@@ -40,8 +52,7 @@ def test_gradient_equals_finite_differences(name, antialias):
         values = []
         for sign in (1, -1):
             moved = Gaussians(**{**exact.tensors(), name: getattr(exact, name) + sign * 1e-6 * direction})
-            image = reference.render(moved, camera, background=BACKGROUND, antialias=antialias).image
-            values.append((image * weights).sum().item())
+            values.append(functional(moved).item())
         slope = (values[0] - values[1]) / 2e-6
         size = (gradient * direction).abs().sum().item()
         assert size > 0.1
@@ -62,11 +73,15 @@ def project(gaussians, camera, antialias=False):
     return splats, tiles, radii
 
 
-@pytest.mark.parametrize("aspect", [2.0, 30.0])
-def test_tiles_hold_every_touched_pixel_and_few_others(aspect):
+@pytest.mark.parametrize("kind", ["round", "long", "needle"])
+def test_tiles_hold_every_touched_pixel_and_few_others(kind):
     """The tile list against alpha >= 1/255 at every pixel, from the float64 projection."""
-    camera = make_camera(150, 100)
-    gaussians = make_gaussians(camera, 60, size_px=8.0, aspect=aspect)
+    if kind in ("round", "long"):
+        camera = make_camera(150, 100)
+        gaussians = make_gaussians(camera, 60, size_px=8.0, aspect=2.0 if kind == "round" else 30.0)
+    else:
+        camera = make_camera(160, 96)  # whole tiles: where needles leave the image is not looked into
+        gaussians = make_needles(camera, 100, length_px=1e7, aspect=1e6)
     splats, tiles, radii = project(gaussians, camera)
     offsets = np.concatenate([[0], np.cumsum(tiles)])
     pairs = np.empty(offsets[-1], np.uint32)

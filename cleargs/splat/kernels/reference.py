@@ -80,12 +80,16 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool) -> Splats:
-    """Project, cull at the near plane and sort by (depth, index)."""
+    """Project, cull at the near plane and sort by (depth, index).
+
+    By definition depths are compared as float32: which of two splats lies in front does not hang on the last
+    bits of a float64, so a wall facing the camera stays in the order of its indices.
+    """
     pose = torch.as_tensor(camera.world_to_camera)
     rotation, translation = pose[:3, :3], pose[:3, 3]
     depths = gaussians.means.detach() @ rotation[2] + translation[2]
     visible = torch.nonzero(depths >= constants.NEAR).squeeze(1)
-    visible = visible[torch.argsort(depths[visible], stable=True)]
+    visible = visible[torch.argsort(depths[visible].float(), stable=True)]
     means = gaussians.means[visible]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,14 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
 from cleargs.splat.kernels.cpu.jit import Array, Floats
 from cleargs.splat.kernels.cpu.layout import MAX_PAIRS, PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH, TILE
+from cleargs.splat.kernels.memory import available_memory
+
+PAIR_BUFFERS = ("pair_tiles", "pair_ids", "pair_slots", "pair_sums")
+PAIR_BYTES = 4 * (3 + SUM_DEPTH)
+"""What a (tile, splat) pair takes in them: its tile, Gaussian, slot and, when it is trained, its sums."""
+
+UNASKED = 2**28
+"""Bytes that are taken without asking how many are left, which takes about a millisecond."""
 
 
 @dataclass
@@ -32,6 +41,10 @@ class Buffers:
             memory = np.empty(size if memory is None else size + size // 4, dtype)
             self.arrays[name] = memory
         return memory[:size].reshape(shape)
+
+    def held(self, names: Iterable[str]) -> int:
+        """Bytes of the memory called so."""
+        return sum(self.arrays[name].nbytes for name in names if name in self.arrays)
 
 
 @dataclass(frozen=True)
@@ -184,12 +197,7 @@ class CpuRasteriser:
         pair_offsets = self._buffers.take("pair_offsets", (n + 1,), np.int64)
         visible = binning.pair_ranges(tile_counts, pair_offsets)
         pairs = int(pair_offsets[n])
-        if pairs > MAX_PAIRS:
-            raise StageError(
-                f"{visible} Gaussians touch {pairs:.2e} (tile, splat) pairs at {width}x{height}, "
-                f"more than {MAX_PAIRS:.2e}",
-                hint="lower the resolution or the number of Gaussians, or check for exploded scales",
-            )
+        self._require_memory(pairs, visible, camera)
         keys = self._buffers.take("keys", (2, visible), np.uint32)
         ids = self._buffers.take("ids", (2, visible), np.uint32)
         order = ids[binning.depth_order(splats, tile_counts, keys, ids)]
@@ -217,4 +225,19 @@ class CpuRasteriser:
             pair_slots=pair_slots,
             transmittance=self._buffers.take("transmittance", (height, width)),
             last=self._buffers.take("last", (height, width)),
+        )
+
+    def _require_memory(self, pairs: int, visible: int, camera: Camera) -> None:
+        """Raise StageError when this many pairs cannot be numbered, or their buffers would not fit."""
+        missing = pairs * PAIR_BYTES - self._buffers.held(PAIR_BUFFERS)
+        if pairs > MAX_PAIRS:
+            excess = f"more than {MAX_PAIRS:.2e}"
+        elif missing > UNASKED and missing > available_memory():
+            excess = f"more than fit: they need another {missing / 1e9:.1f} GB of memory"
+        else:
+            return
+        raise StageError(
+            f"{visible} Gaussians touch {pairs:.2e} (tile, splat) pairs at {camera.width}x{camera.height}, "
+            f"{excess}",
+            hint="lower the resolution or the number of Gaussians, or check for exploded scales",
         )

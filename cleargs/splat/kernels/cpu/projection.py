@@ -196,7 +196,7 @@ def project_one(
 ) -> bool:
     """Write the packed splat of Gaussian ``g``; False when it is culled (behind, too faint, not finite)."""
     x, y, z = camera_position(means[g], view)
-    if not z >= NEAR:  # also when z is NaN
+    if not NEAR <= z <= FLOAT32_MAX:  # also when z is NaN
         return False
     qw, qx, qy, qz, _ = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
