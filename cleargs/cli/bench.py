@@ -1,18 +1,88 @@
-"""``cleargs bench``: what the splatting core costs on this machine."""
+"""``cleargs bench``: what the splatting core costs on this machine, and how far it is from the truth."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import median
 
 import click
 
-from cleargs.cli.common import json_option, print_json, threads_or_all
+from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.progress import make_reporter
+
+prototype_option = click.option(
+    "--prototype",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder of another trainer (train.py with main(threads, iters), TM) to measure in turn with ours.",
+)
 
 
 @click.group()
 def bench() -> None:
     """Measure the splatting core on this machine."""
+
+
+@bench.command(
+    epilog="""\b
+Examples:
+  cleargs bench splat -o bench            all sizes; tables, JSON and pictures
+  cleargs bench splat --quick             the same kinds of rows, small
+  cleargs bench splat -o bench --prototype DIR
+
+How to read the tables: docs/speed.md.
+"""
+)
+@click.option(
+    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
+)
+@click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
+@click.option("--threads", type=click.IntRange(1), help="Measured besides 1.  [default: all cores]")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Chooses the oracle's pixels."
+)
+@prototype_option
+@json_option
+@quiet_option
+def splat(
+    out: Path | None,
+    quick: bool,
+    threads: int | None,
+    seed: int,
+    prototype: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Speed beside error: 10,000 to 400,000 splats, 320x180 to 1280x720, on 1 thread and on all.
+
+    Forward and backward pass, loss, Adam and memory; the image's and every gradient's error against the
+    float64 oracle; a rasteriser in pure torch; each kernel under the machine's roof; how cost grows. With -o
+    the folder gets splat.md, splat.json, speed-error.png and scaling.png; without it the tables are printed.
+    """
+    import dataclasses
+
+    from cleargs.bench.benchmark import run
+    from cleargs.bench.markdown import markdown
+    from cleargs.bench.pictures import plot_scaling, plot_speed_error
+    from cleargs.bench.plan import full_plan, quick_plan
+    from cleargs.files import write_bytes, write_json
+    from cleargs.splat.kernels.runtime import warm_up
+
+    counts = tuple(sorted({1, threads_or_all(threads)}))
+    plan = (quick_plan if quick else full_plan)(counts, prototype)
+    warm_up()
+    benchmark = run(dataclasses.replace(plan, seed=seed), make_reporter(quiet))
+    text, values = markdown(benchmark), benchmark.as_json()
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_bytes(out / "splat.md", text.encode())
+        write_json(out / "splat.json", values)
+        plot_speed_error(out / "speed-error.png", benchmark)
+        plot_scaling(out / "scaling.png", benchmark)
+    if as_json:
+        print_json(values)
+    elif out is None:
+        click.echo(text)
+    else:
+        click.echo(out / "splat.md")
 
 
 @bench.command(
@@ -32,12 +102,8 @@ Examples:
     "--height", default=360, show_default=True, type=click.IntRange(1, 8192), help="Image height, px."
 )
 @click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
-@click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Measurements to take.")
-@click.option(
-    "--prototype",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Folder of another trainer (train.py with main(threads) and TM) to time in turn with ours.",
-)
+@click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Rounds to measure.")
+@prototype_option
 @json_option
 def train(
     gaussians: int,
@@ -48,29 +114,39 @@ def train(
     prototype: Path | None,
     as_json: bool,
 ) -> None:
-    """Time one training iteration (SH degree 3): forward, loss, backward, Adam; medians of medians.
+    """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error.
 
-    With a prototype the two are measured in turn in one process: quote the ratio, not the milliseconds.
+    With a prototype the two are measured in turn in one process: quote the ratio, not the milliseconds. It is
+    measured at its own size, and so are we for the ratio.
     """
-    import torch
+    from cleargs.bench.benchmark import compare_with_prototype, measure
+    from cleargs.bench.iteration import PARTS, WHOLE
+    from cleargs.bench.plan import Case, Plan
+    from cleargs.bench.prototype import Prototype
 
-    from cleargs.splat.bench import time_iteration, time_prototype
-    from cleargs.splat.kernels.runtime import set_threads
-
+    trainer = Prototype(prototype) if prototype is not None else None
     count = threads_or_all(threads)
-    torch.set_num_threads(count)
-    ours, theirs = [], []
-    for _ in range(repeats):
-        if prototype is not None:
-            theirs.append(time_prototype(prototype, count))
-        set_threads(count)
-        ours.append(time_iteration(gaussians, width, height))
-    row: dict[str, float] = {part: median(run[part] for run in ours) for part in ours[0]}
-    if theirs:
-        row["prototype"] = median(theirs)
-        row["ratio"] = median(run["iteration"] / other for run, other in zip(ours, theirs, strict=True))
+    case = Case(gaussians, width, height)
+    plan = Plan(cases=(case,), threads=(count,), rounds=repeats, repetitions=5)
+    found = measure(case, plan)
+    row: dict[str, float | None] = {part: found.times[count][part].median for part in (*PARTS, WHOLE)}
+    if trainer is not None:
+        comparison = compare_with_prototype(trainer, plan)
+        row["prototype"] = comparison.prototype[count].median
+        row["ratio"] = comparison.ratio[count].median
+    row["memory_mb"] = None if found.memory is None else found.memory / 1e6
+    row["image_error"] = found.accuracy.image.max
+    row["gradient_error"] = found.accuracy.worst_gradient
     if as_json:
         print_json({"gaussians": gaussians, "width": width, "height": height, "threads": count} | row)
         return
-    for part, value in row.items():
-        click.echo(f"{part:<10} {value:8.2f}" + ("" if part == "ratio" else " ms"))
+    for name, value in row.items():
+        click.echo(f"{name:<14} {_with_unit(name, value)}")
+
+
+def _with_unit(name: str, value: float | None) -> str:
+    if value is None:
+        return " unknown"
+    if name.endswith("error"):
+        return f"{value:8.1e}"
+    return f"{value:8.2f}" + ("" if name in ("ratio", "memory_mb") else " ms")

@@ -1,0 +1,99 @@
+"""One training iteration: forward pass, loss, backward pass, Adam."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cleargs.bench.probe import timed_kernels
+from cleargs.bench.scenes import random_image
+from cleargs.bench.timing import Clock
+from cleargs.splat.adam import adam_step
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
+from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.losses import photometric_loss
+
+PARTS = ("forward", "loss", "backward", "adam")
+WHOLE = "iteration"
+
+SSIM_LAMBDA = 0.2
+
+
+def use_threads(count: int) -> None:
+    """Kernels and torch run on ``count`` threads from now on."""
+    set_threads(count)
+    torch.set_num_threads(count)
+
+
+class Iteration:
+    """A scene, a target image and everything that training keeps from step to step.
+
+    Adam's rate is 0: it does all its work, and the scene stays the one whose error is measured.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
+        self.gaussians = gaussians
+        self.camera = camera
+        self.engine = Engine()
+        self._target = random_image(camera.width, camera.height)
+        self._slope = torch.empty_like(self._target)
+        tensors = gaussians.tensors()
+        self._first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        self._second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        self._step = 0
+
+    def run(self, clock: Clock) -> None:
+        """One iteration, a repetition on ``clock``: PARTS and WHOLE."""
+        self._step += 1
+        with clock.repetition(), clock.time(WHOLE):
+            with clock.time("forward"):
+                render = self.engine.forward(self.gaussians, self.camera)
+            with clock.time("loss"):
+                loss = photometric_loss(
+                    render.image, self._target, ssim_lambda=SSIM_LAMBDA, gradient=self._slope
+                )
+            with clock.time("backward"):
+                gradients = self.engine.backward(loss.grad_image).tensors()
+            with clock.time("adam"):
+                for name, tensor in self.gaussians.tensors().items():
+                    adam_step(
+                        tensor,
+                        gradients[name],
+                        self._first[name],
+                        self._second[name],
+                        step=self._step,
+                        lr=0.0,
+                    )
+
+    def run_on(self, threads: int, repetitions: int, clock: Clock) -> None:
+        """Several iterations on so many threads, every kernel timed as well."""
+        use_threads(threads)
+        with timed_kernels(clock):
+            for _ in range(repetitions):
+                self.run(clock)
+
+    def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
+        """Copies of the rendered image [H, W, 3] and of the gradients for dL/d(image) [H, W, 3]."""
+        image = self.engine.forward(self.gaussians, self.camera).image.clone()
+        return image, self.engine.backward(grad_image).clone()
+
+
+class _OpenRasteriser(CpuRasteriser):
+    """The CPU rasteriser with a view of what lies between its passes."""
+
+    @property
+    def frame(self) -> Frame:
+        assert self._frame is not None
+        return self._frame
+
+
+def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
+    """Packed splats, (tile, splat) pairs and each pixel's last contributor of a view (SH degree 3)."""
+    rasteriser = _OpenRasteriser()
+    rasteriser.forward(
+        gaussians, camera, sh_count=16, background=(0.0, 0.0, 0.0), antialias=False, depth=False
+    )
+    return rasteriser.frame

@@ -1,0 +1,139 @@
+"""What a benchmark found, as plain data."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cleargs
+from cleargs.bench.oracle import Accuracy
+from cleargs.bench.peaks import Peaks
+from cleargs.bench.plan import Case
+from cleargs.bench.roofline import Roof
+from cleargs.bench.timing import Quartiles
+from cleargs.bench.work import Size
+
+Times = dict[str, Quartiles]
+"""Part of an iteration -> milliseconds."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where it was measured, and what else ran there."""
+
+    processor: str
+    cores: int
+    versions: dict[str, str]
+    load_before: float  # load average over a minute
+    load_after: float
+
+
+@dataclass(frozen=True)
+class TorchForm:
+    """One pure-torch rasteriser, forward and backward, by the number of threads."""
+
+    times: dict[int, Quartiles]  # ms
+    ratio: dict[int, Quartiles]  # its time / ours, round by round
+    accuracy: Accuracy  # behind the oracle's projection
+
+
+@dataclass(frozen=True)
+class Rasterisers:
+    """Our rasteriser against pure torch, forward and backward, by the number of threads."""
+
+    ours: dict[int, Quartiles]  # ms
+    torch: dict[str, TorchForm]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case."""
+
+    case: Case
+    pairs: int
+    contributions: int
+    times: dict[int, Times]  # by the number of threads
+    memory: int | None  # bytes; None where the system does not tell
+    accuracy: Accuracy
+    rasterisers: Rasterisers | None  # None: not run
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A training iteration of the prototype's and ours, by the number of threads."""
+
+    case: Case
+    ours: dict[int, Quartiles]  # ms
+    prototype: dict[int, Quartiles]  # ms
+    ratio: dict[int, Quartiles]  # ours / the prototype's, round by round
+    accuracy: Accuracy
+    prototype_accuracy: Accuracy
+
+
+@dataclass(frozen=True)
+class ScalingPoint:
+    """Forward and backward pass on all threads, and peak memory, at one number of pairs."""
+
+    case: Case
+    pairs: int
+    milliseconds: Quartiles
+    memory: int | None
+
+
+@dataclass(frozen=True)
+class Rooflines:
+    """The kernels of one case under the machine's roof, by the number of threads."""
+
+    case: Case
+    size: Size
+    peaks: dict[int, Peaks]
+    kernels: dict[int, list[Roof]]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Everything that ``cleargs bench splat`` reports."""
+
+    machine: Machine
+    threads: tuple[int, ...]
+    rows: list[Row]
+    prototype: Comparison | None
+    roofline: Rooflines | None
+    scaling: dict[str, list[ScalingPoint]]  # series -> points
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain dictionaries and lists; a Case or a Size becomes an object with named fields."""
+        plain: dict[str, Any] = asdict(self, dict_factory=_named)
+        return plain
+
+
+def _named(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: value._asdict() if isinstance(value, Case | Size) else value for name, value in items}
+
+
+def describe_machine(load_before: float) -> Machine:
+    """This machine, at the end of the measurements."""
+    return Machine(
+        processor=_processor(),
+        cores=len(os.sched_getaffinity(0)),
+        versions={
+            "cleargs": cleargs.__version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "numba", "numpy")},
+        },
+        load_before=load_before,
+        load_after=os.getloadavg()[0],
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

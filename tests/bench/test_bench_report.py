@@ -1,0 +1,187 @@
+"""A whole benchmark at toy size: every table, file and picture, from the command line and from Python."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from cleargs.bench import plan as plans
+from cleargs.bench.benchmark import run
+from cleargs.bench.markdown import NOT_RUN, markdown, milliseconds
+from cleargs.bench.memory import peak_memory
+from cleargs.bench.pictures import plot_speed_error
+from cleargs.bench.plan import Case, Plan, full_plan, quick_plan
+from cleargs.bench.results import Benchmark
+from cleargs.bench.timing import Quartiles
+from cleargs.cli.main import main
+from cleargs.progress import SilentReporter
+
+SMALL, LARGE = Case(60, 40, 24), Case(90, 48, 32)
+
+FAKE_PROTOTYPE = """
+import torch
+from cleargs.splat.camera import Camera
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.render import render
+
+N, W, H = 60, 40, 24
+TM = {}
+
+def main(threads, iters):
+    TM["TOTAL"] = [0.5] * (iters - 5)
+    print("noise")
+
+def proj(means, scales, rotations, sh, view, intrinsics):
+    global camera
+    camera = Camera(W, H, *intrinsics, view.double().numpy())
+    return means, torch.cat([scales.log(), rotations], 1), sh, means[:, 2]
+
+class Raster:
+    @staticmethod
+    def apply(means, shape, sh, opacities, depths, background):
+        log_scales, rotations = (part.contiguous() for part in shape.split([3, 4], 1))
+        gaussians = Gaussians(means, log_scales, rotations, opacities.logit(), sh)
+        return render(gaussians, camera).image + 0.25, None
+"""
+
+
+def toy_plan(prototype: Path | None = None) -> Plan:
+    return Plan(
+        cases=(SMALL, LARGE),
+        threads=(1,),
+        rounds=1,
+        repetitions=1,
+        torch_rounds=1,
+        torch_largest=SMALL,
+        roofline=SMALL,
+        more_splats=(SMALL, LARGE),
+        larger_splats=(SMALL, Case(60, 40, 24, 5.0)),
+        memory=False,
+        prototype=prototype,
+        peak_repeats=1,
+        seed=4,
+    )
+
+
+@pytest.fixture(scope="module")
+def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Benchmark:
+    folder = tmp_path_factory.mktemp("prototype")
+    (folder / "train.py").write_text(FAKE_PROTOTYPE)
+    try:
+        return run(toy_plan(folder), SilentReporter())
+    finally:
+        sys.modules.pop("train", None)
+
+
+def test_every_row_has_its_errors_beside_its_times(benchmark):
+    for row, case in zip(benchmark.rows, (SMALL, LARGE), strict=True):
+        assert row.case == case
+        assert set(row.accuracy.gradients) == {"means", "log_scales", "rotations", "logit_opacities", "sh"}
+        assert 0 < row.accuracy.image.max < 1e-5
+        assert 0 < row.accuracy.worst_gradient < 1e-4
+        assert row.accuracy.pixels + row.accuracy.left_out == min(1000, case.width * case.height)
+        assert row.pairs > 0 and row.times[1]["iteration"].median > 0
+    small, large = benchmark.rows
+    assert large.rasterisers is None
+    assert list(small.rasterisers.torch) == ["stacked tiles", "gsplat's form"]
+    for form in small.rasterisers.torch.values():
+        assert 0 < form.accuracy.worst_gradient < 1e-4
+        assert form.accuracy.image.max < 1e-5
+        assert form.ratio[1].median == pytest.approx(form.times[1].median / small.rasterisers.ours[1].median)
+
+
+def test_the_prototype_is_timed_and_its_error_seen(benchmark):
+    found = benchmark.prototype
+    assert found.case == SMALL
+    assert found.prototype[1].median == 500.0
+    assert found.ratio[1].median == pytest.approx(found.ours[1].median / 500.0)
+    assert found.accuracy.image.max < 1e-5
+    assert found.prototype_accuracy.image.median == pytest.approx(0.25, abs=1e-4)
+    assert found.prototype_accuracy.worst_gradient < 1e-4
+
+
+def test_tables_say_what_was_not_run(benchmark):
+    text = markdown(benchmark)
+    lines = [line for line in text.splitlines() if line.startswith(f"| {LARGE.title} | 1 | {NOT_RUN}")]
+    assert len(lines) == 1
+    assert "seed 4" in text
+    assert f"{benchmark.rows[0].accuracy.worst_gradient:.1e}" in text
+    assert milliseconds(benchmark.prototype.ratio[1]) in text
+    assert text.count("rasterise.backward") == 1
+    assert "unknown" in text  # memory was not measured
+    for table in text.split("\n\n"):
+        if table.startswith("|"):
+            assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_json_is_complete(benchmark):
+    values = json.loads(json.dumps(benchmark.as_json()))
+    assert values["rows"][0]["case"] == {"gaussians": 60, "width": 40, "height": 24, "sigma": 1.8}
+    assert values["rows"][1]["rasterisers"] is None
+    assert values["rows"][0]["times"]["1"]["forward"].keys() == {"low", "median", "high"}
+    assert [point["case"]["gaussians"] for point in values["scaling"]["more splats"]] == [60, 90]
+    assert len(values["roofline"]["kernels"]["1"]) == 12
+
+
+def test_the_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plans, "quick_plan", lambda threads, prototype: toy_plan())
+    with pytest.raises(SystemExit) as end:
+        main(
+            [
+                "bench",
+                "splat",
+                "--quick",
+                "--threads",
+                "1",
+                "--seed",
+                "9",
+                "-q",
+                "--json",
+                "-o",
+                str(tmp_path),
+            ]
+        )
+    assert end.value.code == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["prototype"] is None
+    assert {row["accuracy"]["seed"] for row in printed["rows"]} == {9}
+    assert json.loads((tmp_path / "splat.json").read_text()) == printed
+    assert "Not run: its folder" in (tmp_path / "splat.md").read_text()
+    for name in ("speed-error.png", "scaling.png"):
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture.shape[0] > 300 and picture.std() > 5
+
+
+def test_the_command_prints_the_tables(monkeypatch, capsys):
+    monkeypatch.setattr(plans, "quick_plan", lambda threads, prototype: toy_plan())
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "splat", "--quick", "--threads", "1", "-q"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.startswith("# Speed against error")
+
+
+def test_a_picture_with_the_prototype(benchmark, tmp_path):
+    plot_speed_error(tmp_path / "a.png", benchmark)
+    assert cv2.imread(str(tmp_path / "a.png")) is not None
+
+
+def test_memory_is_that_of_the_scene():
+    """20,000 splats keep parameters, two moments and gradients: 4 x 59 floats each, and more in buffers."""
+    found = peak_memory(20_000, 64, 48, 1.8)
+    if found is None:
+        pytest.skip("this system does not tell a process its peak memory")
+    least = 20_000 * 4 * 59 * 4
+    assert least < found < 5 * least
+
+
+def test_plans_name_cases_that_are_measured():
+    for plan in (full_plan((1, 2)), quick_plan((1,))):
+        compared = [plan.compares_torch(case) for case in plan.cases]
+        assert any(compared) and not all(compared)
+    assert not full_plan((1,)).compares_torch(Case(200_000, 320, 180))
+    assert not full_plan((1,)).compares_torch(Case(10_000, 1280, 720))
+    assert milliseconds(Quartiles(1.0, 2.0, 30.0)) == "2.00 [1.00 30.00]"
