@@ -2,6 +2,7 @@
 # make test   the whole test suite
 # make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
 # make test-convert  the tests of those conversions
+# make cluster       .venv-cluster, the Snakemake that `cleargs batch` uses
 # TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c cons
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test lint convert-env test-convert clean
+.PHONY: demo test lint convert-env test-convert cluster clean
 
 demo: .venv/demo.stamp demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
@@ -27,6 +28,15 @@ convert-env: .venv-convert/stamp
 
 test-convert: convert-env
 	.venv-convert/bin/python -m pytest tests/models
+
+# An environment of its own: the engine wants numpy and pandas of its own choosing.
+cluster: .venv-cluster/stamp
+
+.venv-cluster/stamp: Makefile
+	$(PYTHON) -m venv .venv-cluster
+	.venv-cluster/bin/python -m pip install --quiet --disable-pip-version-check \
+		'snakemake>=9.20,<10' 'snakemake-executor-plugin-slurm>=2.8,<3'
+	touch $@
 
 demo/capture/transforms.json: | .venv/demo.stamp
 	rm -rf demo/capture
@@ -54,4 +64,4 @@ demo/capture/transforms.json: | .venv/demo.stamp
 	touch $@
 
 clean:
-	rm -rf demo build dist *.egg-info .venv .venv-convert
+	rm -rf demo build dist *.egg-info .venv .venv-convert .venv-cluster

@@ -22,6 +22,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "stage": ("cleargs.cli.stage", "Run one stage of a prepared run."),
     "explain": ("cleargs.cli.explain", "Say for each stage whether it is done, and what changed if not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
+    "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
+    "batch-status": ("cleargs.cli.batch_status", "Say how far each scene of a sheet is."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
@@ -32,7 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
     "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
 }
-"""Command -> (module that holds the click command of that name, the line in ``cleargs --help``)."""
+"""Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""
 
 EPILOG = """\b
 Examples:
@@ -57,7 +59,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name)
+        command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_"))
         assert isinstance(command, click.Command)
         return command
 

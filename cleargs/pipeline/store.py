@@ -2,19 +2,25 @@
 
 ::
 
-    STORE/<stage>/<key>/                  finished: every output and manifest.json; never written again
-    STORE/work/<key>/{out,checkpoints}/   unfinished: survives kill -9, the next try goes on from it
-    STORE/kept/<stage>/                   findings about single items, by digest; safe to delete
+    STORE/<stage>/<key>/                      finished: every output and manifest.json; never written again
+    STORE/work/<key>@<writer>/{out,checkpoints}/  unfinished: survives kill -9, the next try goes on from it
+    STORE/leases/<writer>.json                who that writer is, with a heartbeat
+    STORE/kept/<stage>/                       findings about single items, by digest; safe to delete
     STORE/locks/  STORE/roots/  STORE/digests.sqlite
+
+A work folder carries its writer's name, and another takes it over by renaming it: of two only one can, and a
+writer that was taken for dead finds its folder gone instead of writing into another's.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 import shutil
+import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +28,7 @@ from typing import Literal
 from cleargs.errors import StoreError
 from cleargs.files import disk_error, is_partial, write_bytes
 from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.lease import DEAD_AFTER, Holder, lease, living_holder, this_process
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.manifest import (
     MANIFEST,
@@ -35,6 +42,9 @@ from cleargs.progress import Reporter
 
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""
+
+WAIT = 0.5
+"""Seconds between two looks whether another writer is done."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,8 @@ class Store:
     def __init__(self, root: Path, memo: DigestMemo) -> None:
         self.root = root
         self.memo = memo
+        here = this_process()
+        self._writer = f"{_process_name(here.host, here.pid)}{secrets.token_hex(4)}"
 
     # -- reading ---------------------------------------------------------------------------------------
 
@@ -105,15 +117,69 @@ class Store:
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Held by whoever works in the store, so that nothing is cleared away under its feet."""
-        with file_lock(self.root / "locks" / "store.lock", shared=True):
+        with file_lock(self.root / "locks" / "store.lock", shared=True), lease(self._lease(self._writer)):
             yield
 
-    def lock(self, key: str, reporter: Reporter, stage: str) -> AbstractContextManager[bool]:
-        """Hold the work on ``key``; waits, and says so, while another process has it."""
-        return file_lock(
-            self.root / "locks" / f"{key}.lock",
-            on_wait=lambda: reporter.info(f"{stage}: another run is at work on it; waiting"),
-        )
+    @contextmanager
+    def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[None]:
+        """Hold the work on ``key``; waits, and says so, while another process has it.
+
+        The lock keeps processes apart where the file system has locks. Where it has none, another writer's
+        heartbeat is waited out; where a dead node's lock stays, it is passed over once no writer was seen
+        alive for `DEAD_AFTER` seconds.
+        """
+        path, held, said = self.root / "locks" / f"{key}.lock", False, False
+        seen = time.monotonic()
+        with ExitStack() as kept:
+            while True:
+                if not held:
+                    with ExitStack() as attempt:
+                        held = attempt.enter_context(file_lock(path, wait=False))
+                        if held:
+                            kept.enter_context(attempt.pop_all())
+                holder = self._other_writer(key)
+                if holder is not None:
+                    seen = time.monotonic()
+                elif held or time.monotonic() - seen > DEAD_AFTER:
+                    break
+                if not said:
+                    where = f" ({holder.host}, job {holder.job})" if holder is not None and holder.job else ""
+                    reporter.info(f"{stage}: another run is at work on it{where}; waiting")
+                    said = True
+                time.sleep(WAIT)
+            try:
+                yield
+            finally:
+                self._let_go(key)
+
+    def _lease(self, writer: str) -> Path:
+        return self.root / "leases" / f"{writer}.json"
+
+    def _other_writer(self, key: str) -> Holder | None:
+        """A living writer, other than this one, that has a work folder of ``key``."""
+        for folder in (self.root / "work").glob(f"{key}*@*"):
+            writer = folder.name.partition("@")[2]
+            if writer != self._writer and (holder := living_holder(self._lease(writer))) is not None:
+                return holder
+        return None
+
+    def _claim(self, name: str) -> Path:
+        """The work folder ``name`` as this writer's own; what a dead writer left of it is taken over."""
+        mine = self.root / "work" / f"{name}@{self._writer}"
+        for folder in sorted((self.root / "work").glob(f"{name}@*")):
+            writer = folder.name.partition("@")[2]
+            if mine.exists() or living_holder(self._lease(writer)) is not None:
+                continue
+            self._lease(writer).unlink(missing_ok=True)  # first: without it, that writer publishes nothing
+            with suppress(FileNotFoundError):  # else another writer was quicker
+                folder.rename(mine)
+        return mine
+
+    def _let_go(self, key: str) -> None:
+        """Leave what this writer keeps of ``key`` to whoever comes next; else it would be waited for."""
+        for folder in (self.root / "work").glob(f"{key}*@{self._writer}"):
+            with suppress(OSError):  # something left is there already: ours stays until this process ends
+                folder.rename(folder.with_name(f"{folder.name.partition('@')[0]}@left"))
 
     def open_work(self, key: str, *, fresh: bool, entry: Entry | None) -> Work:
         """The work folder of ``key``, ready to go on: leftovers of dead writers removed.
@@ -121,7 +187,7 @@ class Store:
         A forced rebuild (``fresh``) has a folder of its own, which goes on only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
         """
-        work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
+        work = Work(self._claim(f"{key}.forced" if fresh else key))
         try:
             if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
                 _link_files(entry.folder, work.out)
@@ -139,8 +205,14 @@ class Store:
         """Move the outputs of ``work`` to their final place: all or nothing, and durable.
 
         Where a whole result with the same content is already there, ours is dropped and that one's manifest
-        returned. A partial, damaged or differing one makes room.
+        returned. A partial, damaged or differing one makes room. Raises StoreError when this writer was taken
+        for dead meanwhile: what it holds may lack what it wrote before.
         """
+        if not self._lease(self._writer).exists():
+            raise StoreError(
+                f"another process took over the work on {manifest.stage}: this one gave no sign of life",
+                hint="nothing is lost; the same command waits for the other or finds what it made",
+            )
         final = self.folder(manifest.stage, manifest.key)
         try:
             write_manifest(work.out, manifest)
@@ -227,8 +299,9 @@ class Store:
 
         Raises StoreError when a run is at work in the store.
         """
+        leases = sorted((self.root / "leases").glob("*.json"))
         with file_lock(self.root / "locks" / "store.lock", wait=False) as alone:
-            if not alone:
+            if not alone or any(living_holder(path) is not None for path in leases):
                 raise StoreError("a run is at work in this store", hint="try again when it is done")
             linked = self._linked(stages)
             found = [
@@ -250,6 +323,8 @@ class Store:
             if not dry_run:
                 for garbage in found:
                     self.discard(garbage.folder)
+                for path in leases:
+                    path.unlink(missing_ok=True)
                 for lock in (self.root / "locks").glob("*.lock"):
                     if lock.name != "store.lock":
                         lock.unlink(missing_ok=True)
@@ -270,6 +345,25 @@ class Garbage:
     folder: Path
     kind: Literal["finished", "unfinished", "kept", "rubbish"]
     bytes: int
+
+
+def last_saved(root: Path, pid: int) -> int:
+    """When process ``pid`` of this host last finished a file in its work folders in the store ``root``.
+
+    The youngest time stamp, ns; 0 without any file. A growing number says that a checkpoint was written.
+    """
+    youngest = 0
+    for folder in (root / "work").glob(f"*@{_process_name(this_process().host, pid)}*"):
+        for file in folder.rglob("*"):
+            with suppress(FileNotFoundError):
+                if file.is_file() and not is_partial(file):
+                    youngest = max(youngest, file.stat().st_mtime_ns)
+    return youngest
+
+
+def _process_name(host: str, pid: int) -> str:
+    """How the name of a writer begins."""
+    return f"{host}-{pid}-"
 
 
 def _size(folder: Path) -> int:

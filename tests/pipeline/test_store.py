@@ -109,7 +109,7 @@ def test_leftovers_of_dead_writers_are_not_published(bench: Bench) -> None:
     bench.run(until="count")
     key = read_manifest(bench.folder / "count").key
     shutil.rmtree(bench.store / "count")
-    out = bench.store / "work" / key / "out"
+    out = bench.store / "work" / f"{key}@dead-1-0" / "out"
     (out / "numbers").mkdir(parents=True)
     (out / "numbers" / ".99.partial.1.txt").write_text("half")
     (out / MANIFEST).write_text("{}")

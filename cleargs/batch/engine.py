@@ -1,0 +1,158 @@
+"""Snakemake as the engine: found in an environment of its own, started once at a time for a batch."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+
+from cleargs.batch.folder import BatchFolder
+from cleargs.errors import InputError, StageError
+from cleargs.pipeline.lease import lease, living_holder
+
+ENGINE_VARIABLE = "CLEARGS_SNAKEMAKE"
+PROFILES = ("local", "slurm")
+LOOK_EVERY = 1.0
+"""Seconds between two looks at how far the scenes are."""
+REST = 10.0
+"""At least so many times as long as a look took: a thousand scenes are thousands of small files."""
+
+
+def find_snakemake() -> Path:
+    """The ``snakemake`` to use: $CLEARGS_SNAKEMAKE, ``.venv-cluster`` beside this environment, the PATH.
+
+    Raises InputError where there is none.
+    """
+    named = os.environ.get(ENGINE_VARIABLE)
+    if named:
+        if not os.access(named, os.X_OK):
+            raise InputError(
+                f"${ENGINE_VARIABLE} names {named}, which is no program",
+                hint="let it name the snakemake of an environment",
+            )
+        return Path(named)
+    beside = Path(sys.prefix).parent / ".venv-cluster" / "bin" / "snakemake"
+    on_path = shutil.which("snakemake")
+    if not beside.exists() and on_path is None:
+        raise InputError(
+            "Snakemake, which runs batches, is not installed",
+            hint="`make cluster` in the checkout, or install snakemake and its plugin executor-slurm in an "
+            f"environment of their own and let ${ENGINE_VARIABLE} name its snakemake",
+        )
+    return beside if beside.exists() else Path(str(on_path))
+
+
+def profile_folder(profile: str) -> Path:
+    """The folder of a profile: one that comes with ClearGS by name, or one of your own by path."""
+    folder = _workflows() / "profiles" / profile if profile in PROFILES else Path(profile).absolute()
+    if not (folder / "config.yaml").is_file():
+        raise InputError(
+            f"there is no profile {profile}",
+            hint=f"choose {' or '.join(PROFILES)}, or give a folder with a config.yaml",
+        )
+    return folder
+
+
+def is_local(profile: Path) -> bool:
+    """Whether ``profile`` is the one for this machine."""
+    return profile == _workflows() / "profiles" / "local"
+
+
+def engine_command(folder: BatchFolder, profile: Path, *, cores: int, dry_run: bool = False) -> list[str]:
+    """The call of Snakemake. ``cores`` bounds jobs on this machine and holds nothing back on a cluster."""
+    command = [str(find_snakemake()), "--snakefile", str(_workflows() / "Snakefile")]
+    command += ["--directory", str(folder.root), "--profile", str(profile), "--workflow-profile", "none"]
+    command += ["--cores", str(cores)] if is_local(profile) else []
+    return command + (["--dry-run", "--quiet"] if dry_run else [])
+
+
+@contextmanager
+def only_batch(folder: BatchFolder) -> Iterator[int]:
+    """Be the only batch at work in ``folder``; yields the lock's handle, which the engine is to inherit.
+
+    The lock lives as long as the engine, also where the command that started it was killed. Where the file
+    system has no locks, the lease tells. Raises StageError when another batch is at work.
+    """
+    folder.root.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder.root / "batch.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        busy = living_holder(folder.root / "batch.lease") is not None
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            busy = True
+        except OSError:
+            pass  # a file system without locks
+        if busy:
+            engine = os.pread(handle, 200, 0).decode()
+            raise StageError(
+                f"a batch of this sheet is at work already{f' ({engine})' if engine else ''}",
+                hint="watch it with cleargs batch-status; it may be interrupted, what is done is kept",
+            )
+        with lease(folder.root / "batch.lease"):
+            yield handle
+    finally:
+        os.close(handle)
+
+
+def run_engine(command: Sequence[str], folder: BatchFolder, lock: int, look: Callable[[], None]) -> int:
+    """Run Snakemake to its end, its words in the engine's log; ``look`` is called every now and then.
+
+    Returns its exit code. An interruption is passed on to it and all that it started here: it then takes back
+    what it gave to a cluster.
+    """
+    folder.engine_log.parent.mkdir(parents=True, exist_ok=True)
+    with folder.engine_log.open("ab") as log:
+        if _locked(folder):
+            # We are the only batch, so this lock was left by an engine that was killed.
+            subprocess.run(
+                [*command, "--unlock"], stdin=subprocess.DEVNULL, stdout=log, stderr=log, check=False
+            )
+        engine = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            pass_fds=(lock,),
+            start_new_session=True,  # so that a Ctrl-C reaches it once, from here
+        )
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, f"process {engine.pid} on {socket.gethostname()}".encode(), 0)
+        try:
+            pause = LOOK_EVERY
+            while not _ended(engine, pause):
+                begin = time.monotonic()
+                look()
+                pause = max(LOOK_EVERY, REST * (time.monotonic() - begin))
+        except KeyboardInterrupt:
+            os.killpg(engine.pid, signal.SIGINT)
+            raise
+    look()
+    return engine.returncode
+
+
+def _ended(engine: subprocess.Popen[bytes], seconds: float) -> bool:
+    """Whether the engine ended within ``seconds``."""
+    try:
+        engine.wait(seconds)
+        return True
+    except subprocess.TimeoutExpired:
+        return False
+
+
+def _locked(folder: BatchFolder) -> bool:
+    locks = folder.root / ".snakemake" / "locks"
+    return locks.is_dir() and any(locks.iterdir())
+
+
+def _workflows() -> Path:
+    return Path(str(files("cleargs.workflows")))

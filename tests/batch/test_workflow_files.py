@@ -1,0 +1,38 @@
+"""The files that Snakemake reads: installed with the package, and in step with the stages."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from cleargs.batch.resources import GPU_STAGES
+from cleargs.batch.watch import PATIENCE
+from cleargs.pipeline.dag import installed
+
+ROOT = Path(__file__).parents[2]
+SLURM = (ROOT / "workflows" / "profiles" / "slurm" / "config.yaml").read_text()
+
+
+def test_all_of_them_are_installed() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    patterns = settings["package-data"]["cleargs.workflows"]
+    installed_files = {file for pattern in patterns for file in (ROOT / "workflows").glob(pattern)}
+    there = {
+        file
+        for file in (ROOT / "workflows").rglob("*")
+        if file.is_file() and file.suffix not in (".py", ".pyc")
+    }
+    assert there == installed_files
+
+
+def test_the_stages_that_use_a_gpu_are_one_job() -> None:
+    """They follow each other: what leaves the group and comes back would make Snakemake see a circle."""
+    grouped = re.findall(r"(\w+)=scene", SLURM)
+    names = installed().names
+    assert tuple(grouped) == GPU_STAGES == names[names.index(grouped[0]) :]
+
+
+def test_the_warning_leaves_time_for_a_checkpoint() -> None:
+    found = re.search(r"--signal=TERM@(\d+)", SLURM)
+    assert found is not None and int(found[1]) >= PATIENCE + 20
