@@ -103,7 +103,6 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         use_observation=config.use_observation,
         prefer_sharper=config.prefer_sharper,
     )
-    restored.prepare(targets, reporter)
 
     g0 = current = Snapshot(context.inputs["g0"])
     rows, repairs, trainings = [], [], []

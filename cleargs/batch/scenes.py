@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -17,6 +17,7 @@ from cleargs.batch.sheet import Problem, Row, SheetError, read_rows
 from cleargs.errors import InputError
 from cleargs.pipeline.config import Config, Document, check_document, merge, read_recipe
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.keys import settings as flat
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 FIELDS = ("name", "input", "recipe", "set", "resources")
@@ -108,7 +109,7 @@ class _Checker:
             self._note(row.line_of("recipe"), _said(document))
             return None
         wrong = False
-        for name, value in _leaves(settings):
+        for name, value in flat(settings):
             try:
                 check_document(self.dag, merge(document, _nested(name, value)))
             except InputError as error:
@@ -117,7 +118,7 @@ class _Checker:
         if wrong:
             return None
         whole = document
-        for name, value in _leaves(settings):
+        for name, value in flat(settings):
             whole = merge(whole, _nested(name, value))
         try:
             return check_document(self.dag, whole)
@@ -156,15 +157,6 @@ class _Checker:
 
 def _said(error: InputError) -> str:
     return f"{error}; {error.hint}"
-
-
-def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of each setting in nested tables."""
-    for name, value in table.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
 
 
 def _nested(name: str, value: Any) -> Document:

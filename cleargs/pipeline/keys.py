@@ -92,7 +92,7 @@ def differences(
     lines = []
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
-    old_settings, new_settings = dict(_flat(old.config)), dict(_flat(new.config))
+    old_settings, new_settings = dict(settings(old.config)), dict(settings(new.config))
     for name in sorted(old_settings.keys() | new_settings.keys()):
         before, after = old_settings.get(name, "(none)"), new_settings.get(name, "(none)")
         if before != after:
@@ -121,10 +121,11 @@ def _input_digests(parts: KeyParts) -> dict[str, str | None]:
     }
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of each setting in nested tables."""
     for name, value in config.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from settings(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from cleargs.errors import StoreError
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
-from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image, Source
 from cleargs.rva.blur import detail_ratios
 from cleargs.rva.degradations import noise_level
@@ -18,7 +17,7 @@ from cleargs.splat.views import Mask, View
 
 
 class Restorations:
-    """D_t of every target frame. That of a raw frame is made once and kept in ``cache``."""
+    """D_t of target frames. That of a raw frame is made when it is first asked for and kept in ``cache``."""
 
     def __init__(
         self,
@@ -33,26 +32,24 @@ class Restorations:
         self._use_observation = use_observation
         self._prefer_sharper = prefer_sharper
 
-    def prepare(self, targets: Sequence[View], reporter: Reporter) -> None:
-        """Restore the raw frames of ``targets`` before the rounds; what is there is kept."""
-        if not self._use_observation:
-            return
-        self._cache.mkdir(exist_ok=True)
-        with reporter.task("restoring", total=len(targets)) as task:
-            for view in targets:
-                if not _readable(self._path(view)):
-                    restored = to_layer(self._restore(observation(view)[0]))
-                    write_exr(self._path(view), LayeredImage({"restored": restored}, {}))
-                task.advance()
-
     def __call__(self, view: View, render: Image) -> tuple[Image, Source]:
         """D_t in the light of the render R_t, and what it was made from."""
-        if not self._use_observation or (self._prefer_sharper and shows_more(render, *observation(view))):
+        if not self._use_observation:
             return self._restore(render), "render"
-        return from_layer(read_exr(self._path(view)).layers["restored"]), "observation"
+        observed, mask = observation(view)
+        if self._prefer_sharper and shows_more(render, observed, mask):
+            return self._restore(render), "render"
+        return self._restored_observation(view, observed), "observation"
 
-    def _path(self, view: View) -> Path:
-        return self._cache / f"{view.frame_id:06d}.exr"
+    def _restored_observation(self, view: View, observed: Image) -> Image:
+        """As the cache gives it back, so that every round and every resumed run has the same bits."""
+        path = self._cache / f"{view.frame_id:06d}.exr"
+        try:
+            return from_layer(read_exr(path).layers["restored"])
+        except StoreError:  # not made yet, or not whole
+            self._cache.mkdir(exist_ok=True)
+            write_exr(path, LayeredImage({"restored": to_layer(self._restore(observed))}, {}))
+            return from_layer(read_exr(path).layers["restored"])
 
 
 def shows_more(render: Image, observed: Image, mask: Mask | None) -> bool:
@@ -77,11 +74,3 @@ def _detail(image: Image, mask: Mask | None) -> float:
     luminance = reduce_luminance(levels, None if mask is None else mask.astype(np.uint8))
     noise = noise_level(luminance.reduced, luminance.valid)
     return float(detail_ratios(luminance.reduced, luminance.valid, noise).mean())
-
-
-def _readable(path: Path) -> bool:
-    try:
-        read_exr(path)
-    except StoreError:
-        return False
-    return True
