@@ -1,5 +1,6 @@
 # make demo   a synthetic capture through all five stages
 # make test   the whole test suite
+# make test-gpu-kernels   the GPU kernels, without a GPU: in Triton's interpreter, and compiled ahead of time
 # make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
 # make test-convert  the tests of those conversions
 # make cluster       .venv-cluster, the Snakemake that `cleargs batch` uses
@@ -11,13 +12,16 @@ PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c cons
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test lint convert-env test-convert cluster clean
+.PHONY: demo test test-gpu-kernels lint convert-env test-convert cluster clean
 
 demo: .venv/demo.stamp demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
 
 test: .venv/test.stamp
 	$(BIN)/python -m pytest
+
+test-gpu-kernels: .venv/cuda.stamp
+	TRITON_INTERPRET=1 $(BIN)/python -m pytest tests/gpu
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .
@@ -51,6 +55,11 @@ demo/capture/transforms.json: | .venv/demo.stamp
 
 .venv/test.stamp: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP) -e '.[test]'
+	touch $@
+
+# The Triton that the tests passed with; a CPU build of PyTorch leaves the choice open.
+.venv/cuda.stamp: Makefile pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) -e '.[test,cuda]' 'triton==3.8.*'
 	touch $@
 
 .venv/dev.stamp: pyproject.toml constraints.txt | .venv/bin/python

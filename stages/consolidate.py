@@ -67,6 +67,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Latest accepted repairs -> distillation from RIVR's scene -> the check for harm."""
+    from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.gates import judge_harm
@@ -81,12 +82,12 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     rivr = context.inputs["rivr"]
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
-    scorer = load_scorer(config.scorer)
+    scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     repairs = latest_accepted(read_selection(rivr / "selection.parquet"))
     write_repairs(context.out / "repairs.parquet", repairs)
 
-    g0 = Snapshot(context.inputs["g0"])
-    start = Snapshot(rivr) if repairs else g0
+    g0 = Snapshot(context.inputs["g0"], context.device)
+    start = Snapshot(rivr, context.device) if repairs else g0
     consolidated, trainings = start, []
     if repairs:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
@@ -97,7 +98,6 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             seed=(context.seed, _STREAM),
             label="consolidating",
             round=0,
-            device=context.device,
             reporter=reporter,
         )
         trainings.append(consolidated)

@@ -91,8 +91,9 @@ def run(context: StageContext[G0Config]) -> StageResult:
     write_exposure(context.out / "exposure.parquet", learned)
     save_state(context.out / "state.safetensors", trained.state)
 
+    on_device = trained.scene.to(context.device)
     psnr = dict(
-        zip((view.frame_id for view in views), evaluate_views(trained.scene, views, learned), strict=True)
+        zip((view.frame_id for view in views), evaluate_views(on_device, views, learned), strict=True)
     )
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(

@@ -72,6 +72,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 def run(context: StageContext[RivrConfig]) -> StageResult:
     """Candidates -> scores -> choice -> distillation, for every round; then the check for harm."""
     from cleargs.models.expert import load_expert
+    from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.gates import judge_harm
@@ -87,10 +88,11 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
     targets = supervision.targets(config.targets)
-    expert = load_expert(config.expert)
+    networks_on = network_device(context.device, reporter.warn)
+    expert = load_expert(config.expert, networks_on)
     rules = Rules(
-        primary=load_scorer(config.primary_scorer),
-        tiebreak=load_scorer(config.tiebreak_scorer),
+        primary=load_scorer(config.primary_scorer, networks_on),
+        tiebreak=load_scorer(config.tiebreak_scorer, networks_on),
         margin=config.margin,
         fuse_sigma=config.fuse_sigma,
         use_fused=config.use_fused,
@@ -104,7 +106,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         prefer_sharper=config.prefer_sharper,
     )
 
-    g0 = current = Snapshot(context.inputs["g0"])
+    g0 = current = Snapshot(context.inputs["g0"], context.device)
     rows, repairs, trainings = [], [], []
     for number in range(1, config.rounds + 1):
         found = run_round(number, targets, current.render, restored, rules, context.out, reporter)
@@ -120,7 +122,6 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
                 seed=(context.seed, _STREAM, number),
                 label=f"round {number}: distilling",
                 round=number,
-                device=context.device,
                 reporter=reporter,
             )
             trainings.append(current)

@@ -4,5 +4,6 @@
 ``oracle`` gives the errors, ``torch_tiles``, ``torch_flat`` and ``prototype`` are what it is compared with,
 ``peaks``, ``work`` and ``roofline`` say what the machine could do, ``memory`` asks a process of its own,
 ``scaling`` fits lines. ``benchmark`` runs a ``plan``; ``markdown`` and ``pictures`` show its ``results``.
+``device`` runs a plan for a GPU beside ``gsplat_cuda``, ``device_markdown`` shows what it found.
 Nothing here is needed to make a scene.
 """

@@ -34,13 +34,13 @@ class Iteration:
     Adam's rate is 0: it does all its work, and the scene stays the one whose error is measured.
     """
 
-    def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
-        self.gaussians = gaussians
+    def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device | str = "cpu") -> None:
+        self.gaussians = gaussians.to(device)
         self.camera = camera
-        self.engine = Engine()
-        self._target = random_image(camera.width, camera.height)
+        self.engine = Engine(device)
+        self._target = random_image(camera.width, camera.height).to(device)
         self._slope = torch.empty_like(self._target)
-        tensors = gaussians.tensors()
+        tensors = self.gaussians.tensors()
         self._first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self._second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self._step = 0
@@ -52,11 +52,9 @@ class Iteration:
             with clock.time("forward"):
                 render = self.engine.forward(self.gaussians, self.camera)
             with clock.time("loss"):
-                loss = photometric_loss(
-                    render.image, self._target, ssim_lambda=SSIM_LAMBDA, gradient=self._slope
-                )
+                slope = self.differentiate(render.image)
             with clock.time("backward"):
-                gradients = self.engine.backward(loss.grad_image).tensors()
+                gradients = self.engine.backward(slope).tensors()
             with clock.time("adam"):
                 for name, tensor in self.gaussians.tensors().items():
                     adam_step(
@@ -68,6 +66,10 @@ class Iteration:
                         lr=0.0,
                     )
 
+    def differentiate(self, image: Tensor) -> Tensor:
+        """The gradient of the loss by the image [H, W, 3]."""
+        return photometric_loss(image, self._target, ssim_lambda=SSIM_LAMBDA, gradient=self._slope).grad_image
+
     def run_on(self, threads: int, repetitions: int, clock: Clock) -> None:
         """Several iterations on so many threads, every kernel timed as well."""
         use_threads(threads)
@@ -76,9 +78,11 @@ class Iteration:
                 self.run(clock)
 
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
-        """Copies of the rendered image [H, W, 3] and of the gradients for dL/d(image) [H, W, 3]."""
+        """Copies, on the CPU, of the rendered image [H, W, 3] and of the gradients for dL/d(image)
+        [H, W, 3]."""
         image = self.engine.forward(self.gaussians, self.camera).image.clone()
-        return image, self.engine.backward(grad_image).clone()
+        gradients = self.engine.backward(grad_image.to(image.device)).clone()
+        return image.cpu(), gradients.to("cpu")
 
 
 class _OpenRasteriser(CpuRasteriser):

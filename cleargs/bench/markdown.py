@@ -44,7 +44,7 @@ def milliseconds(value: Quartiles) -> str:
     return f"{value.median:.{digits}f} [{value.low:.{digits}f} {value.high:.{digits}f}]"
 
 
-def _megabytes(size: int | None) -> str:
+def megabytes(size: int | None) -> str:
     return UNKNOWN if size is None else f"{size / 1e6:.0f}"
 
 
@@ -67,7 +67,7 @@ def _iterations(rows: list[Row]) -> list[str]:
             str(threads),
             f"{row.pairs:,}",
             *(milliseconds(times[part]) for part in (*PARTS, WHOLE)),
-            _megabytes(row.memory),
+            megabytes(row.memory),
             f"{row.accuracy.image.max:.1e}",
             f"{row.accuracy.worst_gradient:.1e}",
         ]
@@ -85,7 +85,7 @@ def _iterations(rows: list[Row]) -> list[str]:
 
 
 def _errors(rows: list[Row]) -> list[str]:
-    lines = [[row.case.title, *_accuracy_cells(row.accuracy)] for row in rows]
+    lines = [[row.case.title, *accuracy_cells(row.accuracy)] for row in rows]
     left_out = max(row.accuracy.left_out_max for row in rows)
     seeds = ", ".join(sorted({str(row.accuracy.seed) for row in rows}))
     return [
@@ -100,7 +100,7 @@ def _errors(rows: list[Row]) -> list[str]:
     ]
 
 
-def _accuracy_cells(found: Accuracy) -> list[str]:
+def accuracy_cells(found: Accuracy) -> list[str]:
     return [
         _error(found.image),
         *(_error(found.gradients[group]) for group in GROUPS),
@@ -162,8 +162,8 @@ def _prototype(found: Comparison | None) -> list[str]:
         table(
             ["", "image", *GROUPS, "pixels", "not compared", "splats seen"],
             [
-                ["ours", *_accuracy_cells(found.accuracy)],
-                ["prototype", *_accuracy_cells(found.prototype_accuracy)],
+                ["ours", *accuracy_cells(found.accuracy)],
+                ["prototype", *accuracy_cells(found.prototype_accuracy)],
             ],
         ),
     ]
@@ -224,7 +224,7 @@ def _scaling(series: dict[str, list[ScalingPoint]], threads: int) -> list[str]:
                 f"{point.pairs:,}",
                 milliseconds(point.milliseconds),
                 f"{1e6 * point.milliseconds.median / point.pairs:.0f}",
-                _megabytes(point.memory),
+                megabytes(point.memory),
                 UNKNOWN if point.memory is None else f"{point.memory / point.pairs:.0f}",
             ]
             for point in points

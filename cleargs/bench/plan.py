@@ -51,6 +51,28 @@ class Plan:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class DevicePlan:
+    """A benchmark of a GPU."""
+
+    cases: tuple[Case, ...]
+    rounds: int = 7
+    repetitions: int = 10  # iterations a round
+    seed: int = 0
+
+
+def device_plan() -> DevicePlan:
+    """100,000 to 3,000,000 splats, 1280x720 and 1920x1080."""
+    counts = (100_000, 500_000, 1_000_000, 3_000_000)
+    sizes = ((1280, 720), (1920, 1080))
+    return DevicePlan(tuple(Case(count, *size) for size in sizes for count in counts))
+
+
+def quick_device_plan() -> DevicePlan:
+    """Two small cases: to try the command, not to quote."""
+    return DevicePlan((Case(4_000, 160, 90), Case(20_000, 320, 180)), rounds=3, repetitions=3)
+
+
 def full_plan(threads: tuple[int, ...], prototype: Path | None = None) -> Plan:
     """10,000 to 400,000 splats, 320x180 to 1280x720."""
     counts = (10_000, 50_000, 200_000, 400_000)

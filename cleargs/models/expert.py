@@ -6,7 +6,7 @@ Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embed
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
@@ -14,9 +14,10 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError, StageError
+from cleargs.models.batches import in_batches
 from cleargs.models.installed import installable, installed_file, verify
-from cleargs.models.onnx import OnnxModel
-from cleargs.models.tiling import Image, apply_tiled
+from cleargs.models.onnx import Device, OnnxModel
+from cleargs.models.tiling import Image, apply_tiled, map_tiled
 
 EMBEDDED = "embedded"
 """The name under which settings ask for the expert that ships with ClearGS."""
@@ -43,7 +44,7 @@ class Expert(Protocol):
 
 
 class OnnxExpert:
-    """A restoration network in an ONNX file, run on overlapping tiles.
+    """A restoration network in an ONNX file, run on overlapping tiles: on a GPU on several at a time.
 
     The model takes one image as [1, 3, H, W] or [1, H, W, 3] float32 in [0, 1] and returns one of the same
     size in either layout; of several outputs the first counts. Sides that the model fixes become the tiles'.
@@ -51,8 +52,8 @@ class OnnxExpert:
     Raises InputError when the file is missing, no ONNX model, or of another form.
     """
 
-    def __init__(self, path: Path, name: str | None = None) -> None:
-        model = OnnxModel(path)
+    def __init__(self, path: Path, name: str | None = None, device: Device = "cpu") -> None:
+        model = OnnxModel(path, device)
         shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
         if len(shape) != 4 or shape[0] not in (None, 1) or 3 not in (shape[1], shape[3]):
             raise InputError(
@@ -65,6 +66,8 @@ class OnnxExpert:
                 hint="export the model in float32",
             )
         self._model = model
+        self._batches = model.takes_batches
+        self._calls = 1 if model.device == "cuda" else None  # at once; None: as many as threads
         self._channels_first = shape[1] == 3
         self._fixed = (shape[2], shape[3]) if self._channels_first else (shape[1], shape[2])
         self.name = name or path.stem
@@ -78,7 +81,13 @@ class OnnxExpert:
         self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
     ) -> Image:
         """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
-        restored = apply_tiled(self._restore_tile, image, fixed=self._fixed, threads=threads, on_tile=on_tile)
+        if self._batches:
+            restored = map_tiled(self._restore_in_batches, image, fixed=self._fixed, on_tile=on_tile)
+        else:
+            calls = self._calls or threads
+            restored = apply_tiled(
+                self._restore_tile, image, fixed=self._fixed, threads=calls, on_tile=on_tile
+            )
         if not np.isfinite(restored).all():
             raise StageError(
                 f"the restoration expert {self.name} returned values that are not finite",
@@ -87,12 +96,21 @@ class OnnxExpert:
         return np.clip(restored, np.float32(0.0), np.float32(1.0))
 
     def _restore_tile(self, tile: Image) -> Image:
-        batch = tile.transpose(2, 0, 1)[None] if self._channels_first else tile[None]
+        restored: Image = self._restore_batch(tile[None])[0]
+        return restored
+
+    def _restore_in_batches(self, tiles: Sequence[Image]) -> Sequence[Image]:
+        height, width = tiles[0].shape[:2]
+        return in_batches(self._restore_batch, tiles, height * width)
+
+    def _restore_batch(self, tiles: Image) -> Image:
+        """Tiles [N, h, w, 3], restored."""
+        batch = tiles.transpose(0, 3, 1, 2) if self._channels_first else tiles
         output = self._model.run(np.ascontiguousarray(batch, np.float32))[0]
-        restored = output[0].transpose(1, 2, 0) if output.ndim == 4 and output.shape[1] == 3 else output[0]
-        if restored.shape != tile.shape:
+        restored = output.transpose(0, 2, 3, 1) if output.ndim == 4 and output.shape[1] == 3 else output
+        if restored.shape != tiles.shape:
             raise InputError(
-                f"the restoration expert {self.name} maps {tile.shape} to {output.shape}",
+                f"the restoration expert {self.name} maps {tiles.shape} to {output.shape}",
                 hint="a restoration model returns an image of the same size",
             )
         return np.asarray(restored, np.float32)
@@ -109,10 +127,10 @@ def expert_path(spec: str) -> Path:
     return installed_file(spec, "expert") or Path(spec).absolute()
 
 
-def load_expert(spec: str) -> Expert:
-    """The expert named by ``spec`` (see `expert_path`). Raises InputError as `OnnxExpert` does, and where an
-    installed file is not what was installed."""
+def load_expert(spec: str, device: Device = "cpu") -> Expert:
+    """The expert named by ``spec`` (see `expert_path`), on what `network_device` found. Raises InputError as
+    `OnnxExpert` does, and where an installed file is not what was installed."""
     path = expert_path(spec)
     if model := installable(spec, "expert"):
         verify(model, path.parent)
-    return OnnxExpert(path, name=spec if spec == EMBEDDED or model else None)
+    return OnnxExpert(path, name=spec if spec == EMBEDDED or model else None, device=device)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from cleargs.errors import InputError
-from cleargs.models.onnx import OnnxModel
+from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.tile_mean import MIN_SIDE, Image
 
 PATCH = 32
@@ -30,8 +30,8 @@ class MusiqScorer:
     Raises InputError when the file is missing or of another form.
     """
 
-    def __init__(self, path: Path, name: str = "musiq") -> None:
-        model = OnnxModel(path)
+    def __init__(self, path: Path, name: str = "musiq", device: Device = "cpu") -> None:
+        model = OnnxModel(path, device)
         if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
             raise InputError(
                 f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",

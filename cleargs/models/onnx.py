@@ -1,22 +1,58 @@
-"""ONNX models on onnxruntime's CPU provider, one thread a call: results never depend on the thread count.
+"""ONNX models on onnxruntime: on the CPU one thread a call, so that results never depend on the thread count.
 
 Parallelism is the caller's: `OnnxModel.run` may be called from several threads at once (for instance one
-image tile each), and every call computes the same bits.
+image tile each), and every call computes the same bits. On a GPU one caller gives it several tiles at once.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.resources import files
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+
+Device = Literal["cpu", "cuda"]
+
+CUDA_PROVIDER = "CUDAExecutionProvider"
+
+_CUDA_OPTIONS = {
+    "use_tf32": "0",  # ten bits of mantissa would be too few to compare scores by
+    "cudnn_conv_algo_search": "HEURISTIC",  # a search by time may end with another algorithm each time
+    "arena_extend_strategy": "kSameAsRequested",  # the splatting shares the GPU's memory
+}
+
+
+def network_device(device: Device, warn: Callable[[str], None]) -> Device:
+    """Where onnxruntime can run the networks of work on ``device``.
+
+    That is the GPU only where onnxruntime's CUDA provider is there and loads; where not, ``warn`` is told
+    why, once, and the CPU serves.
+    """
+    if device == "cpu":
+        return "cpu"
+    import onnxruntime
+
+    if CUDA_PROVIDER not in onnxruntime.get_available_providers():
+        warn("experts and scorers run on the CPU: onnxruntime has no CUDA provider (onnxruntime-gpu has)")
+        return "cpu"
+    if hasattr(onnxruntime, "preload_dlls"):
+        with redirect_stdout(StringIO()):
+            onnxruntime.preload_dlls()  # finds the libraries of CUDA that came with PyTorch
+    probe = Path(str(files("cleargs.models"))) / "weights" / "scorer.onnx"
+    if OnnxModel(probe, device).device == "cpu":
+        warn("experts and scorers run on the CPU: onnxruntime's CUDA provider does not load")
+        return "cpu"
+    return "cuda"
 
 
 @dataclass(frozen=True)
@@ -29,12 +65,12 @@ class TensorInfo:
 
 
 class OnnxModel:
-    """An ONNX file ready to run on the CPU.
+    """An ONNX file ready to run, on the CPU where the GPU's provider does not load (see `network_device`).
 
     Raises InputError when the file is missing or not an ONNX model that onnxruntime can run.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, device: Device = "cpu") -> None:
         import onnxruntime
 
         if not path.is_file():
@@ -45,7 +81,9 @@ class OnnxModel:
         options.use_deterministic_compute = True
         options.log_severity_level = 3
         try:
-            session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            session = _cuda_session(path, options) if device == "cuda" else None
+            if session is None:
+                session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's exceptions share no base class of their own
             reason = str(error).strip().splitlines()[0]
             raise InputError(
@@ -53,9 +91,15 @@ class OnnxModel:
                 hint="export the model again as a single ONNX file with standard operators",
             ) from error
         self.path = path
+        self.device: Device = "cuda" if CUDA_PROVIDER in session.get_providers() else "cpu"
         self.inputs = _describe(session.get_inputs())
         self.outputs = _describe(session.get_outputs())
         self._session: Any = session
+
+    @property
+    def takes_batches(self) -> bool:
+        """Whether several items a call are possible, and worth it: on a GPU, where the first axis is free."""
+        return self.device == "cuda" and all(info.shape[:1] == (None,) for info in self.inputs)
 
     @cached_property
     def digest(self) -> str:
@@ -68,6 +112,18 @@ class OnnxModel:
         feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
         outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
         return outputs
+
+
+def _cuda_session(path: Path, options: Any) -> Any:
+    """A session on the GPU; None where that fails, be it for the provider or for the model."""
+    import onnxruntime
+
+    providers = [(CUDA_PROVIDER, _CUDA_OPTIONS), "CPUExecutionProvider"]
+    try:
+        with redirect_stdout(StringIO()):  # onnxruntime prints on stdout that a provider does not load
+            return onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception:  # onnxruntime's exceptions share no base class of their own
+        return None
 
 
 def _describe(arguments: Sequence[Any]) -> tuple[TensorInfo, ...]:

@@ -16,11 +16,12 @@ from typing import Protocol
 import numpy as np
 
 from cleargs.errors import InputError
+from cleargs.models.batches import in_batches
 from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
-from cleargs.models.onnx import OnnxModel
+from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.registry import load_registry
-from cleargs.models.tile_mean import Image, mean_over_tiles
+from cleargs.models.tile_mean import Image, cover, mean_over_tiles
 
 CLARITY = "clarity-net"
 """The embedded network, meant for the primary role."""
@@ -58,8 +59,10 @@ class LearnedScorer:
     Raises InputError when the file is missing, no ONNX model, or of another form.
     """
 
-    def __init__(self, path: Path, name: str | None = None, tile: int | None = None) -> None:
-        model = OnnxModel(path)
+    def __init__(
+        self, path: Path, name: str | None = None, tile: int | None = None, device: Device = "cpu"
+    ) -> None:
+        model = OnnxModel(path, device)
         shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
         takes_images = len(shape) == 4 and shape[0] in (None, 1) and shape[1] == 3
         if not takes_images or len(model.outputs[0].shape) > 2:
@@ -70,6 +73,7 @@ class LearnedScorer:
             )
         self.name = name or path.stem
         self._model = model
+        self._batches = model.takes_batches
         self._tile = (shape[2] or tile, shape[3] or tile)
 
     @property
@@ -79,11 +83,21 @@ class LearnedScorer:
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """See Scorer."""
-        return mean_over_tiles(self._score_tile, image, self._tile, threads)
+        if self._batches:
+            tiles = cover(image, self._tile)
+            height, width = tiles[0].shape[:2]
+            scores = in_batches(self._score_batch, tiles, height * width)
+            return float(np.mean(scores, dtype=np.float64))
+        calls = 1 if self._model.device == "cuda" else threads
+        return mean_over_tiles(self._score_tile, image, self._tile, calls)
 
     def _score_tile(self, tile: Image) -> float:
-        planes = np.ascontiguousarray(tile.transpose(2, 0, 1)[None], np.float32)
-        return float(self._model.run(planes)[0].ravel()[0])
+        return float(self._score_batch(tile[None])[0])
+
+    def _score_batch(self, tiles: Image) -> Image:
+        """The scores [N] of tiles [N, h, w, 3]."""
+        planes = np.ascontiguousarray(tiles.transpose(0, 3, 1, 2), np.float32)
+        return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
 
 
 def scorer_path(spec: str) -> Path | None:
@@ -102,9 +116,9 @@ def scorer_path(spec: str) -> Path | None:
     return installed_file(spec, "scorer")
 
 
-def load_scorer(spec: str) -> Scorer:
+def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
     """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, one of the registry that is
-    installed, or the path of an ONNX file.
+    installed, or the path of an ONNX file; networks on what `network_device` found.
 
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
@@ -121,6 +135,8 @@ def load_scorer(spec: str) -> Scorer:
         if model.converter == "musiq":
             from cleargs.models.musiq import MusiqScorer  # torch, which naming a scorer must not import
 
-            return MusiqScorer(path, spec)
-        return LearnedScorer(path, spec)
-    return LearnedScorer(path, CLARITY, _TRAINED_ON) if spec == CLARITY else LearnedScorer(path)
+            return MusiqScorer(path, spec, device)
+        return LearnedScorer(path, spec, device=device)
+    if spec == CLARITY:
+        return LearnedScorer(path, CLARITY, _TRAINED_ON, device)
+    return LearnedScorer(path, device=device)

@@ -26,6 +26,20 @@ def mean_over_tiles(
 
     ``sides`` are the height and width of a tile, None for the whole side; a smaller image is one tile in that
     direction. The mean is taken in the tiles' order, so it does not depend on ``threads``.
+    Raises InputError as `cover` does.
+    """
+    tiles = cover(image, sides)
+    if threads == 1 or len(tiles) == 1:
+        figures = [figure(tile) for tile in tiles]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            figures = list(pool.map(figure, tiles))
+    return float(np.mean(figures, dtype=np.float64))
+
+
+def cover(image: Image, sides: tuple[int | None, int | None]) -> list[Image]:
+    """The tiles, all of one size.
+
     Raises InputError for anything but a colour image of at least 32 pixels on each side.
     """
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
@@ -33,17 +47,11 @@ def mean_over_tiles(
             f"an image of shape {image.shape} cannot be scored",
             hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
         )
-    tiles = [
+    return [
         image[row, column]
         for row in _windows(image.shape[0], sides[0])
         for column in _windows(image.shape[1], sides[1])
     ]
-    if threads == 1 or len(tiles) == 1:
-        figures = [figure(tile) for tile in tiles]
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            figures = list(pool.map(figure, tiles))
-    return float(np.mean(figures, dtype=np.float64))
 
 
 def _windows(length: int, tile: int | None) -> list[slice]:

@@ -7,7 +7,7 @@ result is bitwise the same for any number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -83,8 +83,25 @@ def apply_tiled(
     """The function's result on the whole image [H, W, 3], computed on tiles.
 
     function: maps a tile [h, w, 3] to one of the same shape; several threads may call it at once.
-    fixed: height and width of the tiles where the function accepts only these.
     threads: tiles computed at once.
+
+    For the rest see `map_tiled`.
+    """
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        return map_tiled(lambda tiles: pool.map(function, tiles), image, fixed=fixed, on_tile=on_tile)
+
+
+def map_tiled(
+    function: Callable[[Sequence[Image]], Iterable[Image]],
+    image: Image,
+    *,
+    fixed: tuple[int | None, int | None] = (None, None),
+    on_tile: Callable[[int, int], None] | None = None,
+) -> Image:
+    """The function's result on the whole image [H, W, 3], computed on tiles that it is given together.
+
+    function: maps tiles [h, w, 3], all of one size, to as many of the same size, in their order.
+    fixed: height and width of the tiles where the function accepts only these.
     on_tile: called with (done, total) after each tile, in the caller's thread.
 
     The image is padded by reflection at its right and bottom sides where it has to be.
@@ -100,11 +117,10 @@ def apply_tiled(
         return slice(y, y + rows.size), slice(x, x + columns.size)
 
     result = np.zeros_like(padded)
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        tiles = pool.map(lambda place: function(padded[cut(*place)]), places)
-        for done, ((row, column), tile) in enumerate(zip(places, tiles, strict=True), start=1):
-            weight = rows.windows[row][:, None, None] * columns.windows[column][None, :, None]
-            result[cut(row, column)] += weight * tile
-            if on_tile is not None:
-                on_tile(done, len(places))
+    tiles = function([padded[cut(*place)] for place in places])
+    for done, ((row, column), tile) in enumerate(zip(places, tiles, strict=True), start=1):
+        weight = rows.windows[row][:, None, None] * columns.windows[column][None, :, None]
+        result[cut(row, column)] += weight * tile
+        if on_tile is not None:
+            on_tile(done, len(places))
     return np.ascontiguousarray(result[:height, :width])

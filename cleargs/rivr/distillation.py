@@ -32,11 +32,12 @@ REJECTED = "rejected.ply"
 class Snapshot:
     """A scene on disk (``scene.ply`` and ``exposure.parquet`` in ``folder``), ready to be rendered."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, device: str = "cpu") -> None:
         self.folder = folder
-        self.scene = read_ply(folder / SCENE)
+        self._device = device
+        self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
-        self._engine = Engine()
+        self._engine = Engine(device)
 
     @property
     def exposure(self) -> Exposure | None:
@@ -63,7 +64,6 @@ class Snapshot:
         seed: Sequence[int],
         label: str,
         round: int,
-        device: str,
         reporter: Reporter,
     ) -> Snapshot:
         """This scene after training with fresh Adam moments on raw and repaired views, kept in ``folder``.
@@ -84,13 +84,13 @@ class Snapshot:
                 reporter=reporter,
                 label=label,
                 round=round,
-                device=device,
+                device=self._device,
             )
             write_table(folder / LOG, result.rows, TRAIN)
             save_state(folder / STATE, result.state)
             write_exposure(folder / EXPOSURE, result.exposure or self._written_exposure)
             write_ply(folder / SCENE, result.scene)  # last: it says that the training is done
-        return Snapshot(folder)
+        return Snapshot(folder, self._device)
 
 
 def publish(snapshot: Snapshot, trainings: Sequence[Snapshot], out: Path, rejected: Snapshot | None) -> None:

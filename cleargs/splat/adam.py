@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from cleargs.errors import InputError
+from cleargs.splat.kernels.cuda import support
 
 BLOCK = 4096
 """Elements per work item, about."""
@@ -26,30 +27,41 @@ def adam_step(
 ) -> None:
     """One dense Adam step, ``parameter`` and the moments updated in place.
 
-    The four tensors are contiguous float32 of one shape; ``step`` counts from 1. ``lr`` is one rate, or a
-    tensor with one rate per column of ``parameter.reshape(len(parameter), -1)``. Same arithmetic as
-    ``torch.optim.Adam`` without weight decay: p -= lr / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + eps).
+    The four tensors are contiguous float32 of one shape on one device; ``step`` counts from 1. ``lr`` is one
+    rate, or a tensor with one rate per column of ``parameter.reshape(len(parameter), -1)``. Same arithmetic
+    as ``torch.optim.Adam`` without weight decay: p -= lr / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + eps).
 
     Raises:
         InputError: when the tensors do not fit together.
     """
     tensors = (parameter, gradient, first_moment, second_moment)
     for tensor in tensors:
-        if tensor.shape != parameter.shape or not tensor.is_contiguous() or tensor.device.type != "cpu":
+        if (
+            tensor.shape != parameter.shape
+            or not tensor.is_contiguous()
+            or tensor.device != parameter.device
+            or tensor.device.type not in ("cpu", "cuda")
+        ):
             raise InputError(
-                f"Adam got tensors of the shapes {[tuple(t.shape) for t in tensors]}",
-                hint="give four contiguous CPU tensors of one shape",
+                f"Adam got tensors of the shapes {[tuple(t.shape) for t in tensors]} "
+                f"on {sorted({str(t.device) for t in tensors})}",
+                hint="give four contiguous tensors of one shape, all on the CPU or all on one GPU",
             )
     if parameter.numel() == 0:
         return
+    columns = parameter.numel() // len(parameter)
+    given = lr.numel() if isinstance(lr, Tensor) else 1
+    if given not in (1, columns):
+        raise InputError(f"{given} learning rates for {columns} columns", hint="give one, or one per column")
+    if support.on_gpu(parameter.device):
+        from cleargs.splat.kernels.cuda import adam as gpu_adam
+
+        rates_on_gpu = gpu_adam.rates_tensor(lr, parameter.device)
+        gpu_adam.adam_step(*tensors, rates_on_gpu, step=step, betas=betas, eps=eps)
+        return
     from cleargs.splat.kernels.cpu import adam, launch
 
-    columns = parameter.numel() // len(parameter)
     rates = np.asarray(lr, np.float64).reshape(-1)
-    if rates.size not in (1, columns):
-        raise InputError(
-            f"{rates.size} learning rates for {columns} columns", hint="give one, or one per column"
-        )
     beta1, beta2 = betas
     corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
     flat = [tensor.detach().view(-1).numpy() for tensor in tensors]

@@ -11,6 +11,7 @@ from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda import support
 
 
 class Render(NamedTuple):
@@ -46,8 +47,13 @@ def rasteriser_for(device: torch.device) -> Rasteriser:
     """The back end for a device.
 
     Raises:
-        InputError: when there is none.
+        InputError: when there is none, or when it cannot run here.
     """
+    if support.on_gpu(device):
+        support.require(device)
+        from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
+
+        return CudaRasteriser(device)
     if device.type == "cpu":
         from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 
@@ -75,7 +81,7 @@ class Engine:
     """Renders float32 Gaussians and differentiates the picture, with buffers kept from call to call.
 
     Everything returned is a view into these buffers and valid until the next call of the same method.
-    Results are bitwise the same for any number of threads.
+    Results are bitwise the same for any number of threads, and from run to run on one GPU.
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:

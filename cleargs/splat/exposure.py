@@ -8,9 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cleargs.splat.kernels.cuda import support
+
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     """The image [H, W, 3] with every pixel mapped by ``affine`` [3, 4] (matrix and offset), float32."""
+    if support.on_gpu(image.device):
+        from cleargs.splat.kernels.cuda import colour as gpu_colour
+
+        return gpu_colour.apply_affine(image, affine)
     from cleargs.splat.kernels.cpu import colour, launch
 
     output = torch.empty(image.shape)
@@ -23,6 +29,10 @@ def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of ``apply_affine``: with respect to the image [H, W, 3] and to the map [3, 4] (float64)."""
+    if support.on_gpu(image.device):
+        from cleargs.splat.kernels.cuda import colour as gpu_colour
+
+        return gpu_colour.affine_backward(image, affine, grad_output)
     from cleargs.splat.kernels.cpu import colour, launch
 
     grad_image = torch.empty(image.shape)

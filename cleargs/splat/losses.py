@@ -1,6 +1,6 @@
 """Photometric loss with its gradient, SSIM and PSNR: fixed-order sums on every device.
 
-The kernels behind them run on CPU tensors; tensors elsewhere are refused.
+The device of the images chooses the kernels.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import torch
 from torch import Tensor
 
 from cleargs.errors import InputError
+from cleargs.splat.kernels.cuda import support
+
+_DEVICES = ("cpu", "cuda")
 
 
 class PhotometricLoss(NamedTuple):
@@ -44,10 +47,12 @@ def photometric_loss(
         InputError: when shapes or precision do not fit.
     """
     _check(image, target, mask)
-    from cleargs.splat.kernels.cpu import launch, loss
-
     if gradient is None:
         gradient = torch.empty_like(image, memory_format=torch.contiguous_format, requires_grad=False)
+    if support.on_gpu(image.device):
+        return _loss_on_gpu(image, target, ssim_lambda, weight, mask, gradient)
+    from cleargs.splat.kernels.cpu import launch, loss
+
     with launch.exclusive():
         padded = _pad(image, target, mask)
         l1, similarity, count, maps = _measure(padded)
@@ -74,6 +79,11 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     11 x 11 Gaussian window, sigma 1.5, zero padding, as in the Inria code.
     """
     _check(image, target, mask)
+    if support.on_gpu(image.device):
+        from cleargs.splat.kernels.cuda.loss import Photometer
+
+        measured = Photometer()(image, target, mask, l1_weight=0.0, ssim_weight=0.0, gradient=None)
+        return measured.read(ssim_lambda=0.0, weight=1.0).ssim
     from cleargs.splat.kernels.cpu import launch
 
     with launch.exclusive():
@@ -84,6 +94,11 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; infinite when nothing differs."""
     _check(image, target, mask)
+    if support.on_gpu(image.device):
+        errors = (image.detach().double() - target.double()).square()
+        errors = errors if mask is None else errors[mask]
+        mean = float(errors.mean()) if errors.numel() else 0.0
+        return -10.0 * math.log10(mean) if mean > 0.0 else math.inf
     from cleargs.splat.kernels.cpu import launch, loss
 
     row_sums = np.empty((image.shape[0], 2), np.float64)
@@ -91,6 +106,28 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         loss.squared_errors(_read(image), _read(target), None if mask is None else _read(mask), row_sums)
     total, count = math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
     return 10.0 * math.log10(count / total) if total > 0.0 else math.inf
+
+
+def _loss_on_gpu(
+    image: Tensor,
+    target: Tensor,
+    ssim_lambda: float,
+    weight: float,
+    mask: Tensor | None,
+    gradient: Tensor,
+) -> PhotometricLoss:
+    from cleargs.splat.kernels.cuda.loss import Photometer
+
+    measured = Photometer()(
+        image,
+        target,
+        mask,
+        l1_weight=weight * (1.0 - ssim_lambda),
+        ssim_weight=-weight * ssim_lambda,
+        gradient=gradient,
+    )
+    read = measured.read(ssim_lambda=ssim_lambda, weight=weight)
+    return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
 
 
 class _Padded(NamedTuple):
@@ -111,9 +148,14 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
             hint="both must be [H, W, 3]",
         )
     for tensor in (image, target):
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+        if (
+            tensor.dtype != torch.float32
+            or tensor.device != image.device
+            or tensor.device.type not in _DEVICES
+        ):
             raise InputError(
-                f"an image is {tensor.dtype} on {tensor.device}", hint="give float32 images on the CPU"
+                f"an image is {tensor.dtype} on {tensor.device}",
+                hint="give float32 images, both on the CPU or both on one GPU",
             )
     if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
         raise InputError(

@@ -39,9 +39,9 @@ class Moments:
 class Rates:
     """Learning rates by parameter name. The world is normalised, so the scene's extent is 1."""
 
-    def __init__(self, config: TrainConfig, coefficients: int) -> None:
+    def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:
         self._config = config
-        sh = torch.full((coefficients * 3,), config.lr_sh / SH_REST_DIVISOR)
+        sh = torch.full((coefficients * 3,), config.lr_sh / SH_REST_DIVISOR, device=device)
         sh[:3] = config.lr_sh
         self._fixed: dict[str, float | Tensor] = {
             "log_scales": config.lr_scales,

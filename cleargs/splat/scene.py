@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
 
 from cleargs.splat.gaussians import Gaussians
 
@@ -16,3 +18,7 @@ class Scene:
     """Whether opacities of sub-pixel splats are compensated (Mip-Splatting)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """sRGB behind everything, in [0, 1]."""
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The same scene with its Gaussians on another device."""
+        return replace(self, gaussians=self.gaussians.to(device))

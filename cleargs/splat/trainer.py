@@ -10,10 +10,10 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -26,37 +26,26 @@ from cleargs.progress import Reporter, Task
 from cleargs.splat import strategy
 from cleargs.splat.compensation import Exposure
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.densification import Densifier
 from cleargs.splat.engine import Engine
 from cleargs.splat.exposure import affine_backward, apply_affine
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.optimiser import ExposureOptimiser, Moments, Rates, step_gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.tables import TRAIN
+from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
 
-_REAL, _PSEUDO, _REFINE, _NOISE = range(4)
-"""Purposes of random numbers."""
+if TYPE_CHECKING:
+    from cleargs.splat.kernels.cuda.loss import Meter
 
-_LOG = np.dtype(
-    [
-        ("frame_id", np.int32),
-        ("pseudo", np.bool_),
-        ("weight", np.float32),
-        ("width", np.int32),
-        ("height", np.int32),
-        ("loss", np.float64),
-        ("l1", np.float64),
-        ("ssim", np.float64),
-        ("psnr", np.float64),
-        ("n_gaussians", np.int32),
-        ("sh_degree", np.int32),
-    ]
-)
+_REAL, _PSEUDO = range(2)
+"""Purposes of random numbers; the next two are those of densification."""
 
 _NOTE_INTERVAL = 10
-"""Steps between updates of the progress bar."""
+"""Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
 
 _CHECK_INTERVAL = 10
 """Steps between looks for NaN and infinity (under 1 ms for 50,000 Gaussians)."""
@@ -115,7 +104,7 @@ def train(
     elif saved is not None:
         trainer.restore(saved)
         reporter.info(f"{label}: going on from step {trainer.done} of {config.steps}")
-    with reporter.task(label, total=config.steps) as task:
+    with support.memory_errors(), reporter.task(label, total=config.steps) as task:
         progress = _Progress(task, trainer)
         while trainer.done < config.steps:
             trainer.step()
@@ -128,7 +117,8 @@ def train(
                 save_state(checkpoint, trainer.state())
         trainer.check_finite()
         progress.show()
-    return Trained(trainer.scene, trainer.exposure, trainer.rows(round), trainer.state())
+    state = {name: tensor.cpu() for name, tensor in trainer.state().items()}
+    return Trained(trainer.scene.to("cpu"), trainer.exposure, trainer.rows(round), state)
 
 
 class Trainer:
@@ -155,23 +145,26 @@ class Trainer:
         self._config = config
         self._seed = tuple(seed)
         self._scene = scene
-        self._gaussians = scene.gaussians.detach().clone()
+        self._engine = Engine(device)
+        self._device = torch.device(device)
+        self._gaussians = scene.gaussians.detach().clone().to(self._device)
         if fault := _fault(self._gaussians):
             raise InputError(
                 f"the scene to start from is damaged: {fault}",
                 hint="run the stage that made it again with --force",
             )
         self._moments = Moments.zeros(self._gaussians)
-        self._rates = Rates(config, self._gaussians.sh.shape[1])
-        self._budget = config.budget or strategy.budget_from_pixels(
+        self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
+        budget = config.budget or strategy.budget_from_pixels(
             sum(view.camera.width * view.camera.height for view in self._real or self._pseudo)
         )
+        self._densifier = Densifier(config, budget, seed)
         self._exposure = (
             None if exposure is None else _exposure_optimiser(exposure, weighted, config.lr_exposure)
         )
-        self._engine = Engine(device)
-        self._cache = ImageCache(config.cache_mb * 2**20)
-        self._log = np.zeros(config.steps, _LOG)
+        self._cache = ImageCache(config.cache_mb * 2**20, self._device)
+        self._meter = _meter(config, self._device)
+        self._log = TrainLog(config.steps)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         self._fingerprint = _fingerprint(scene, weighted, config, [*self._seed, self._share, pseudo_weight])
         self.done = 0
@@ -189,8 +182,8 @@ class Trainer:
     @property
     def last_psnr(self) -> float:
         """Mean PSNR over the last 50 steps, dB."""
-        recent = self._log["psnr"][max(0, self.done - 50) : self.done]
-        return float(recent.mean()) if len(recent) else math.nan
+        self._read_meter()
+        return self._log.recent_psnr(self.done)
 
     def step(self) -> None:
         """One iteration: one view, one Adam step, and what densification is due."""
@@ -210,39 +203,17 @@ class Trainer:
         if self._exposure is not None:
             affine = self._exposure.affine(view.frame_id)
             image = apply_affine(render.image, affine)
-        loss = photometric_loss(
-            image,
-            target,
-            ssim_lambda=config.ssim_lambda,
-            weight=weight,
-            mask=mask,
-            gradient=self._slope(target),
-        )
-        self._log[self.done] = (
-            view.frame_id,
-            view.kind == "pseudo",
-            weight,
-            target.shape[1],
-            target.shape[0],
-            loss.loss,
-            loss.l1,
-            loss.ssim,
-            psnr(image, target, mask),
-            self._gaussians.num,
-            sh_degree,
-        )
-        if not math.isfinite(loss.loss):
-            self.check_finite()
-            raise self._stopped("the loss is not finite")
-        slope = loss.grad_image
+        self._log.seen(self.done, view, weight, target, self._gaussians.num, sh_degree)
+        slope = self._measure(image, target, mask, weight)
         if self._exposure is not None:
             slope, affine_slope = affine_backward(render.image, affine, slope)
-            self._exposure.step(view.frame_id, np.asarray(affine_slope, np.float64))
         gradients = self._engine.backward(slope)
         _regularise(self._gaussians, gradients, config)
         step_gaussians(
             self._gaussians, gradients, self._moments, self._rates.at(self.done), step=self.done + 1
         )
+        if self._exposure is not None:  # last, since it may have to wait for the device
+            self._exposure.step(view.frame_id, affine_slope.cpu().numpy())
         self.done += 1
         if config.densify:
             self._densify()
@@ -256,10 +227,11 @@ class Trainer:
 
     def state(self) -> dict[str, Tensor]:
         """All that a training needs to go on: parameters, moments, affines, step and the log so far."""
+        self._read_meter()
         state = {
             "fingerprint": self._fingerprint,
             "step": torch.tensor(self.done),
-            "log": torch.from_numpy(self._log[: self.done].view(np.uint8).copy()),
+            "log": self._log.packed(self.done),
         }
         groups = (self._gaussians.tensors(), self._moments.first, self._moments.second)
         for prefix, group in zip(("parameter", "first", "second"), groups, strict=True):
@@ -283,22 +255,16 @@ class Trainer:
             }
 
         self.done = int(state["step"])
-        self._log[: self.done] = state["log"].numpy().view(_LOG)
-        self._gaussians = Gaussians(**group("parameter"))
-        self._moments = Moments(group("first"), group("second"))
+        self._log.restore(state["log"])
+        self._gaussians = Gaussians(**group("parameter")).to(self._device)
+        self._moments = Moments(*(self._on_device(group(prefix)) for prefix in ("first", "second")))
         if self._exposure is not None:
             self._exposure.restore({name: tensor.numpy() for name, tensor in group("exposure").items()})
 
     def rows(self, round: int) -> pa.Table:
         """The log so far, one row a step."""
-        log = self._log[: self.done]
-        columns: dict[str, Any] = {
-            "round": np.full(self.done, round),
-            "step": np.arange(1, self.done + 1),
-            "kind": np.where(log["pseudo"], "pseudo", "real"),
-        }
-        columns |= {name: log[name] for name in _LOG.names or () if name != "pseudo"}
-        return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)
+        self._read_meter()
+        return self._log.table(self.done, round)
 
     def _view(self, step: int) -> View:
         """The view of a step: pseudo ones spread evenly at their share, both in shuffled epochs."""
@@ -316,43 +282,40 @@ class Trainer:
         largest = self._gaussians.sh_degree
         return largest if interval == 0 else min(largest, self.done // interval)
 
+    def _measure(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
+        """The gradient of the loss by the image; its value goes into the log, from a GPU with some delay."""
+        slope = self._slope(target)
+        if self._meter is not None:
+            self._meter.add(self.done, image, target, mask, weight=weight, gradient=slope)
+            if len(self._meter) >= _NOTE_INTERVAL:
+                self._read_meter()
+            return slope
+        loss = photometric_loss(
+            image, target, ssim_lambda=self._config.ssim_lambda, weight=weight, mask=mask, gradient=slope
+        )
+        self._note(self.done, loss.loss, loss.l1, loss.ssim, psnr(image, target, mask))
+        return loss.grad_image
+
+    def _read_meter(self) -> None:
+        """Bring the log up to date. Waits for the GPU."""
+        for step, read in self._meter.take() if self._meter is not None else ():
+            self._note(step, read.loss, read.l1, read.ssim, read.psnr)
+
+    def _note(self, step: int, loss: float, l1: float, ssim: float, psnr: float) -> None:
+        self._log.measured(step, loss=loss, l1=l1, ssim=ssim, psnr=psnr)
+        if not math.isfinite(loss):
+            self.check_finite()
+            raise self._stopped("the loss is not finite")
+
     def _densify(self) -> None:
         """Relocate and grow where a refinement is due, then shake the means."""
-        config, step = self._config, self.done
-        names = list(self._gaussians.tensors())
-        if (
-            step % config.refine_interval == 0
-            and config.refine_start * config.steps <= step <= config.refine_stop * config.steps
-        ):
+        if self._densifier.due(self.done):
             self.check_finite()  # relocation takes a Gaussian whose opacity is NaN for dead, and hides it
-            rng = self._rng(_REFINE, step)
-            arrays = {name: tensor.numpy() for name, tensor in self._gaussians.tensors().items()}
-            moments = [
-                {name: tensor.numpy() for name, tensor in group.items()}
-                for group in (self._moments.first, self._moments.second)
-            ]
-            strategy.relocate(arrays, moments, min_opacity=config.min_opacity, rng=rng)
-            arrays, moments = strategy.grow(
-                arrays,
-                moments,
-                rate=config.growth,
-                budget=self._budget,
-                min_opacity=config.min_opacity,
-                rng=rng,
-            )
-            self._gaussians = Gaussians(**{name: torch.from_numpy(arrays[name]) for name in names})
-            first, second = ({name: torch.from_numpy(group[name]) for name in names} for group in moments)
-            self._moments = Moments(first, second)
-        if config.noise > 0.0:
-            felt, offsets = strategy.mean_noise(
-                self._gaussians.log_scales.numpy(),
-                self._gaussians.rotations.numpy(),
-                self._gaussians.logit_opacities.numpy(),
-                amount=config.noise * self._rates.means(step),
-                min_opacity=config.min_opacity,
-                rng=self._rng(_NOISE, step),
-            )
-            self._gaussians.means.numpy()[felt] += offsets
+            self._gaussians, self._moments = self._densifier.refine(self._gaussians, self._moments, self.done)
+        self._densifier.shake(self._gaussians, self._rates.means(self.done), self.done)
+
+    def _on_device(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: tensor.to(self._device) for name, tensor in tensors.items()}
 
     def _slope(self, target: Tensor) -> Tensor:
         """A buffer for the gradient of the loss with respect to the image."""
@@ -373,12 +336,21 @@ class Trainer:
 
 def _fault(gaussians: Gaussians) -> str | None:
     """The first parameter that holds NaN or infinity, and in how many Gaussians; None where none does."""
-    for name, tensor in gaussians.tensors().items():
-        finite = np.isfinite(tensor.numpy())
-        if not finite.all():
-            sound = finite.reshape(gaussians.num, -1).all(axis=1).sum()
+    tensors = gaussians.tensors()
+    if _all_finite(tensors.values()):
+        return None
+    for name, tensor in tensors.items():
+        sound = int(torch.isfinite(tensor).reshape(gaussians.num, -1).all(1).sum())
+        if sound < gaussians.num:
             return f"{name} is not finite in {gaussians.num - sound} of {gaussians.num} Gaussians"
     return None
+
+
+def _all_finite(tensors: Collection[Tensor]) -> bool:
+    """Whether no number is NaN or infinite. Waits for a GPU once; a CPU's numbers NumPy tests far sooner."""
+    if not any(tensor.is_cuda for tensor in tensors):
+        return all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors)
+    return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
 
 
 def render_view(
@@ -404,7 +376,7 @@ def evaluate_views(
 ) -> list[float]:
     """PSNR in dB of the scene at every view, in their order, over unmasked pixels, at full size."""
     engine = engine or Engine(str(scene.gaussians.device))
-    cache = cache or ImageCache(0)
+    cache = cache or ImageCache(0, scene.gaussians.device)
     values = []
     for view in views:
         target, mask = cache.get(view)
@@ -427,6 +399,15 @@ class _Progress:
         self._task.update(done=trainer.done, note=note)
 
 
+def _meter(config: TrainConfig, device: torch.device) -> Meter | None:
+    """Keeps losses on the GPU until they are needed; None on the CPU, where they are known at once."""
+    if not support.on_gpu(device):
+        return None
+    from cleargs.splat.kernels.cuda.loss import Meter
+
+    return Meter(config.ssim_lambda)
+
+
 def _fingerprint(
     scene: Scene, views: Sequence[View], config: TrainConfig, numbers: Sequence[float]
 ) -> Tensor:
@@ -435,12 +416,20 @@ def _fingerprint(
     seen = [(view.frame_id, view.kind, view.weight, view.camera.width, view.camera.height) for view in views]
     digest = hashlib.sha256(json.dumps([settings, seen, list(numbers)], sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
-        digest.update(tensor.detach().numpy().tobytes())
+        digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
 
 
 def _regularise(gaussians: Gaussians, gradients: Gaussians, config: TrainConfig) -> None:
     """Add to the gradients those of opacity_reg * mean(opacity) + scale_reg * mean(scale) (3DGS-MCMC)."""
+    if support.on_gpu(gaussians.device):
+        if config.opacity_reg > 0.0:
+            opacities = gaussians.logit_opacities.sigmoid()
+            gradients.logit_opacities += config.opacity_reg / gaussians.num * opacities * (1 - opacities)
+        if config.scale_reg > 0.0:
+            share = config.scale_reg / gaussians.log_scales.numel()
+            gradients.log_scales += share * gaussians.log_scales.exp()
+        return
     if config.opacity_reg > 0.0:
         opacity = strategy.sigmoid(gaussians.logit_opacities.numpy())
         gradients.logit_opacities.numpy()[:] += (

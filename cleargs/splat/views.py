@@ -122,14 +122,18 @@ class ImageCache:
 
     An image is held as it was loaded (uint8), or as half floats where it was float32, and always passes
     through that form, so that results do not depend on what fitted. What fits first stays: under the
-    trainer's shuffled epochs dropping the oldest would only lower the share of hits.
+    trainer's shuffled epochs dropping the oldest would only lower the share of hits. Images lie on
+    ``device``.
     """
 
-    def __init__(self, limit_bytes: int) -> None:
+    def __init__(self, limit_bytes: int, device: torch.device | str = "cpu") -> None:
         self._limit = limit_bytes
+        self._device = torch.device(device)
+        # A tensor, since a GPU multiplies by the reciprocal of a number, which is not the same.
+        self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._held: dict[View, tuple[NDArray[np.generic], Mask | None]] = {}
+        self._held: dict[View, tuple[Tensor, Tensor | None]] = {}
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
     def get(self, view: View, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
@@ -142,19 +146,23 @@ class ImageCache:
             self._used, self._factor = 0, factor
         entry = self._held.get(view)
         if entry is None:
-            entry = _prepare(view, factor)
-            size = entry[0].nbytes + (0 if entry[1] is None else entry[1].nbytes)
+            pixels, counts = _prepare(view, factor)
+            entry = (
+                torch.from_numpy(pixels).to(self._device),
+                None if counts is None else torch.from_numpy(counts).to(self._device),
+            )
+            size = pixels.nbytes + (0 if counts is None else counts.nbytes)
             if self._used + size <= self._limit:
                 self._held[view] = entry
                 self._used += size
         stored, mask = entry
         height, width = stored.shape[:2]
         if (height, width) not in self._scratch:
-            self._scratch[height, width] = torch.empty(height, width, 3)
-        image = self._scratch[height, width]
-        divisor = np.float32(255.0 if stored.dtype == np.uint8 else 1.0)
-        np.divide(stored, divisor, out=image.numpy(), dtype=np.float32)
-        return image, None if mask is None else torch.from_numpy(mask)
+            self._scratch[height, width] = torch.empty(height, width, 3, device=self._device)
+        image = self._scratch[height, width].copy_(stored)
+        if stored.dtype == torch.uint8:
+            image /= self._white
+        return image, mask
 
 
 def _prepare(view: View, factor: float) -> tuple[NDArray[np.generic], Mask | None]:

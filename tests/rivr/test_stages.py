@@ -47,8 +47,8 @@ def capture(tmp_path: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) ->
 
 def make_capture(root: Path, expert: Sharpen, monkeypatch: pytest.MonkeyPatch) -> Capture:
     scorers = {"clarity-net": Contrast(), "naturalness-stats": Darkness()}
-    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec: expert)
-    monkeypatch.setattr("cleargs.models.scorer.load_scorer", scorers.__getitem__)
+    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: expert)
+    monkeypatch.setattr("cleargs.models.scorer.load_scorer", lambda name, device: scorers[name])
     write_capture(root)
     return Capture(root)
 

@@ -1,1 +1,1 @@
-"""Back ends of the splatting core: ``reference`` (float64 oracle) and ``cpu`` (Numba)."""
+"""Back ends of the splatting core: ``reference`` (float64 oracle), ``cpu`` (Numba) and ``cuda`` (Triton)."""

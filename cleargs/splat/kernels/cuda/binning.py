@@ -1,0 +1,190 @@
+"""Which splats touch which tile, in depth order.
+
+Depths are sorted once (N keys of 32 bits). Pairs are then made in that order, and a stable sort by tile alone
+(keys of 16 bits for up to 32,766 tiles) leaves every tile's pairs from near to far, ties by index. Both sorts
+are torch's, which are radix sorts on the GPU.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from cleargs.splat import constants
+from cleargs.splat.kernels.cuda import layout
+
+
+def key_type(tiles: int) -> torch.dtype:
+    """The smallest integer type that numbers the tiles and their end."""
+    return torch.int16 if tiles < 2**15 - 1 else torch.int32
+
+
+@triton.jit
+def tile_range(low, high, tiles):
+    """Tiles [begin, end) that hold a pixel centre of the interval [low, high] px; 0, 0 when there is none."""
+    # Bounded as floats first: the conversion of huge numbers to integers is undefined.
+    limit = (tiles * layout.TILE).to(tl.float64)
+    first = tl.minimum(tl.maximum(tl.ceil(low - constants.PIXEL_CENTRE), 0.0), limit)
+    last = tl.minimum(tl.maximum(tl.floor(high - constants.PIXEL_CENTRE), -1.0), limit - 1.0)
+    some = first <= last
+    begin = tl.where(some, first.to(tl.int32) // layout.TILE, 0)
+    end = tl.where(some, last.to(tl.int32) // layout.TILE + 1, 0)
+    return (begin, end)
+
+
+@triton.jit
+def reach_of_rows(extent_y):
+    """Half height of the ellipse with its margin, float64."""
+    return extent_y.to(tl.float64) * 1.001 + 0.001
+
+
+@triton.jit
+def tile_rows(mean_y, extent_y, height):
+    """Rows of tiles [begin, end) that the ellipse alpha >= 1/255 may touch."""
+    mean = mean_y.to(tl.float64)
+    extent = reach_of_rows(extent_y)
+    return tile_range(mean - extent, mean + extent, (height + layout.TILE - 1) // layout.TILE)
+
+
+@triton.jit
+def tile_columns(
+    mean_x,
+    mean_y,
+    bend_x,
+    skew,
+    bend_y,
+    log2_opacity,
+    extent_y,
+    extent_x_at,
+    row,
+    width,
+):
+    """Tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
+
+    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so it is
+    largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge is its
+    mirror.
+    """
+    mean = mean_y.to(tl.float64)
+    extent = reach_of_rows(extent_y)
+    line = (row * layout.TILE).to(tl.float64)
+    low = tl.maximum(line + constants.PIXEL_CENTRE - mean, -extent)
+    high = tl.minimum(line + layout.TILE - constants.PIXEL_CENTRE - mean, extent)
+    at = extent_x_at.to(tl.float64)
+    right_at = tl.minimum(tl.maximum(at, low), high)
+    left_at = tl.minimum(tl.maximum(-at, low), high)
+    a = tl.maximum(bend_x.to(tl.float64), 1e-30)
+    e = bend_y.to(tl.float64)
+    t = log2_opacity.to(tl.float64) - layout.LOG2_REACH_CUT
+    k = skew.to(tl.float64)
+    right = k * right_at + tl.sqrt(tl.maximum(t - e * right_at * right_at, 0.0) / a)
+    left = k * left_at - tl.sqrt(tl.maximum(t - e * left_at * left_at, 0.0) / a)
+    centre = mean_x.to(tl.float64)
+    # MEAN_X and SKEW were rounded to float32 (6e-8), which counts when the mean is far away.
+    margin = 1e-3 + 2e-7 * (tl.abs(centre) + tl.abs(k) * extent)
+    return tile_range(
+        centre + left - margin, centre + right + margin, (width + layout.TILE - 1) // layout.TILE
+    )
+
+
+@triton.jit
+def count_tiles(
+    mean_x,
+    mean_y,
+    bend_x,
+    skew,
+    bend_y,
+    log2_opacity,
+    extent_y,
+    extent_x_at,
+    visible,
+    width,
+    height,
+):
+    """Number of tiles that each splat touches, int32; as many as ``list_pairs`` will write."""
+    rows = tile_rows(mean_y, extent_y, height)
+    top, bottom = tl.where(visible, rows[0], 0), tl.where(visible, rows[1], 0)
+    count = tl.zeros_like(top)
+    for step in range(0, tl.max(bottom - top, axis=0)):
+        row = top + step
+        columns = tile_columns(
+            mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at, row, width
+        )
+        count += tl.where(row < bottom, columns[1] - columns[0], 0)
+    return count
+
+
+@triton.jit(do_not_specialize=["n", "width", "height"])
+def list_pairs(
+    splats,
+    order,
+    tile_counts,
+    pair_ends,
+    pair_starts,
+    pair_tiles,
+    pair_owners,
+    n,
+    width,
+    height,
+    BLOCK: tl.constexpr,
+):
+    """The tile and the Gaussian of every slot, and each Gaussian's first slot ``pair_starts`` [N] int32.
+
+    Lane r takes the Gaussian ``order[r]``, whose slots end before ``pair_ends[r]``.
+    """
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = rank < n
+    g = tl.load(order + rank, mask=mask, other=0).to(tl.int32)
+    count = tl.load(tile_counts + g, mask=mask, other=0)
+    end = tl.load(pair_ends + rank, mask=mask, other=0)
+    slot = end - count
+    tl.store(pair_starts + g, slot.to(tl.int32), mask=mask)
+    some = count > 0
+    row = splats + g * layout.SPLAT_COLUMNS
+    mean_x = tl.load(row + layout.MEAN_X, mask=some, other=0.0)
+    mean_y = tl.load(row + layout.MEAN_Y, mask=some, other=0.0)
+    bend_x = tl.load(row + layout.BEND_X, mask=some, other=1.0)
+    skew = tl.load(row + layout.SKEW, mask=some, other=0.0)
+    bend_y = tl.load(row + layout.BEND_Y, mask=some, other=1.0)
+    log2_opacity = tl.load(row + layout.LOG2_OPACITY, mask=some, other=0.0)
+    extent_y = tl.load(row + layout.EXTENT_Y, mask=some, other=0.0)
+    extent_x_at = tl.load(row + layout.EXTENT_X_AT, mask=some, other=0.0)
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    rows = tile_rows(mean_y, extent_y, height)
+    top, bottom = tl.where(some, rows[0], 0), tl.where(some, rows[1], 0)
+    for step in range(0, tl.max(bottom - top, axis=0)):
+        tile_row = top + step
+        columns = tile_columns(
+            mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at, tile_row, width
+        )
+        length = tl.where(tile_row < bottom, columns[1] - columns[0], 0)
+        tile = tile_row * tiles_x + columns[0]
+        for column in range(0, tl.max(length, axis=0)):
+            fits = (column < length) & (slot + column < end)
+            tl.store(pair_tiles + slot + column, (tile + column).to(pair_tiles.dtype.element_ty), mask=fits)
+            tl.store(pair_owners + slot + column, g, mask=fits)
+        slot += length
+
+
+@triton.jit(do_not_specialize=["pairs"])
+def order_pairs(sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK: tl.constexpr):
+    """The Gaussian and the slot (both int32) of every place, from torch's int64 order of the slots."""
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < pairs
+    slot = tl.load(sorted_slots + place, mask=mask, other=0)
+    tl.store(pair_ids + place, tl.load(pair_owners + slot, mask=mask, other=0), mask=mask)
+    tl.store(pair_slots + place, slot.to(tl.int32), mask=mask)
+
+
+def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
+    """First place of every tile and the end, [tiles + 1] int32."""
+    numbers = torch.arange(tiles + 1, dtype=sorted_tiles.dtype, device=sorted_tiles.device)
+    return torch.searchsorted(sorted_tiles, numbers, out_int32=True)
+
+
+def chunk_starts(starts: Tensor) -> Tensor:
+    """First chunk of every tile and the end, [tiles + 1] int32, from the first place of every tile."""
+    chunks = (starts.diff() + (layout.CHUNK - 1)) // layout.CHUNK
+    return torch.nn.functional.pad(chunks.cumsum(0), (1, 0)).to(torch.int32)

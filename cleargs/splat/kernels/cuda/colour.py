@@ -1,0 +1,70 @@
+"""Per-frame affine colour and its gradient."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+BLOCK = 1024
+
+
+@triton.jit(do_not_specialize=["pixels"])
+def map_pixels(image, affine, output, pixels, BLOCK: tl.constexpr):
+    """output = affine[:, :3] image + affine[:, 3]; images [pixels, 3], affine [3, 4]."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = i < pixels
+    red = tl.load(image + i * 3, mask=mask, other=0.0)
+    green = tl.load(image + i * 3 + 1, mask=mask, other=0.0)
+    blue = tl.load(image + i * 3 + 2, mask=mask, other=0.0)
+    for channel in tl.static_range(3):
+        value = tl.load(affine + channel * 4) * red + tl.load(affine + channel * 4 + 1) * green
+        value += tl.load(affine + channel * 4 + 2) * blue + tl.load(affine + channel * 4 + 3)
+        tl.store(output + i * 3 + channel, value, mask=mask)
+
+
+@triton.jit(do_not_specialize=["pixels"])
+def map_backward(image, affine, grad_output, grad_image, partials, pixels, BLOCK: tl.constexpr):
+    """grad_image = affine[:, :3]ᵀ grad_output, and each program's share of dL/d(affine) [programs, 12]."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = i < pixels
+    for source in tl.static_range(3):
+        total = tl.zeros([BLOCK], tl.float32)
+        for channel in tl.static_range(3):
+            g = tl.load(grad_output + i * 3 + channel, mask=mask, other=0.0)
+            total += tl.load(affine + channel * 4 + source) * g
+            value = tl.load(image + i * 3 + source, mask=mask, other=0.0)
+            share = tl.sum(g.to(tl.float64) * value.to(tl.float64), axis=0)
+            tl.store(partials + tl.program_id(0) * 12 + channel * 4 + source, share)
+        tl.store(grad_image + i * 3 + source, total, mask=mask)
+    for channel in tl.static_range(3):
+        g = tl.load(grad_output + i * 3 + channel, mask=mask, other=0.0)
+        tl.store(partials + tl.program_id(0) * 12 + channel * 4 + 3, tl.sum(g.to(tl.float64), axis=0))
+
+
+def _on_device(affine: Tensor, image: Tensor) -> Tensor:
+    # Without waiting: what is copied so is read before the call returns.
+    return affine.detach().float().contiguous().to(image.device, non_blocking=True)
+
+
+def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
+    """See ``cleargs.splat.exposure.apply_affine``."""
+    image, affine = image.detach().contiguous(), _on_device(affine, image)
+    output = torch.empty_like(image)
+    pixels = image.numel() // 3
+    map_pixels[(-(-pixels // BLOCK),)](image, affine, output, pixels, BLOCK=BLOCK, num_warps=4)
+    return output
+
+
+def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
+    """See ``cleargs.splat.exposure.affine_backward``; both gradients stay on the device."""
+    image, affine = image.detach().contiguous(), _on_device(affine, image)
+    grad_image = torch.empty_like(image)
+    pixels = image.numel() // 3
+    programs = -(-pixels // BLOCK)
+    partials = torch.empty(programs, 12, dtype=torch.float64, device=image.device)
+    map_backward[(programs,)](
+        image, affine, grad_output.contiguous(), grad_image, partials, pixels, BLOCK=BLOCK, num_warps=4
+    )
+    return grad_image, partials.sum(0).reshape(3, 4)

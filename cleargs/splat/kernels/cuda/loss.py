@@ -1,0 +1,348 @@
+"""L1 + D-SSIM and its gradient in four passes over the image; the mathematics is that of the CPU back end's
+``loss``.
+
+The 11 x 11 window of SSIM is separable: ``window_rows`` sums x, y, x², y² and xy along the rows, ``measure``
+sums these down the columns, which gives the similarity and its derivatives by the window means;
+``window_maps`` and ``differentiate`` send the derivatives back the same way. An image row is 3 W interleaved
+values, so neighbours in a channel are three values apart. Masked pixels are zero in both images, as are those
+beyond the border.
+
+Each program leaves its sums in float64 at a place of its own, and torch adds them in a fixed order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from cleargs.splat import constants
+from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels.cuda.support import memory_errors
+
+ROWS = 4
+COLUMNS = 128
+"""Rows and values of a row that a program treats."""
+
+
+class Reading(NamedTuple):
+    """What was measured, as numbers."""
+
+    loss: float
+    l1: float
+    ssim: float
+    psnr: float
+
+
+class Measured(NamedTuple):
+    """Sums over the values that count; on the device, so that reading them can wait."""
+
+    totals: Tensor  # [4] float64: |x - y|, SSIM, (x - y)², number of values
+    gradient: Tensor | None  # [H, W, 3]
+
+    def read(self, *, ssim_lambda: float, weight: float) -> Reading:
+        """The loss and its parts. Waits for the device."""
+        return reading(self.totals.tolist(), ssim_lambda=ssim_lambda, weight=weight)
+
+
+def reading(totals: Sequence[float], *, ssim_lambda: float, weight: float) -> Reading:
+    """The loss and its parts from the four sums."""
+    l1, similarity, squared, count = totals
+    if not count > 0:
+        return Reading(0.0, 0.0, 1.0, math.inf) if count == 0 else Reading(*(math.nan,) * 4)
+    l1, similarity = l1 / count, similarity / count
+    loss = weight * ((1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - similarity))
+    psnr = math.inf if squared == 0.0 else 10.0 * math.log10(count / squared)
+    return Reading(loss, l1, similarity, psnr)
+
+
+@triton.jit
+def kept(values, mask, y, j, inside, length, HAS_MASK: tl.constexpr):
+    """Values at row y, place j, zero outside the image and where masked."""
+    value = tl.load(values + y * length + j, mask=inside, other=0.0)
+    if HAS_MASK:
+        counts = tl.load(mask + y * (length // 3) + j // 3, mask=inside, other=0)
+        value = tl.where(counts != 0, value, 0.0)
+    return value
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def window_rows(
+    image,
+    target,
+    mask,
+    sums,
+    height,
+    length,
+    HAS_MASK: tl.constexpr,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
+    """Window sums of x, y, x², y² and xy along the rows: ``sums`` [5, H, length]."""
+    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
+    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    mean_x = tl.zeros([ROWS, COLUMNS], tl.float32)
+    mean_y = tl.zeros([ROWS, COLUMNS], tl.float32)
+    mean_xx = tl.zeros([ROWS, COLUMNS], tl.float32)
+    mean_yy = tl.zeros([ROWS, COLUMNS], tl.float32)
+    mean_xy = tl.zeros([ROWS, COLUMNS], tl.float32)
+    for tap in tl.static_range(11):
+        j = i + 3 * (tap - 5)
+        inside = (y < height) & (j >= 0) & (j < length)
+        a = kept(image, mask, y, j, inside, length, HAS_MASK)
+        b = kept(target, mask, y, j, inside, length, HAS_MASK)
+        weighted_a = a * layout.SSIM_WINDOW[tap]
+        weighted_b = b * layout.SSIM_WINDOW[tap]
+        mean_x += weighted_a
+        mean_y += weighted_b
+        mean_xx += weighted_a * a
+        mean_yy += weighted_b * b
+        mean_xy += weighted_a * b
+    plane = height.to(tl.int64) * length
+    at = sums + y * length + i
+    here = (y < height) & (i < length)
+    tl.store(at, mean_x, mask=here)
+    tl.store(at + plane, mean_y, mask=here)
+    tl.store(at + 2 * plane, mean_xx, mask=here)
+    tl.store(at + 3 * plane, mean_yy, mask=here)
+    tl.store(at + 4 * plane, mean_xy, mask=here)
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def measure(
+    image,
+    target,
+    mask,
+    sums,
+    maps,
+    partials,
+    height,
+    length,
+    HAS_MASK: tl.constexpr,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
+    """The derivatives of SSIM by the window means ``maps`` [3, H, length], and sums [programs, 4]."""
+    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
+    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    here = (y < height) & (i < length)
+    plane = height.to(tl.int64) * length
+    m = tl.zeros([ROWS, COLUMNS], tl.float32)
+    n = tl.zeros([ROWS, COLUMNS], tl.float32)
+    p = tl.zeros([ROWS, COLUMNS], tl.float32)
+    q = tl.zeros([ROWS, COLUMNS], tl.float32)
+    r = tl.zeros([ROWS, COLUMNS], tl.float32)
+    for tap in tl.static_range(11):
+        row = y + (tap - 5)
+        inside = (row >= 0) & (row < height) & (i < length)
+        at = sums + row * length + i
+        m += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        n += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+    a = kept(image, mask, y, i, here, length, HAS_MASK)
+    b = kept(target, mask, y, i, here, length, HAS_MASK)
+    counts = here.to(tl.float32)
+    if HAS_MASK:
+        counts = tl.load(mask + y * (length // 3) + i // 3, mask=here, other=0).to(tl.float32)
+    mn = m * n
+    squares = m * m + n * n
+    a1 = 2.0 * mn + constants.SSIM_C1
+    a2 = 2.0 * (r - mn) + constants.SSIM_C2
+    b1 = squares + constants.SSIM_C1
+    b2 = (p + q - squares) + constants.SSIM_C2
+    inverse = 1.0 / (b1 * b2)
+    similarity = a1 * a2 * inverse
+    scale = inverse * counts
+    at = maps + y * length + i
+    tl.store(at, 2.0 * (n * (a2 - a1) + m * similarity * (b1 - b2)) * scale, mask=here)
+    tl.store(at + plane, -similarity * b1 * scale, mask=here)
+    tl.store(at + 2 * plane, 2.0 * a1 * scale, mask=here)
+    difference = a - b
+    place = partials + (tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)) * 4
+    tl.store(place, tl.sum(tl.sum(tl.abs(difference).to(tl.float64), axis=1), axis=0))
+    tl.store(place + 1, tl.sum(tl.sum((similarity * counts).to(tl.float64), axis=1), axis=0))
+    squared = difference.to(tl.float64) * difference.to(tl.float64)
+    tl.store(place + 2, tl.sum(tl.sum(squared, axis=1), axis=0))
+    tl.store(place + 3, tl.sum(tl.sum(counts.to(tl.float64), axis=1), axis=0))
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def window_maps(maps, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Window sums of the three maps along the rows: ``sums`` [3, H, length]."""
+    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
+    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    plane = height.to(tl.int64) * length
+    by_mean = tl.zeros([ROWS, COLUMNS], tl.float32)
+    by_square = tl.zeros([ROWS, COLUMNS], tl.float32)
+    by_product = tl.zeros([ROWS, COLUMNS], tl.float32)
+    for tap in tl.static_range(11):
+        j = i + 3 * (tap - 5)
+        inside = (y < height) & (j >= 0) & (j < length)
+        at = maps + y * length + j
+        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+    at = sums + y * length + i
+    here = (y < height) & (i < length)
+    tl.store(at, by_mean, mask=here)
+    tl.store(at + plane, by_square, mask=here)
+    tl.store(at + 2 * plane, by_product, mask=here)
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def differentiate(
+    image,
+    target,
+    mask,
+    sums,
+    totals,
+    gradient,
+    l1_weight,
+    ssim_weight,
+    height,
+    length,
+    HAS_MASK: tl.constexpr,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
+    """gradient = (l1_weight sign(x - y) + ssim_weight d(sum of SSIM)/dx) / count; 0 where masked."""
+    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
+    i = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    here = (y < height) & (i < length)
+    plane = height.to(tl.int64) * length
+    by_mean = tl.zeros([ROWS, COLUMNS], tl.float32)
+    by_square = tl.zeros([ROWS, COLUMNS], tl.float32)
+    by_product = tl.zeros([ROWS, COLUMNS], tl.float32)
+    for tap in tl.static_range(11):
+        row = y + (tap - 5)
+        inside = (row >= 0) & (row < height) & (i < length)
+        at = sums + row * length + i
+        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+    a = kept(image, mask, y, i, here, length, HAS_MASK)
+    b = kept(target, mask, y, i, here, length, HAS_MASK)
+    share = (1.0 / tl.maximum(tl.load(totals + 3), 1.0)).to(tl.float32)
+    sign = tl.where(a > b, 1.0, tl.where(a < b, -1.0, 0.0))
+    slope = by_mean + 2.0 * a * by_square + b * by_product
+    value = (l1_weight * sign + ssim_weight * slope) * share
+    if HAS_MASK:
+        counts = tl.load(mask + y * (length // 3) + i // 3, mask=here, other=0)
+        value = tl.where(counts != 0, value, 0.0)
+    tl.store(gradient + y * length + i, value, mask=here)
+
+
+class Meter:
+    """The losses of some steps, kept on the device until they are read together: one wait for all of them."""
+
+    def __init__(self, ssim_lambda: float) -> None:
+        self._photometer = Photometer()
+        self._lambda = ssim_lambda
+        self._pending: list[tuple[int, float, Tensor]] = []
+
+    def __len__(self) -> int:
+        """Number of steps that wait to be read."""
+        return len(self._pending)
+
+    def add(
+        self,
+        step: int,
+        image: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        *,
+        weight: float,
+        gradient: Tensor,
+    ) -> None:
+        """Write the gradient of a step's loss (see ``losses.photometric_loss``) and keep its sums."""
+        measured = self._photometer(
+            image,
+            target,
+            mask,
+            l1_weight=weight * (1.0 - self._lambda),
+            ssim_weight=-weight * self._lambda,
+            gradient=gradient,
+        )
+        self._pending.append((step, weight, measured.totals))
+
+    def take(self) -> list[tuple[int, Reading]]:
+        """What waits, by step, and forget it."""
+        if not self._pending:
+            return []
+        rows = torch.stack([totals for _, _, totals in self._pending]).tolist()
+        readings = [
+            (step, reading(row, ssim_lambda=self._lambda, weight=weight))
+            for (step, weight, _), row in zip(self._pending, rows, strict=True)
+        ]
+        self._pending.clear()
+        return readings
+
+
+class Photometer:
+    """L1, SSIM and squared error of image pairs on one device, with buffers kept from call to call."""
+
+    def __init__(self) -> None:
+        self._memory: Tensor | None = None
+
+    def __call__(
+        self,
+        image: Tensor,  # [H, W, 3]
+        target: Tensor,  # [H, W, 3]
+        mask: Tensor | None,  # [H, W] bool, True = counts
+        *,
+        l1_weight: float,
+        ssim_weight: float,
+        gradient: Tensor | None,  # [H, W, 3] to write into; None = not wanted
+    ) -> Measured:
+        """Measure, and write the gradient of l1_weight * mean |x - y| + ssim_weight * mean SSIM."""
+        with memory_errors():
+            return self._run(image.detach(), target, mask, l1_weight, ssim_weight, gradient)
+
+    def _run(
+        self,
+        image: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        l1_weight: float,
+        ssim_weight: float,
+        gradient: Tensor | None,
+    ) -> Measured:
+        height, length = image.shape[0], 3 * image.shape[1]
+        size = height * length
+        if self._memory is None or len(self._memory) < 8 * size or self._memory.device != image.device:
+            self._memory = None
+            self._memory = torch.empty(8 * size, device=image.device)
+        sums, maps = self._memory[: 5 * size], self._memory[5 * size : 8 * size]
+        grid = (-(-length // COLUMNS), -(-height // ROWS))
+        partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
+        image, target = image.contiguous(), target.contiguous()
+        bits = image if mask is None else mask.contiguous().view(torch.uint8)
+        block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "num_warps": 4}
+        has_mask = mask is not None
+        window_rows[grid](image, target, bits, sums, height, length, HAS_MASK=has_mask, **block)
+        measure[grid](image, target, bits, sums, maps, partials, height, length, HAS_MASK=has_mask, **block)
+        totals = partials.sum(0)
+        if gradient is not None:
+            window_maps[grid](maps, sums, height, length, **block)
+            differentiate[grid](
+                image,
+                target,
+                bits,
+                sums,
+                totals,
+                gradient,
+                l1_weight,
+                ssim_weight,
+                height,
+                length,
+                HAS_MASK=has_mask,
+                **block,
+            )
+        return Measured(totals, gradient)

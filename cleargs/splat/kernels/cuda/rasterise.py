@@ -1,0 +1,318 @@
+"""Tile rasterisation, forward and backward; the mathematics is that of the CPU back end's ``rasterise``.
+
+Forward, a program is a tile: its 256 pixels are the vector, its pairs follow each other from near to far.
+Behind every ``layout.CHUNK`` pairs it leaves the transmittance and what the chunk added to each pixel.
+``behind`` sums these from the far end into S, the part of g · pixel that lies behind each chunk. With T and S
+at its far end each chunk can be differentiated on its own, so that backward a program is a chunk and long
+lists of pairs are shared out:
+
+    v = dL/d(ln alpha) = w (g · c) - S alpha / (1 - alpha),   0 where alpha is clamped.
+
+The sums over a pair's pixels are reduced within the program and stored once, at the pair's slot.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from cleargs.splat import constants
+from cleargs.splat.kernels.cuda import layout
+
+
+@triton.jit
+def splat_alpha(x, y, row):
+    """u, dy, alpha before clamp and cut, and alpha as it is blended, at pixel centres, of a packed splat.
+
+    Written with explicit fused operations, so that forward and backward pass agree to the bit about the cut.
+    """
+    dy = y - tl.load(row + layout.MEAN_Y)
+    u = tl.fma(-tl.load(row + layout.SKEW), dy, x - tl.load(row + layout.MEAN_X))
+    on_ridge = tl.fma(-(tl.load(row + layout.BEND_Y) * dy), dy, tl.load(row + layout.LOG2_OPACITY))
+    raw = tl.exp2(tl.fma(-(tl.load(row + layout.BEND_X) * u), u, on_ridge))
+    alpha = tl.where(raw >= constants.ALPHA_CUT, tl.minimum(raw, constants.ALPHA_MAX), 0.0)
+    return u, dy, raw, alpha
+
+
+@triton.jit(do_not_specialize=["width", "height"])
+def forward(
+    tile_starts,
+    chunk_starts,
+    pair_ids,
+    splats,
+    background,
+    image,
+    alpha,
+    transmittance,
+    last,
+    depth,
+    chunk_planes,
+    chunk_tiles,
+    deepest,
+    width,
+    height,
+    WITH_DEPTH: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """One tile of image [H, W, 3], alpha, transmittance, last contributor (from 1) and depth [H, W].
+
+    For the backward pass also the planes of its chunks [C, PLANES, 256], the tile of each chunk and the
+    number of the tile's last contributor.
+    """
+    tile = tl.program_id(0)
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    pixel = tl.arange(0, layout.TILE_PIXELS)
+    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
+    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
+    inside = (column < width) & (line < height)
+    x = column.to(tl.float32) + constants.PIXEL_CENTRE
+    y = line.to(tl.float32) + constants.PIXEL_CENTRE
+    begin, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
+    chunk = tl.load(chunk_starts + tile)
+    chunks = tl.load(chunk_starts + tile + 1) - chunk
+    for first in range(0, chunks, layout.TILE_PIXELS):
+        number = first + pixel
+        tl.store(chunk_tiles + chunk + number, tl.zeros_like(pixel) + tile, mask=number < chunks)
+
+    # `live` is T while the pixel goes on and 0 from then on (or outside the image); `rest` keeps T.
+    live = tl.where(inside, 1.0, 0.0)
+    rest = tl.zeros_like(x) + 1.0
+    deep = tl.zeros_like(pixel)
+    red = tl.zeros_like(x)
+    green = tl.zeros_like(x)
+    blue = tl.zeros_like(x)
+    z = tl.zeros_like(x)
+    start = begin
+    goes_on = begin < end
+    while goes_on:
+        stop = tl.minimum(start + layout.CHUNK, end)
+        chunk_red = tl.zeros_like(x)
+        chunk_green = tl.zeros_like(x)
+        chunk_blue = tl.zeros_like(x)
+        chunk_z = tl.zeros_like(x)
+        following = tl.load(pair_ids + start)
+        for place in range(start, stop):
+            # The next number is asked for early: what hangs on it waits for memory only once.
+            g = following
+            following = tl.load(pair_ids + tl.minimum(place + 1, stop - 1))
+            row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
+            _, _, _, blended = splat_alpha(x, y, row)
+            weight = blended * live
+            after = live - weight
+            blends = after >= constants.TRANSMITTANCE_STOP
+            weight = tl.where(blends, weight, 0.0)
+            live = tl.where(blends, after, 0.0)
+            rest = tl.where(blends, after, rest)
+            deep = tl.where(weight > 0.0, place - begin + 1, deep)
+            chunk_red += weight * tl.load(row + layout.RED)
+            chunk_green += weight * tl.load(row + layout.GREEN)
+            chunk_blue += weight * tl.load(row + layout.BLUE)
+            if WITH_DEPTH:
+                chunk_z += weight * tl.load(row + layout.DEPTH)
+        planes = chunk_planes + chunk.to(tl.int64) * (PLANES * layout.TILE_PIXELS) + pixel
+        tl.store(planes + layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS, rest)
+        tl.store(planes + layout.CHUNK_RED * layout.TILE_PIXELS, chunk_red)
+        tl.store(planes + layout.CHUNK_GREEN * layout.TILE_PIXELS, chunk_green)
+        tl.store(planes + layout.CHUNK_BLUE * layout.TILE_PIXELS, chunk_blue)
+        red += chunk_red
+        green += chunk_green
+        blue += chunk_blue
+        if WITH_DEPTH:
+            tl.store(planes + layout.CHUNK_DEPTH * layout.TILE_PIXELS, chunk_z)
+            z += chunk_z
+        chunk += 1
+        start = stop
+        goes_on = (start < end) & (tl.max(live, axis=0) > 0.0)
+
+    tl.store(deepest + tile, tl.max(deep, axis=0))
+    at = line * width + column
+    tl.store(image + at * 3, red + rest * tl.load(background), mask=inside)
+    tl.store(image + at * 3 + 1, green + rest * tl.load(background + 1), mask=inside)
+    tl.store(image + at * 3 + 2, blue + rest * tl.load(background + 2), mask=inside)
+    tl.store(alpha + at, 1.0 - rest, mask=inside)
+    tl.store(transmittance + at, rest, mask=inside)
+    tl.store(last + at, deep, mask=inside)
+    if WITH_DEPTH:
+        tl.store(depth + at, z, mask=inside)
+
+
+@triton.jit(do_not_specialize=["width", "height"])
+def behind(
+    chunk_starts,
+    chunk_planes,
+    deepest,
+    background,
+    transmittance,
+    grad_image,
+    grad_alpha,
+    grad_depth,
+    chunk_behind,
+    width,
+    height,
+    HAS_ALPHA: tl.constexpr,
+    HAS_DEPTH: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """S behind every chunk of a tile that contributes, [C, 256]: g · all that lies behind it."""
+    tile = tl.program_id(0)
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    pixel = tl.arange(0, layout.TILE_PIXELS)
+    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
+    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
+    inside = (column < width) & (line < height)
+    at = line * width + column
+    red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
+    green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
+    blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
+    far = red * tl.load(background) + green * tl.load(background + 1) + blue * tl.load(background + 2)
+    if HAS_ALPHA:  # alpha = 1 - T
+        far -= tl.load(grad_alpha + at, mask=inside, other=0.0)
+    far *= tl.load(transmittance + at, mask=inside, other=0.0)
+    chunk = tl.load(chunk_starts + tile).to(tl.int64)
+    reached = (tl.load(deepest + tile) + (layout.CHUNK - 1)) // layout.CHUNK
+    for step in range(0, reached):
+        number = chunk + (reached - 1 - step)
+        tl.store(chunk_behind + number * layout.TILE_PIXELS + pixel, far)
+        planes = chunk_planes + number * (PLANES * layout.TILE_PIXELS) + pixel
+        far += red * tl.load(planes + layout.CHUNK_RED * layout.TILE_PIXELS)
+        far += green * tl.load(planes + layout.CHUNK_GREEN * layout.TILE_PIXELS)
+        far += blue * tl.load(planes + layout.CHUNK_BLUE * layout.TILE_PIXELS)
+        if HAS_DEPTH:
+            z = tl.load(grad_depth + at, mask=inside, other=0.0)
+            far += z * tl.load(planes + layout.CHUNK_DEPTH * layout.TILE_PIXELS)
+
+
+@triton.jit(do_not_specialize=["tiles", "width", "height"])
+def backward(
+    tile_starts,
+    chunk_starts,
+    chunk_tiles,
+    chunk_planes,
+    chunk_behind,
+    deepest,
+    pair_ids,
+    pair_slots,
+    splats,
+    last,
+    grad_image,
+    grad_depth,
+    pair_sums,
+    tiles,
+    width,
+    height,
+    HAS_DEPTH: tl.constexpr,
+    PLANES: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
+    """The sums of every pair of one chunk, at the rows of ``pair_sums`` [P, 10] that are the pairs' slots.
+
+    Programs beyond the last chunk do nothing: the launch only knows a bound on the number of chunks.
+    """
+    chunk = tl.program_id(0)
+    if chunk < tl.load(chunk_starts + tiles):
+        tile = tl.load(chunk_tiles + chunk)
+        begin = tl.load(tile_starts + tile)
+        start = begin + (chunk - tl.load(chunk_starts + tile)) * layout.CHUNK
+        end = tl.minimum(start + layout.CHUNK, tl.load(tile_starts + tile + 1))
+        contributing = tl.minimum(end, begin + tl.load(deepest + tile))
+
+        place = start + tl.arange(0, layout.CHUNK)
+        unseen = (place >= contributing) & (place < end)
+        slots = tl.load(pair_slots + place, mask=unseen, other=0).to(tl.int64)
+        for k in tl.static_range(COLUMNS):
+            tl.store(pair_sums + slots * layout.PAIR_COLUMNS + k, 0.0, mask=unseen)
+        if start < contributing:
+            backward_chunk(
+                chunk,
+                tile,
+                begin,
+                start,
+                contributing,
+                chunk_planes,
+                chunk_behind,
+                pair_ids,
+                pair_slots,
+                splats,
+                last,
+                grad_image,
+                grad_depth,
+                pair_sums,
+                width,
+                height,
+                HAS_DEPTH,
+                PLANES,
+            )
+
+
+@triton.jit
+def backward_chunk(
+    chunk,
+    tile,
+    begin,
+    start,
+    end,
+    chunk_planes,
+    chunk_behind,
+    pair_ids,
+    pair_slots,
+    splats,
+    last,
+    grad_image,
+    grad_depth,
+    pair_sums,
+    width,
+    height,
+    HAS_DEPTH: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """Walk the places ``end`` - 1 down to ``start`` and store each pair's sums."""
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    pixel = tl.arange(0, layout.TILE_PIXELS)
+    column = (tile % tiles_x) * layout.TILE + pixel % layout.TILE
+    line = (tile // tiles_x) * layout.TILE + pixel // layout.TILE
+    inside = (column < width) & (line < height)
+    x = column.to(tl.float32) + constants.PIXEL_CENTRE
+    y = line.to(tl.float32) + constants.PIXEL_CENTRE
+    at = line * width + column
+    deep = tl.load(last + at, mask=inside, other=0)
+    grad_red = tl.load(grad_image + at * 3, mask=inside, other=0.0)
+    grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
+    grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
+    number = chunk.to(tl.int64) * layout.TILE_PIXELS
+    t = tl.load(chunk_planes + number * PLANES + layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS + pixel)
+    far = tl.load(chunk_behind + number + pixel)
+    if HAS_DEPTH:
+        grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)
+    following = tl.load(pair_ids + end - 1)
+    for step in range(0, end - start):
+        place = end - 1 - step
+        g = following
+        following = tl.load(pair_ids + tl.maximum(place - 1, start))
+        row = splats + g.to(tl.int64) * layout.SPLAT_COLUMNS
+        u, dy, raw, blended = splat_alpha(x, y, row)
+        blended = tl.where(deep > place - begin, blended, 0.0)
+        inverse = 1.0 / (1.0 - blended)
+        t = t * inverse
+        weight = blended * t
+        gain = grad_red * tl.load(row + layout.RED)
+        gain += grad_green * tl.load(row + layout.GREEN)
+        gain += grad_blue * tl.load(row + layout.BLUE)
+        if HAS_DEPTH:
+            gain += grad_z * tl.load(row + layout.DEPTH)
+        own = weight * gain
+        v = tl.where(raw < constants.ALPHA_MAX, own - blended * (far * inverse), 0.0)
+        far += own
+        vu = v * u
+        vy = v * dy
+        sums = pair_sums + tl.load(pair_slots + place).to(tl.int64) * layout.PAIR_COLUMNS
+        tl.store(sums + layout.SUM_V, tl.sum(v, axis=0))
+        tl.store(sums + layout.SUM_VU, tl.sum(vu, axis=0))
+        tl.store(sums + layout.SUM_VY, tl.sum(vy, axis=0))
+        tl.store(sums + layout.SUM_VUU, tl.sum(vu * u, axis=0))
+        tl.store(sums + layout.SUM_VUY, tl.sum(vu * dy, axis=0))
+        tl.store(sums + layout.SUM_VYY, tl.sum(vy * dy, axis=0))
+        tl.store(sums + layout.SUM_RED, tl.sum(weight * grad_red, axis=0))
+        tl.store(sums + layout.SUM_GREEN, tl.sum(weight * grad_green, axis=0))
+        tl.store(sums + layout.SUM_BLUE, tl.sum(weight * grad_blue, axis=0))
+        if HAS_DEPTH:
+            tl.store(sums + layout.SUM_DEPTH, tl.sum(weight * grad_z, axis=0))

@@ -1,0 +1,53 @@
+"""Whether the GPU back end can run here, and what its failures mean."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from cleargs.errors import InputError, StageError
+from cleargs.splat.kernels import memory
+
+
+def on_gpu(device: torch.device) -> bool:
+    """Whether the GPU kernels serve tensors on ``device``; the one question that every dispatch asks."""
+    return device.type == "cuda"
+
+
+def require(device: torch.device) -> None:
+    """Raise InputError when the kernels cannot run on ``device``."""
+    if importlib.util.find_spec("triton") is None:
+        raise InputError(
+            "the GPU kernels need Triton, which is not installed",
+            hint="install it with pip install 'cleargs[cuda]', or use --device cpu",
+        )
+    if device.type == "cuda" and not torch.cuda.is_available():
+        built = "" if torch.version.cuda else ": this PyTorch is built for the CPU only"
+        raise InputError(
+            f"PyTorch finds no usable CUDA device{built}",
+            hint="install a CUDA build of PyTorch and the NVIDIA driver, or use --device cpu",
+        )
+
+
+def available_memory(device: torch.device) -> int:
+    """Bytes that tensors on ``device`` may still take: what is free there and what torch keeps for later."""
+    if device.type != "cuda":  # the interpreter's tensors
+        return memory.available_memory()
+    free, _ = torch.cuda.mem_get_info(device)
+    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return int(free + kept)
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Turn an exhausted device memory into a StageError that says what to change."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise StageError(
+            f"the GPU's memory is full: {str(error).splitlines()[0]}",
+            hint="lower g0.budget, cache_mb or ingest.max_size and run again: the last checkpoint is kept",
+        ) from error

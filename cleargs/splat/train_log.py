@@ -1,0 +1,84 @@
+"""The log of a training: one row a step, as arrays while it runs, a table at the end."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from cleargs.splat.tables import TRAIN
+from cleargs.splat.views import View
+
+_ROW = np.dtype(
+    [
+        ("frame_id", np.int32),
+        ("pseudo", np.bool_),
+        ("weight", np.float32),
+        ("width", np.int32),
+        ("height", np.int32),
+        ("loss", np.float64),
+        ("l1", np.float64),
+        ("ssim", np.float64),
+        ("psnr", np.float64),
+        ("n_gaussians", np.int32),
+        ("sh_degree", np.int32),
+    ]
+)
+
+_RECENT = 50
+"""Steps that a running mean looks back."""
+
+
+class TrainLog:
+    """What each of ``steps`` steps saw and what came of it. Steps count from 0 here, from 1 in the table."""
+
+    def __init__(self, steps: int) -> None:
+        self._rows = np.zeros(steps, _ROW)
+
+    def seen(
+        self, step: int, view: View, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
+    ) -> None:
+        """Write what a step trains on; `measured` fills in the rest."""
+        self._rows[step] = (
+            view.frame_id,
+            view.kind == "pseudo",
+            weight,
+            target.shape[1],
+            target.shape[0],
+            *(math.nan,) * 4,
+            n_gaussians,
+            sh_degree,
+        )
+
+    def measured(self, step: int, *, loss: float, l1: float, ssim: float, psnr: float) -> None:
+        """Write what a step measured, which from a GPU is known some steps later."""
+        self._rows[["loss", "l1", "ssim", "psnr"]][step] = (loss, l1, ssim, psnr)
+
+    def recent_psnr(self, done: int) -> float:
+        """Mean PSNR in dB of the last steps before ``done``; NaN before the first."""
+        recent = self._rows["psnr"][max(0, done - _RECENT) : done]
+        return float(recent.mean()) if len(recent) else math.nan
+
+    def packed(self, done: int) -> Tensor:
+        """The first ``done`` rows as bytes, for a checkpoint."""
+        return torch.from_numpy(self._rows[:done].view(np.uint8).copy())
+
+    def restore(self, packed: Tensor) -> None:
+        """Go on from what `packed` gave."""
+        rows = packed.numpy().view(_ROW)
+        self._rows[: len(rows)] = rows
+
+    def table(self, done: int, round: int) -> pa.Table:
+        """The first ``done`` rows, schema `cleargs.splat.tables.TRAIN`."""
+        rows = self._rows[:done]
+        columns: dict[str, Any] = {
+            "round": np.full(done, round),
+            "step": np.arange(1, done + 1),
+            "kind": np.where(rows["pseudo"], "pseudo", "real"),
+        }
+        columns |= {name: rows[name] for name in _ROW.names or () if name != "pseudo"}
+        return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)

@@ -1,0 +1,223 @@
+"""Compile every GPU kernel ahead of time, without a GPU, and print registers, stack and shared memory of
+each.
+
+    python tests/gpu/compile_kernels.py [COMPUTE_CAPABILITY]     (default 90, a Hopper GPU)
+
+The signatures are those of the launches in ``cleargs.splat.kernels.cuda``. Needs Triton, whose wheel brings
+ptxas.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from cleargs.splat.kernels.cuda import adam, binning, colour, densify, gradients, loss, projection, rasterise
+
+F32, F64, I16, I32, I64, U8 = "*fp32", "*fp64", "*i16", "*i32", "*i64", "*u8"
+SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
+SIZE = {"width": "i32", "height": "i32"}
+IMAGE = {"image": F32, "target": F32, "height": "i32", "length": "i32"}
+WINDOW = {"ROWS": loss.ROWS, "COLUMNS": loss.COLUMNS}
+GRADIENTS = {f"grad_{name}": F32 for name in SCENE}
+UNFUSED = {"enable_fp_fusion": False}
+
+
+def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
+    """(kernel, types of its run-time arguments, compile-time arguments, options of the launch)."""
+    found: list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]] = [
+        (
+            binning.list_pairs,
+            {
+                **{"splats": F32, "order": I64, "tile_counts": I32, "pair_ends": I64, "pair_starts": I32},
+                **{"pair_tiles": I16, "pair_owners": I32, "n": "i32", **SIZE},
+            },
+            {"BLOCK": 32},
+            {"num_warps": 1, **UNFUSED},
+        ),
+        (
+            binning.order_pairs,
+            {"sorted_slots": I64, "pair_owners": I32, "pair_ids": I32, "pair_slots": I32, "pairs": "i32"},
+            {"BLOCK": 1024},
+            {},
+        ),
+        (
+            gradients.total,
+            {"tile_counts": I32, "pair_starts": I32, "pair_sums": F32, "totals": F64, "n": "i32"},
+            {"COLUMNS": 9, "ROWS": 16, "BLOCK": 16},
+            {},
+        ),
+        (
+            adam.adam,
+            {
+                **dict.fromkeys(("parameter", "gradient", "first", "second", "rates"), F32),
+                **{"size": "i32", "columns": "i32"},
+                **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
+            },
+            {"BLOCK": adam.BLOCK},
+            {},
+        ),
+        (
+            colour.map_pixels,
+            {"image": F32, "affine": F32, "output": F32, "pixels": "i32"},
+            {"BLOCK": colour.BLOCK},
+            {},
+        ),
+        (
+            colour.map_backward,
+            {
+                **dict.fromkeys(("image", "affine", "grad_output", "grad_image"), F32),
+                **{"partials": F64, "pixels": "i32"},
+            },
+            {"BLOCK": colour.BLOCK},
+            {},
+        ),
+        (
+            densify.shake_kernel,
+            {
+                **{name: kind for name, kind in SCENE.items() if name != "sh"},
+                **{"n": "i32", "seed": "i64", "amount": "fp32", "min_opacity": "fp32", "cut": "fp32"},
+            },
+            {"BLOCK": densify.BLOCK},
+            {},
+        ),
+        (
+            loss.window_maps,
+            {"maps": F32, "sums": F32, "height": "i32", "length": "i32"},
+            WINDOW,
+            {},
+        ),
+    ]
+    for masked in (False, True):
+        mask = {"mask": U8 if masked else F32}
+        constants = {"HAS_MASK": masked, **WINDOW}
+        found += [
+            (loss.window_rows, {**IMAGE, **mask, "sums": F32}, constants, {}),
+            (loss.measure, {**IMAGE, **mask, "sums": F32, "maps": F32, "partials": F64}, constants, {}),
+            (
+                loss.differentiate,
+                {
+                    **{**IMAGE, **mask, "sums": F32, "totals": F64, "gradient": F32},
+                    **{"l1_weight": "fp32", "ssim_weight": "fp32"},
+                },
+                constants,
+                {},
+            ),
+        ]
+    for extra in (False, True):  # depth and anti-aliasing
+        frame = {"tile_starts": I32, "chunk_starts": I32, "chunk_planes": F32, "deepest": I32}
+        planes = {"PLANES": 4 + extra}
+        found += [
+            (
+                projection.project,
+                {
+                    **{
+                        **SCENE,
+                        "view": F64,
+                        "splats": F32,
+                        "depth_keys": F32,
+                        "tile_counts": I32,
+                        "radii": F32,
+                    },
+                    **{"n": "i32", **SIZE},
+                },
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "BLOCK": 128},
+                UNFUSED,
+            ),
+            (
+                rasterise.forward,
+                {
+                    **{**frame, "pair_ids": I32, "chunk_tiles": I32, "last": I32, **SIZE},
+                    **dict.fromkeys(
+                        ("splats", "background", "image", "alpha", "transmittance", "depth"), F32
+                    ),
+                },
+                {"WITH_DEPTH": extra, **planes},
+                {"num_warps": 2},
+            ),
+            (
+                rasterise.behind,
+                {
+                    **{"chunk_starts": I32, "chunk_planes": F32, "deepest": I32, **SIZE},
+                    **dict.fromkeys(("background", "transmittance", "grad_image", "grad_alpha"), F32),
+                    **{"grad_depth": F32, "chunk_behind": F32},
+                },
+                {"HAS_ALPHA": extra, "HAS_DEPTH": extra, **planes},
+                {},
+            ),
+            (
+                rasterise.backward,
+                {
+                    **{**frame, "chunk_tiles": I32, "pair_ids": I32, "pair_slots": I32, "last": I32, **SIZE},
+                    **dict.fromkeys(("chunk_behind", "splats", "grad_image", "grad_depth", "pair_sums"), F32),
+                    "tiles": "i32",
+                },
+                {"HAS_DEPTH": extra, **planes, "COLUMNS": 9 + extra},
+                {"num_warps": 1},
+            ),
+            (
+                gradients.backpropagate,
+                {
+                    **{**SCENE, "view": F64, "splats": F32, "tile_counts": I32, "totals": F64, **GRADIENTS},
+                    "n": "i32",
+                },
+                {"SH_STORED": 16, "SH_COUNT": 16, "ANTIALIAS": extra, "HAS_DEPTH": extra, "BLOCK": 128},
+                {},
+            ),
+        ]
+    return found
+
+
+def compiled(
+    kernel: Any, types: dict[str, str], constants: dict[str, Any], options: dict[str, Any], capability: int
+) -> Any:
+    """The compiled kernel; torch's memory is aligned to 16 bytes, as the launcher finds out by itself."""
+    names = [parameter.name for parameter in kernel.params]
+    assert set(names) == {*types, *constants}, kernel.__name__
+    source = ASTSource(
+        fn=kernel,
+        signature={name: types.get(name, "constexpr") for name in names},
+        constexprs={(names.index(name),): value for name, value in constants.items()},
+        attrs={
+            (names.index(name),): [["tt.divisibility", 16]]
+            for name, kind in types.items()
+            if kind.startswith("*")
+        },
+    )
+    return triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
+
+
+def resources(cubin: bytes) -> tuple[int, int]:
+    """Registers a thread, and stack bytes a thread (registers that were spilled)."""
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(cubin)
+        file.flush()
+        listing = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True)
+    found = re.search(r"REG:(\d+) STACK:(\d+)", listing.stdout)
+    assert found is not None, listing.stdout
+    return int(found[1]), int(found[2])
+
+
+def main() -> None:
+    capability = int(sys.argv[1]) if len(sys.argv) > 1 else 90
+    print(f"triton {triton.__version__}, sm_{capability}")
+    print("| kernel | registers | stack bytes | shared bytes |", "|---|---|---|---|", sep="\n")
+    for kernel, types, constants, options in cases():
+        result = compiled(kernel, types, constants, {"num_warps": 4, **options}, capability)
+        registers, stack = resources(result.asm["cubin"])
+        flags = "".join(f" {name.lower()}" for name, value in constants.items() if value is True)
+        shared = result.metadata.shared
+        print(f"| {kernel.__name__}{flags} | {registers} | {stack} | {shared} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""The first scene (stage g0) at full size on a GPU, from a run that was prepared elsewhere.
+
+    python tests/gpu/splat_stages.py RUN OUT [--steps 7000] [--budget 500000] [--device cuda]
+
+RUN holds the finished folders ``ingest`` and ``rva``, made by ``cleargs run CAPTURE -o RUN --until rva`` on
+any machine, with ``--set ingest.holdout=every:8`` for held-out frames, and ``--set ingest.max_size=...``
+where images are larger than 960 px. OUT gets the scene, its log and ``stages.json``: time, PSNR of the frames
+trained on and of those held out, and memory. What a time limit cuts off goes on from its checkpoint when the
+same command is given again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+
+from cleargs.capture.tables import load_frames
+from cleargs.pipeline.stage import StageContext
+from cleargs.progress import SilentReporter
+from cleargs.splat.compensation import read_exposure
+from cleargs.splat.config import G0Config
+from cleargs.splat.ply import read_ply
+from cleargs.splat.trainer import evaluate_views
+from cleargs.splat.views import view_of
+
+
+class Lines(SilentReporter):
+    """Remarks and warnings as lines."""
+
+    def info(self, text: str) -> None:
+        print(text, flush=True)
+
+    warn = info
+
+
+def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]:
+    """The stage, timed; its summary and what else is asked of it."""
+    inputs = {name: (run / name).resolve(strict=True) for name in ("ingest", "rva")}
+    folders = {name: out / name for name in ("g0", "checkpoints", "kept")}
+    for folder in folders.values():
+        folder.mkdir(parents=True, exist_ok=True)
+    going_on = any(folders["checkpoints"].iterdir())
+    # `stages` is the package `cleargs.stages`, as it lies in the repository; nothing need be installed.
+    stage = importlib.import_module("stages.g0")
+    start = time.perf_counter()
+    result = stage.run(
+        StageContext(
+            config=config,
+            source=run,
+            inputs=inputs,
+            externals={},
+            out=folders["g0"],
+            checkpoints=folders["checkpoints"],
+            kept=folders["kept"],
+            seed=0,
+            device=device,
+            threads=torch.get_num_threads(),
+            reporter=Lines(),
+        )
+    )
+    seconds = time.perf_counter() - start
+    return {
+        "seconds": None if going_on else round(seconds, 1),  # of the whole, decoding and evaluation included
+        **result.summary,
+        "psnr_held_out": held_out(inputs["ingest"], folders["g0"], device),
+        "peak_memory_gb": round(torch.cuda.max_memory_allocated() / 1e9, 2) if device == "cuda" else None,
+    }
+
+
+def held_out(ingest: Path, scene_folder: Path, device: Any) -> float | None:
+    """Mean PSNR in dB of the frames kept from training; None where there are none."""
+    frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "test"]
+    views = [view_of(frame, ingest, 1.0) for frame in frames]
+    scene = read_ply(scene_folder / "scene.ply").to(device)
+    values = evaluate_views(scene, views, read_exposure(scene_folder / "exposure.parquet"))
+    return fmean(values) if values else None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--steps", type=int, default=7000)
+    parser.add_argument("--budget", type=int, default=500_000)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda")
+    arguments = parser.parse_args()
+    config = G0Config(steps=arguments.steps, budget=arguments.budget)
+    found = train(arguments.run, arguments.out, config, arguments.device)
+    name = torch.cuda.get_device_name() if arguments.device == "cuda" else "cpu"
+    found |= {"device": name, "torch": torch.__version__, "python": sys.version.split()[0]}
+    (arguments.out / "stages.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    print(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()

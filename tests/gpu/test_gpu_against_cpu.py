@@ -1,0 +1,59 @@
+"""The GPU back end against the CPU's on scenes too large for the interpreter; runs on a device only."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from splat_scenes import make_camera, make_gaussians
+
+from cleargs.splat.engine import Engine
+from cleargs.splat.kernels.cuda import support
+
+
+@pytest.fixture(autouse=True)
+def needs_a_device(device):
+    if device.type != "cuda":
+        pytest.skip("needs a GPU: the interpreter would take hours")
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(("count", "size_px", "aspect"), [(20_000, 2.0, 2.0), (3_000, 12.0, 30.0)])
+def test_the_gpu_agrees_with_the_cpu(count, size_px, aspect, antialias, device):
+    camera = make_camera(633, 357)
+    gaussians = make_gaussians(camera, count, size_px=size_px, aspect=aspect)
+    upstream = torch.randn(357, 633, 3, generator=torch.Generator().manual_seed(0))
+    results = []
+    for where in ("cpu", device):
+        engine = Engine(where)
+        image = engine.forward(gaussians.to(where), camera, antialias=antialias).image
+        gradients = engine.backward(upstream.to(where))
+        results.append((image.cpu(), gradients.to("cpu"), engine.visible.cpu()))
+    (image, gradients, visible), (other_image, other_gradients, other_visible) = results
+    assert torch.equal(visible, other_visible)
+    assert visible.double().mean() > 0.5
+    # A pixel whose alpha lies on the cut may fall on either side: 1/255 of one splat's colour, in very few
+    # pixels.
+    apart = (image - other_image).abs().amax(dim=2)
+    assert (apart > 1e-5).double().mean() < 1e-3
+    assert apart.max() < 0.05
+    for name, gradient in gradients.tensors().items():
+        error = (getattr(other_gradients, name) - gradient).double()
+        assert error.norm() < 1e-3 * gradient.double().norm(), name
+
+
+def test_memory_is_bounded_and_grows_with_the_scene(device):
+    engine, camera = Engine(device), make_camera(640, 360)
+    small, large = (make_gaussians(camera, count, size_px=2.0).to(device) for count in (5_000, 50_000))
+    for gaussians in (small, large, small, large):
+        engine.backward(torch.ones_like(engine.forward(gaussians, camera).image))
+    held = torch.cuda.memory_allocated(device)
+    for _ in range(5):
+        engine.backward(torch.ones_like(engine.forward(large, camera).image))
+    assert torch.cuda.memory_allocated(device) <= held
+
+
+def test_a_full_memory_names_what_to_change(device):
+    from cleargs.errors import StageError
+
+    with pytest.raises(StageError, match="memory is full"), support.memory_errors():
+        torch.empty(2**50, dtype=torch.uint8, device=device)

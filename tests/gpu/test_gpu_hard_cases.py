@@ -1,0 +1,183 @@
+"""The hard cases of ``tests/splat/test_hard_cases.py`` on the GPU kernels: smaller, same tolerances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gpu_checks import assert_close
+from splat_scenes import BACKGROUND, at, compare, leaves, make_camera, make_gaussians, make_needles
+
+from cleargs.splat.adam import adam_step
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels import reference
+from cleargs.splat.losses import photometric_loss
+from cleargs.splat.render import render
+
+pytestmark = pytest.mark.usefixtures("compare_on_device")
+
+
+def join(*parts: Gaussians) -> Gaussians:
+    groups = [part.tensors() for part in parts]
+    return Gaussians(**{name: torch.cat([group[name] for group in groups]) for name in groups[0]})
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(("distance", "image", "gradient"), [(1500.0, 2e-4, 5e-4), (5e4, 5e-3, 2e-2)])
+def test_needles_centred_far_away(distance, image, gradient, antialias):
+    """The centre is held in float32, which the needle's thin side feels; CPU and GPU feel the same."""
+    camera = make_camera(36, 27)
+    needles = make_needles(camera, 12, length_px=distance, aspect=1e4, distance=distance)
+    result = compare(needles, camera, antialias=antialias, margin=2e-3)
+    assert result.alpha.max() > 0.2
+    assert_close(result, image, gradient)
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_determinant_that_rounds_to_zero_or_below(antialias):
+    camera = make_camera(36, 27)
+    needles = make_needles(camera, 12, length_px=1e4, aspect=1e5)
+    conics = reference.project(leaves(needles, torch.float64).detach(), camera, 16, antialias).conics
+    covariances = torch.linalg.inv(conics[:, [0, 1, 1, 2]].reshape(-1, 2, 2)).float()
+    naive = covariances[:, 0, 0] * covariances[:, 1, 1] - covariances[:, 0, 1] ** 2
+    assert (naive <= 0).any()
+    assert_close(compare(needles, camera, antialias=antialias), image=2e-5, gradient=5e-5)
+
+
+def test_no_thickness_at_all(device):
+    """Disks seen edge-on, lines seen end-on and points; with anti-aliasing what has no area is invisible."""
+    camera = make_camera(36, 27)
+    gaussians = make_gaussians(camera, 16)
+    gaussians.log_scales[:8, 0] = -100.0
+    gaussians.log_scales[4:8, 1] = -100.0
+    gaussians.log_scales[8:12] = -100.0
+    assert_close(compare(gaussians, camera))
+    engine = Engine(device)
+    image = engine.forward(gaussians.to(device), camera, antialias=True).image
+    assert not engine.visible[4:12].any()
+    assert engine.visible[12:].any()
+    gradients = engine.backward(torch.ones_like(image))
+    assert all(tensor.isfinite().all() for tensor in gradients.tensors().values())
+    assert all(not tensor[4:12].any() for tensor in gradients.tensors().values())
+
+
+def test_a_wall_facing_a_turned_camera_is_ordered_by_depth_then_index():
+    """Splats at one depth up to the rounding of their means: by definition depths are compared as float32."""
+    camera = make_camera(16, 16)
+    gaussians = make_gaussians(camera, 150, opacity=(0.02, 0.3), size_px=3.0)
+    pose = torch.as_tensor(camera.world_to_camera)
+    local = gaussians.means.double() @ pose[:3, :3].T + pose[:3, 3]
+    gaussians.means[:] = at(camera, (local * (4.0 / local[:, 2:])).numpy())
+    depths = gaussians.means.double() @ pose[2, :3] + pose[2, 3]
+    assert len(depths.unique()) > 100
+    assert len(depths.float().unique()) < 3
+    assert_close(compare(gaussians, camera))
+
+
+def test_all_transparent(device):
+    camera = make_camera(20, 18)
+    gaussians = make_gaussians(camera, 12)
+    gaussians.logit_opacities[:] = float(-np.log(255.1 - 1))
+    engine = Engine(device)
+    result = engine.forward(gaussians.to(device), camera, background=BACKGROUND, depth=True)
+    assert torch.equal(result.image.cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert not result.alpha.any()
+    gradients = engine.backward(torch.ones_like(result.image), torch.ones_like(result.alpha))
+    assert all(not tensor.any() for tensor in gradients.tensors().values())
+    gaussians.logit_opacities[:] = float(-np.log(254.9 - 1))
+    gaussians.log_scales[:] = 1.0
+    assert render(gaussians.to(device), camera).alpha.any()
+
+
+def test_what_saturated_pixels_hide_has_no_gradient(device):
+    """Behind an opaque wall T is under 1e-4: hidden splats get exactly 0, those beside the wall do not."""
+    camera = Camera(32, 16, 60.0, 60.0, 16.0, 8.0, np.eye(4))
+    gaussians = make_gaussians(camera, 24, size_px=1.0)
+    wall, hidden = slice(0, 8), slice(8, 14)
+    gaussians.means[wall] = torch.tensor([-0.2, 0.0, 1.0])
+    gaussians.log_scales[wall] = float(np.log(0.1))
+    gaussians.logit_opacities[wall] = 5.0
+    gaussians.means[hidden] = torch.tensor([-1.0, 0.0, 5.0])
+    gaussians.log_scales[hidden] = float(np.log(0.02))
+    result = compare(gaussians, camera)
+    assert_close(result)
+    assert (result.alpha > 1 - 1.5e-4).any()
+    assert (result.alpha < 0.5).any()
+    engine = Engine(device)
+    image = engine.forward(gaussians.to(device), camera).image
+    gradients = engine.backward(torch.ones_like(image))
+    assert engine.visible[hidden].all()
+    assert all(not tensor[hidden].any() for tensor in gradients.tensors().values())
+    assert gradients.sh[wall].any()
+    assert gradients.sh[14:].any()
+
+
+def test_depths_beyond_float32_are_culled(device):
+    camera = make_camera(20, 18)
+    gaussians = make_gaussians(camera, 10)
+    others = gaussians.select(torch.arange(10) != 7)
+    gaussians.means[7] = 3.4e38 * torch.as_tensor(np.sign(camera.world_to_camera[2, :3]), dtype=torch.float32)
+    gaussians.log_scales[7] = 88.0
+    result, expected = (render(scene.to(device), camera) for scene in (gaussians, others))
+    assert torch.equal(result.image, expected.image)
+    assert torch.equal(result.depth, expected.depth)
+
+
+def test_weight_zero_gives_exactly_no_gradient_and_weight_two_twice_that_of_one(device):
+    camera = make_camera(20, 18)
+    gaussians = make_gaussians(camera, 12).to(device)
+    target = torch.rand(18, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    engine = Engine(device)
+    image = engine.forward(gaussians, camera, background=BACKGROUND).image
+
+    def gradients(weight: float) -> Gaussians:
+        slope = photometric_loss(image, target, ssim_lambda=0.2, weight=weight).grad_image
+        return engine.backward(slope).clone()
+
+    assert all(not tensor.any() for tensor in gradients(0.0).tensors().values())
+    one, two = gradients(1.0), gradients(2.0)
+    for name, tensor in one.tensors().items():
+        assert tensor.any(), name
+        assert torch.equal(2.0 * tensor, getattr(two, name)), name
+
+
+def test_training_on_every_hard_case_at_once_stays_finite(device):
+    camera = make_camera(32, 16)
+    odd = make_gaussians(camera, 30)
+    odd.log_scales[:5] = torch.linspace(-60, 30, 5)[:, None]
+    odd.rotations[5:8] = 0.0
+    odd.rotations[8:14] *= torch.logspace(-20, 15, 6)[:, None]
+    odd.logit_opacities[14:20] = torch.linspace(-90, 90, 6)
+    odd.means[20:25] = at(camera, np.linspace(-0.02, 0.03, 5)[:, None] * [0.3, -0.2, 1.0])
+    odd.sh[25:28] *= 1e4
+    needles = make_needles(camera, 6, length_px=1e4, aspect=1e6)
+    far = make_needles(camera, 6, length_px=1e6, aspect=1e4, distance=1e6)
+    scene = join(odd, needles, far).to(device)
+    target = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
+    engine = Engine(device)
+    for step in range(1, 5):
+        image = engine.forward(scene, camera, antialias=step % 2 == 0).image
+        loss = photometric_loss(image, target, ssim_lambda=0.2)
+        assert np.isfinite(loss.loss)
+        for name, gradient in engine.backward(loss.grad_image).tensors().items():
+            assert gradient.isfinite().all(), (step, name)
+            adam_step(getattr(scene, name), gradient, *moments[name], step=step, lr=1e-2)
+            assert getattr(scene, name).isfinite().all(), (step, name)
+
+
+@pytest.mark.parametrize(
+    ("seed", "size", "focal", "size_px", "aspect", "opacity", "degree", "antialias"),
+    [
+        (1, (19, 33), 400.0, 15.0, 50.0, (0.05, 0.95), 2, False),
+        (2, (33, 17), 30.0, 0.2, 900.0, (0.9, 0.9999), 3, True),
+        (3, (7, 22), 2000.0, 35.0, 5.0, (0.005, 0.1), 1, True),
+    ],
+)
+def test_any_scene_equals_oracle(seed, size, focal, size_px, aspect, opacity, degree, antialias):
+    camera = make_camera(*size, focal)
+    gaussians = make_gaussians(camera, 14, seed=seed, opacity=opacity, size_px=size_px, aspect=aspect)
+    result = compare(gaussians, camera, sh_degree=degree, antialias=antialias, margin=2e-3)
+    assert_close(result, image=1e-5, gradient=3e-4)

@@ -1,0 +1,326 @@
+"""Loss, Adam, exposure, densification and training on the GPU kernels, against float64 or the CPU."""
+
+from __future__ import annotations
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+import splat_toy
+import torch
+
+from cleargs.errors import InputError, StageError
+from cleargs.progress import SilentReporter
+from cleargs.splat import strategy
+from cleargs.splat.adam import adam_step
+from cleargs.splat.compensation import Exposure
+from cleargs.splat.config import TrainConfig
+from cleargs.splat.exposure import affine_backward, apply_affine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.losses import photometric_loss, psnr, ssim
+from cleargs.splat.state import load_state
+from cleargs.splat.trainer import Trainer, evaluate_views, train
+from cleargs.splat.views import ImageCache
+
+
+@pytest.fixture
+def densify(device):
+    """The module, imported late, since it imports Triton."""
+    return importlib.import_module("cleargs.splat.kernels.cuda.densify")
+
+
+def images(device, height=14, width=19):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(height, width, 3, generator=generator)
+    image = (target + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+    return image.to(device), target.to(device), generator
+
+
+def ssim_map(image, target):
+    """SSIM by a full 11 x 11 convolution with zero padding, [H, W, 3]."""
+    window = torch.exp(-((torch.arange(11, dtype=image.dtype, device=image.device) - 5) ** 2) / (2 * 1.5**2))
+    window = window / window.sum()
+    kernel = (window[:, None] * window[None])[None, None].expand(3, 1, 11, 11)
+
+    def mean(x):
+        padded = x.permute(2, 0, 1)[None]
+        return torch.nn.functional.conv2d(padded, kernel, padding=5, groups=3)[0].permute(1, 2, 0)
+
+    m, n = mean(image), mean(target)
+    variances = mean(image**2) - m**2 + mean(target**2) - n**2
+    covariance = mean(image * target) - m * n
+    return ((2 * m * n + 0.01**2) * (2 * covariance + 0.03**2)) / (
+        (m**2 + n**2 + 0.01**2) * (variances + 0.03**2)
+    )
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [(14, 50), (1, 1), (3, 46), (30, 2)])
+def test_photometric_loss_equals_torch(size, masked, device):
+    image, target, generator = images(device, *size)
+    mask = (torch.rand(size, generator=generator) > 0.3).to(device) if masked else None
+    if mask is not None:
+        mask[0, 0] = True
+    result = photometric_loss(image, target, ssim_lambda=0.2, weight=0.7, mask=mask)
+
+    x, y = image.double().requires_grad_(), target.double()
+    kept = x.new_ones(*size, 1) if mask is None else mask[..., None].double()
+    count = 3 * kept.sum()
+    l1 = ((x - y).abs() * kept).sum() / count
+    similarity = (ssim_map(x * kept, y * kept) * kept).sum() / count
+    loss = 0.7 * (0.8 * l1 + 0.2 * (1 - similarity))
+    loss.backward()
+    # The tolerances of the CPU kernels: variances are differences of float32 means, 6e-8 against C2 = 9e-4.
+    assert result.loss == pytest.approx(loss.item(), abs=1e-6)
+    assert result.l1 == pytest.approx(l1.item(), abs=1e-7)
+    assert result.ssim == pytest.approx(similarity.item(), abs=1e-6)
+    assert (result.grad_image - x.grad).abs().max() < 3e-6 * x.grad.abs().max()
+    assert ssim(image, target, mask) == result.ssim
+    error = ((x - y) ** 2 * kept).sum() / count
+    assert psnr(image, target, mask) == pytest.approx(-10 * math.log10(error.item()), abs=1e-9)
+    if mask is not None:
+        assert not result.grad_image[~mask].any()
+
+
+def test_weight_zero_and_nothing_kept(device):
+    image, target, _ = images(device)
+    nothing = photometric_loss(image, target, ssim_lambda=0.2, weight=0.0)
+    assert nothing.loss == 0.0
+    assert not nothing.grad_image.any()
+    hidden = torch.zeros(image.shape[:2], dtype=torch.bool, device=device)
+    nothing = photometric_loss(image, target, ssim_lambda=0.2, mask=hidden)
+    assert (nothing.loss, nothing.ssim) == (0.0, 1.0)
+    assert not nothing.grad_image.any()
+    assert psnr(image, image) == math.inf
+
+
+@pytest.mark.parametrize("shape", [(40, 16, 3), (1100, 3), (9,)])
+def test_adam_equals_torch(shape, device):
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(shape, generator=generator)
+    mine = start.to(device)
+    first, second = torch.zeros_like(mine), torch.zeros_like(mine)
+    theirs = start.double().requires_grad_()
+    optimiser = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.999), eps=1e-15)
+    for step in range(1, 5):
+        gradient = torch.randn(shape, generator=generator)
+        gradient[0] = 0.0
+        theirs.grad = gradient.double()
+        optimiser.step()
+        adam_step(mine, gradient.to(device), first, second, step=step, lr=1e-2)
+    assert (mine.cpu() - theirs).abs().max() < 2e-6
+    assert torch.equal(mine.cpu()[0], start[0])
+
+
+def test_adam_takes_a_rate_per_column(device):
+    generator = torch.Generator().manual_seed(0)
+    start, gradient = (torch.randn(50, 4, 3, generator=generator).to(device) for _ in range(2))
+    rates = torch.linspace(0.001, 0.012, 12)
+    mine, first, second = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+    adam_step(mine, gradient, first, second, step=1, lr=rates)
+    expected = gradient.sign() * rates.to(device).reshape(4, 3)
+    torch.testing.assert_close(start - mine, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_exposure_equals_autograd(device):
+    image, upstream, generator = images(device)
+    affine = torch.eye(3, 4) + 0.1 * torch.randn(3, 4, generator=generator)
+    x, a = image.double().requires_grad_(), affine.double().to(device).requires_grad_()
+    output = torch.einsum("cs,hws->hwc", a[:, :3], x) + a[:, 3]
+    (output * upstream).sum().backward()
+    assert (apply_affine(image, affine) - output).abs().max() < 1e-6
+    grad_image, grad_affine = affine_backward(image, affine, upstream)
+    assert (grad_image - x.grad).abs().max() < 1e-6
+    assert (grad_affine - a.grad).abs().max() < 1e-6 * a.grad.abs().max()
+
+
+def test_split_opacity_is_the_strategys(densify):
+    rng = np.random.default_rng(0)
+    opacity, copies = rng.uniform(0.01, 0.99, 200), rng.integers(2, 9, 200)
+    split, factor = densify.split_opacity(torch.from_numpy(opacity), torch.from_numpy(copies))
+    expected = strategy.split_opacity(opacity, copies)
+    # Alternating binomial sums lose digits with the number of copies: 2e-14 for two, 1e-10 for eight.
+    np.testing.assert_allclose(split.numpy(), expected[0], rtol=1e-12)
+    np.testing.assert_allclose(factor.numpy(), expected[1], rtol=1e-9)
+
+
+def crowd(count, device):
+    made = splat_toy.gaussians(count)
+    made.logit_opacities[:] = torch.linspace(-8.0, 3.0, count)
+    return made.to(device)
+
+
+def test_samples_follow_the_weights(device, densify):
+    weights = torch.tensor([0.0, 0.1, 0.0, 0.3, 0.6, 0.0], device=device)
+    drawn = densify.sample(weights, 20_000, densify.generator_of(3, device))
+    shares = torch.bincount(drawn, minlength=6).double().cpu() / 20_000
+    # The standard deviation of a share is at most 0.0035.
+    assert (shares - weights.double().cpu()).abs().max() < 0.015
+    assert shares[[0, 2, 5]].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_relocation_moves_the_dead_and_keeps_the_sum_of_opacity_plausible(device, densify):
+    gaussians = crowd(40, device)
+    opacity = gaussians.logit_opacities.sigmoid()
+    dead = opacity <= 0.01
+    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
+    before = gaussians.clone()
+    moved = densify.relocate(gaussians, moments, min_opacity=0.01, seed=5)
+    assert moved == int(dead.sum()) > 5
+    after = gaussians.logit_opacities.sigmoid()
+    assert (after > 0.00999).all()
+    assert (after[~dead] <= opacity[~dead] + 1e-6).all()
+    # Each dead one lies where a live one lies; what changed has lost its moments, the rest is as it was.
+    same_place = (gaussians.means[dead][:, None] == before.means[~dead][None]).all(dim=2)
+    assert same_place.any(dim=1).all()
+    untouched = (gaussians.logit_opacities == before.logit_opacities) & ~dead
+    assert untouched.any()
+    assert torch.equal(moments[0]["means"][:, 0] == 1, untouched)
+    again = before.clone()
+    densify.relocate(again, [], min_opacity=0.01, seed=5)
+    assert all(
+        torch.equal(a, b) for a, b in zip(again.tensors().values(), gaussians.tensors().values(), strict=True)
+    )
+
+
+def test_growth_stops_at_the_budget(device, densify):
+    gaussians = crowd(40, device)
+    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
+    grown, forgotten = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    assert grown.num == 55
+    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in forgotten[0].values())
+    same, _ = densify.grow(grown, forgotten, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    assert same is grown
+
+
+def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
+    count = 6000
+    one = splat_toy.gaussians(1)
+    gaussians = Gaussians(
+        *(tensor.repeat(count, *[1] * (tensor.ndim - 1)) for tensor in one.tensors().values())
+    )
+    gaussians.logit_opacities[:] = -9.0
+    gaussians.logit_opacities[:10] = 2.0
+    gaussians = gaussians.to(device)
+    start = gaussians.means.clone()
+    densify.shake(gaussians, amount=2.0, min_opacity=0.005, seed=11)
+    offsets = (gaussians.means - start).double().cpu()
+    assert not offsets[:10].any()
+    rotation = strategy.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
+    covariance = rotation @ np.diag(np.exp(2.0 * one.log_scales[0].double().numpy())) @ rotation.T
+    # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ²; a sample's entries are good to some per cent.
+    fade = 1.0 / (1.0 + math.exp(-100.0 * (0.005 - 1.0 / (1.0 + math.exp(9.0)))))
+    expected = 4.0 * fade**2 * covariance @ covariance
+    measured = (offsets[10:].T @ offsets[10:] / (count - 10)).numpy()
+    assert np.abs(measured - expected).max() < 0.06 * np.abs(expected).max()
+    assert np.abs(offsets[10:].mean(dim=0).numpy()).max() < 0.05 * math.sqrt(np.abs(expected).max())
+
+
+CONFIG = TrainConfig(
+    steps=5,
+    refine_interval=2,
+    refine_start=0.1,
+    budget=14,
+    growth=0.3,
+    checkpoint_interval=3,
+    sh_interval=2,
+    coarse_share=0.4,
+    lr_means=2e-3,
+)
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """Three random pictures of 20 x 15 px; training needs no more to be compared."""
+    monkeypatch.setattr(splat_toy, "WIDTH", 20)
+    monkeypatch.setattr(splat_toy, "HEIGHT", 15)
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 256, (15, 20, 3), dtype=np.uint8) for _ in range(3)]
+    return splat_toy.views(pictures, weights=[1.0, 0.5, 0.25])
+
+
+def trained_on(device, views, folder, *, config=CONFIG, exposure=None):
+    return train(
+        splat_toy.start(12, sh_degree=1),
+        views,
+        config,
+        seed=(7,),
+        exposure=exposure,
+        checkpoint=folder / "state.safetensors",
+        reporter=SilentReporter(),
+        device=str(device),
+    )
+
+
+def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_path):
+    exposure = Exposure.identity([view.frame_id for view in toy])
+    whole = trained_on(device, toy, tmp_path, exposure=exposure)
+    assert whole.scene.gaussians.num == 14
+    assert whole.scene.gaussians.device.type == "cpu"
+    assert whole.exposure is not None
+    assert whole.exposure.enabled
+    rows = whole.rows.to_pydict()
+    assert rows["step"] == [1, 2, 3, 4, 5]
+    assert rows["width"] == [10, 10, 20, 20, 20]
+    assert all(0.0 < loss < 1.0 for loss in rows["loss"])
+    assert all(0.0 < value < 50.0 for value in rows["psnr"])
+    # The checkpoint of step 3 is still there: going on from it does steps 4 and 5 again.
+    saved = load_state(tmp_path / "state.safetensors", SilentReporter())
+    assert saved is not None
+    assert int(saved["step"]) == 3
+    resumed = trained_on(device, toy, tmp_path, exposure=exposure)
+    assert resumed.rows.equals(whole.rows)
+    for name, tensor in whole.state.items():
+        assert torch.equal(tensor, resumed.state[name]), name
+
+
+def test_training_follows_the_cpu(toy, device, tmp_path, monkeypatch):
+    """Without densification, whose random numbers differ, both back ends take the same steps."""
+    config = CONFIG.model_copy(update={"densify": False, "steps": 3})
+    on_gpu = trained_on(device, toy, tmp_path / "gpu", config=config)
+    from cleargs.splat.kernels.cuda import support
+
+    monkeypatch.setattr(support, "on_gpu", lambda device: False)
+    on_cpu = trained_on("cpu", toy, tmp_path / "cpu", config=config)
+    assert on_gpu.rows.column("frame_id").equals(on_cpu.rows.column("frame_id"))
+    for name in ("loss", "l1", "ssim", "psnr"):
+        expected = on_cpu.rows.column(name).to_pylist()
+        assert on_gpu.rows.column(name).to_pylist() == pytest.approx(expected, rel=1e-4), name
+    # Adam divides by the root of the second moment, so that a gradient near 0 may change its sign: few do.
+    for name, expected in on_cpu.scene.gaussians.tensors().items():
+        error = (getattr(on_gpu.scene.gaussians, name) - expected).abs()
+        assert (error < 1e-4).double().mean() > 0.97, name
+
+
+def test_evaluation_on_the_device(toy, device):
+    scene = splat_toy.start(8)
+    values = evaluate_views(scene.to(device), toy)
+    cache = ImageCache(0, device)
+    target, _ = cache.get(toy[1])
+    assert target.device.type == device.type
+    assert torch.equal(target.cpu(), torch.from_numpy(toy[1].load()[0] / np.float32(255.0)))
+    assert all(5.0 < value < 20.0 for value in values)
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(toy, device):
+    trainer = Trainer(splat_toy.start(6), toy, CONFIG, seed=(1,), device=str(device))
+    trainer.scene.gaussians.sh[2] = 1e38
+    with pytest.raises(StageError, match="not finite"):
+        for _ in range(2):
+            trainer.step()
+        trainer.rows(0)
+
+
+def test_a_parameter_that_is_not_finite_is_named(toy, device):
+    trainer = Trainer(splat_toy.start(6), toy, CONFIG, seed=(1,), device=str(device))
+    trainer.check_finite()
+    trainer.scene.gaussians.sh[2, 0, 1] = math.nan
+    with pytest.raises(StageError, match="sh is not finite in 1 of 6 Gaussians at step 0"):
+        trainer.check_finite()
+
+
+def test_adam_refuses_tensors_that_do_not_fit(device):
+    one = torch.zeros(4, device=device)
+    with pytest.raises(InputError, match="Adam got"):
+        adam_step(one, one[:2], one.clone(), one.clone(), step=1, lr=0.1)

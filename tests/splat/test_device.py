@@ -1,0 +1,77 @@
+"""A GPU that cannot be used is refused with a reason and a remedy."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+import torch
+
+from cleargs.cli import common
+from cleargs.cli.main import main
+from cleargs.errors import InputError
+from cleargs.pipeline.keys import KeyParts, key_config, library_versions
+from cleargs.splat.engine import Engine
+from cleargs.splat.kernels.cuda import support
+
+
+def test_engine_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError) as caught:
+        Engine("cuda")
+    assert "--device cpu" in caught.value.hint
+    monkeypatch.setattr(support.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="Triton") as caught:
+        Engine("cuda")
+    assert "cleargs[cuda]" in caught.value.hint
+    with pytest.raises(InputError, match="no meta back end"):
+        Engine("meta")
+
+
+def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "exists", lambda self: False)
+    assert common.resolve_device("auto") == "cpu"
+    with pytest.raises(InputError, match="no NVIDIA GPU"):
+        common.resolve_device("cuda")
+    monkeypatch.setattr(Path, "exists", lambda self: True)
+    monkeypatch.setattr(common, "find_spec", lambda name: None)
+    assert "Triton" in (common.cuda_obstacle() or "")
+    monkeypatch.setattr(common, "find_spec", lambda name: object())
+    monkeypatch.setattr(common, "version", lambda name: "2.13.0+cpu")
+    assert "CPU only" in (common.cuda_obstacle() or "")
+    monkeypatch.setattr(common, "version", lambda name: "2.13.0")
+    assert common.resolve_device("cuda") == "cuda"
+    # Not before the back end has passed its tests on a device.
+    assert common.resolve_device("auto") == common.resolve_device("cpu") == "cpu"
+
+
+@pytest.mark.parametrize("stage", ["g0", "rivr", "consolidate"])
+def test_the_device_is_part_of_the_key(stage: str) -> None:
+    module = importlib.import_module(f"cleargs.stages.{stage}")
+    parts = KeyParts(
+        stage=stage,
+        version=module.VERSION,
+        config=key_config(module.CONFIG()),
+        inputs={},
+        externals={},
+        seed=0,
+        device="cpu",
+        libraries=library_versions(module.LIBRARIES),
+    )
+    assert parts.key != parts.model_copy(update={"device": "cuda"}).key
+
+
+def test_the_gpu_benchmark_says_what_it_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(common, "cuda_obstacle", lambda: "there is no NVIDIA GPU")
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", "splat", "--device", "cuda"])
+    assert caught.value.code == 2
+    message = capsys.readouterr().err
+    assert "there is no NVIDIA GPU" in message
+    assert "--device cpu" in message
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", "splat", "--device", "cuda", "--threads", "2"])
+    assert caught.value.code == 2
