@@ -9,6 +9,7 @@ from cleargs.bench.oracle import MARGIN, Accuracy, Error
 from cleargs.bench.results import Benchmark, Comparison, Machine, Rooflines, Row, ScalingPoint
 from cleargs.bench.scaling import straight_line
 from cleargs.bench.timing import Quartiles
+from cleargs.splat.kernels.cpu.simd import LANES
 
 NOT_RUN = "not run"
 UNKNOWN = "unknown"
@@ -179,8 +180,8 @@ def _roofline(found: Rooflines | None) -> list[str]:
         "time is the larger of operations and bytes at the measured peaks; reached is least time / time. "
         "More than 100 % means that the caches serve what memory would have to.",
         f"{found.size.pairs:,} pairs, {found.size.contributions:,} contributions of a splat to a pixel in "
-        f"{found.size.vectors:,} vectors of eight pixels: "
-        f"{found.size.contributions / max(1, found.size.vectors):.1f} of eight lanes do work.",
+        f"{found.size.vectors:,} vectors of {LANES} pixels: "
+        f"{found.size.contributions / max(1, found.size.vectors):.1f} of {LANES} lanes do work.",
     ]
     for threads, roofs in found.kernels.items():
         peaks = found.peaks[threads]
@@ -198,7 +199,7 @@ def _roofline(found: Rooflines | None) -> list[str]:
             for roof in roofs
         ]
         parts += [
-            f"{_plural(threads)}: peak {peaks.gflops:.0f} GFLOP/s (multiply-adds of eight lanes), "
+            f"{_plural(threads)}: peak {peaks.gflops:.0f} GFLOP/s (multiply-adds of {LANES} lanes), "
             f"{peaks.gbytes:.1f} GB/s (copy).",
             table(["kernel", "Mop", "MB", "ms", "GFLOP/s", "GB/s", "bound by", "reached"], lines),
         ]

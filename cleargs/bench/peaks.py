@@ -10,7 +10,7 @@ from numba import prange
 
 from cleargs.bench.iteration import use_threads
 from cleargs.splat.kernels.cpu.jit import Floats, kernel
-from cleargs.splat.kernels.cpu.simd import LANES, broadcast8, load8, store8
+from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, store
 
 CHAINS = 12
 """Independent multiply-adds in flight: two pipes times the latency of four or five cycles, and some more."""
@@ -28,30 +28,30 @@ HALF = np.float32(0.5)
 class Peaks:
     """Best of the repeats; a fused multiply-add is two operations, a copied byte is read and written."""
 
-    gflops: float  # 1e9 float32 operations per second in the kernels' vectors of eight
+    gflops: float  # 1e9 float32 operations per second in the kernels' vectors
     gbytes: float  # 1e9 bytes per second, read and written
 
 
 @kernel
 def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float32, values: Floats) -> None:
-    """CHAINS independent chains x = x m + c of eight lanes on every worker."""
+    """CHAINS independent chains x = x m + c of LANES lanes on every worker."""
     for worker in prange(workers):
         start = worker * CHAINS * LANES
         # Nothing that the compiler could see through: it would compute equal chains once, and fold steps by
         # known numbers into one.
-        m, c = broadcast8(factor), broadcast8(addend)
-        x0 = load8(values, start + 0 * LANES)
-        x1 = load8(values, start + 1 * LANES)
-        x2 = load8(values, start + 2 * LANES)
-        x3 = load8(values, start + 3 * LANES)
-        x4 = load8(values, start + 4 * LANES)
-        x5 = load8(values, start + 5 * LANES)
-        x6 = load8(values, start + 6 * LANES)
-        x7 = load8(values, start + 7 * LANES)
-        x8 = load8(values, start + 8 * LANES)
-        x9 = load8(values, start + 9 * LANES)
-        x10 = load8(values, start + 10 * LANES)
-        x11 = load8(values, start + 11 * LANES)
+        m, c = broadcast(factor), broadcast(addend)
+        x0 = load(values, start + 0 * LANES)
+        x1 = load(values, start + 1 * LANES)
+        x2 = load(values, start + 2 * LANES)
+        x3 = load(values, start + 3 * LANES)
+        x4 = load(values, start + 4 * LANES)
+        x5 = load(values, start + 5 * LANES)
+        x6 = load(values, start + 6 * LANES)
+        x7 = load(values, start + 7 * LANES)
+        x8 = load(values, start + 8 * LANES)
+        x9 = load(values, start + 9 * LANES)
+        x10 = load(values, start + 10 * LANES)
+        x11 = load(values, start + 11 * LANES)
         for _ in range(steps):
             x0 = x0 * m + c
             x1 = x1 * m + c
@@ -65,18 +65,18 @@ def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float3
             x9 = x9 * m + c
             x10 = x10 * m + c
             x11 = x11 * m + c
-        store8(values, start + 0 * LANES, x0)
-        store8(values, start + 1 * LANES, x1)
-        store8(values, start + 2 * LANES, x2)
-        store8(values, start + 3 * LANES, x3)
-        store8(values, start + 4 * LANES, x4)
-        store8(values, start + 5 * LANES, x5)
-        store8(values, start + 6 * LANES, x6)
-        store8(values, start + 7 * LANES, x7)
-        store8(values, start + 8 * LANES, x8)
-        store8(values, start + 9 * LANES, x9)
-        store8(values, start + 10 * LANES, x10)
-        store8(values, start + 11 * LANES, x11)
+        store(values, start + 0 * LANES, x0)
+        store(values, start + 1 * LANES, x1)
+        store(values, start + 2 * LANES, x2)
+        store(values, start + 3 * LANES, x3)
+        store(values, start + 4 * LANES, x4)
+        store(values, start + 5 * LANES, x5)
+        store(values, start + 6 * LANES, x6)
+        store(values, start + 7 * LANES, x7)
+        store(values, start + 8 * LANES, x8)
+        store(values, start + 9 * LANES, x9)
+        store(values, start + 10 * LANES, x10)
+        store(values, start + 11 * LANES, x11)
 
 
 @kernel

@@ -27,6 +27,7 @@ from cleargs.splat.kernels.cpu.layout import (
     TILE,
 )
 from cleargs.splat.kernels.cpu.pipeline import Frame
+from cleargs.splat.kernels.cpu.rasterise import PIECES
 from cleargs.splat.kernels.cpu.simd import LANES
 
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
@@ -37,6 +38,8 @@ VALUES = 59
 PARAMETERS = 4 * VALUES
 SPLAT = 64
 """Bytes of a packed splat, one cache line."""
+SET_UP = LANES * (6 * (TILE // LANES) + 7 * (TILE // LANES) ** 2)
+"""Operations that place a pair in its tile: six vectors a block of rows, seven a block of both."""
 PAIR_SUMS = 36
 """Bytes of the sums of a pair without depth."""
 
@@ -47,7 +50,7 @@ class Size(NamedTuple):
     gaussians: int
     pairs: int  # (tile, splat)
     contributions: int  # (splat, pixel): alpha at least 1/255, and the pixel not finished before
-    vectors: int  # (splat, eight pixels of a row) with a contribution
+    vectors: int  # (splat, LANES pixels of a row) with a contribution
     pixels: int
 
 
@@ -114,19 +117,20 @@ def work_of(size: Size) -> dict[str, Work]:
         "binning.list_pairs": Work(0, n * (SPLAT + 8) + pairs * 4),
         # Counted, then placed: tiles read twice, Gaussian and slot written.
         "binning.sort_pairs_by_tile": Work(0, 2 * n * 12 + pairs * 16),
-        # A pair: 40 vector operations of eight lanes to find its rows and columns. A contribution: exponent
-        # 4, exp2 15, weight and T 3, cut-offs and the last contributor 9, three colours 6.
-        "rasterise.forward": Work(320 * pairs + 37 * hits, pairs * (4 + SPLAT) + pixels * 20),
+        # A pair: its geometry in the tile. A contribution: exponent 4, exp2 15, weight and T 3, cut-offs and
+        # the last contributor 9, three colours 6.
+        "rasterise.forward": Work(SET_UP * pairs + 37 * hits, pairs * (4 + SPLAT) + pixels * 20),
         # Planes are padded copies of both images and of the mask.
         "loss.pad_images": Work(0, values * 20),
         # Eleven taps each way, 10 operations down and 10 across, then SSIM and its derivatives.
         "loss.measure": Work(257 * values, values * 24),
         # Eleven taps of three maps each way, then the sum.
         "loss.differentiate": Work(144 * values, values * 28),
-        # A pair: as forward, and its sums over the lanes. A contribution: alpha again 24, T back 4, gain and
-        # v 12, nine sums 17.
+        # A pair: as forward, which pieces it reaches, nine sums over the lanes. A contribution: alpha again
+        # 24, T back 2, gain, S and v 12, nine sums 17.
         "rasterise.backward": Work(
-            415 * pairs + 57 * hits, pairs * (4 + 4 + SPLAT + PAIR_SUMS) + pixels * 20
+            (SET_UP + PIECES + 9 * (LANES - 1)) * pairs + 55 * hits,
+            pairs * (4 + 4 + SPLAT + PAIR_SUMS) + pixels * 20,
         ),
         # Projection once more, then its chain rule, mostly in float64; nine additions a pair.
         "gradients.backpropagate": Work(

@@ -18,6 +18,7 @@ from cleargs.bench.work import Work, size_of, work_of
 from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
+from cleargs.splat.kernels.cpu.simd import LANES
 
 
 def test_contributions_are_those_of_the_oracle():
@@ -37,7 +38,7 @@ def test_contributions_are_those_of_the_oracle():
     assert (after[..., -1] < constants.TRANSMITTANCE_STOP).any()
     contributes = (alpha > 0) & (after >= constants.TRANSMITTANCE_STOP)
     expected = int(contributes.sum())
-    starts = [contributes[:, start : start + 8].any(1) for start in range(0, 45, 8)]
+    starts = [contributes[:, start : start + LANES].any(1) for start in range(0, 45, LANES)]
 
     size = size_of(projected_frame(gaussians, camera))
     assert size.contributions == expected

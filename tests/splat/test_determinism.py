@@ -60,3 +60,25 @@ def test_training_steps_are_bitwise_equal_for_1_2_and_16_threads_and_for_two_run
     digests = [*run(), *run()]
     assert len(digests) == 8
     assert len(set(digests)) == 1
+
+
+PROJECTION = """
+import hashlib
+from splat_scenes import make_camera, make_gaussians
+from test_projection import project
+
+camera = make_camera()
+print(hashlib.sha256(project(make_gaussians(camera, 200), camera)[0].tobytes()).hexdigest())
+"""
+
+
+def test_a_kernel_compiled_just_now_rounds_like_one_from_the_cache(tmp_path: Path):
+    here = Path(__file__).parent
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here)}
+    compiled, loaded = (
+        subprocess.run(
+            [sys.executable, "-c", PROJECTION], env=environment, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    )
+    assert compiled == loaded

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +17,7 @@ from cleargs.errors import InputError, StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.render import render
 
 # float32 resolves 6e-8; blending some tens of splats and 2^x by a polynomial (relative error 1e-6) gave at
@@ -42,6 +49,29 @@ def test_random_scene_equals_oracle(n, opacity, size_px, antialias):
     assert result.alpha.max() > 0.2
     assert result.alpha.min() < 0.99
     assert all(size > 1e-3 for size in result.gradient_sizes.values())
+
+
+@pytest.mark.skipif(LANES == 8, reason="eight lanes are what the other tests use here")
+def test_vectors_of_eight_lanes_equal_oracle_too():
+    program = (
+        "import json; from splat_scenes import compare, make_camera, make_gaussians; camera = make_camera();"
+        "from cleargs.splat.kernels.cpu.simd import LANES;"
+        "result = compare(make_gaussians(camera, 60, size_px=5.0), camera);"
+        "print(json.dumps([LANES, result.image, max(result.gradients.values())]))"
+    )
+    environment = os.environ | {
+        "NUMBA_CPU_NAME": "x86-64-v3",
+        "NUMBA_CPU_FEATURES": "+avx2,+fma",
+        "PYTHONPATH": str(Path(__file__).parent),
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    lanes, image, gradient = json.loads(result.stdout)
+    assert lanes == 8
+    assert image < IMAGE_TOLERANCE
+    assert gradient < GRADIENT_TOLERANCE
 
 
 def test_saturated_scene_reaches_the_stop():

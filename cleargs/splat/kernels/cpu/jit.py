@@ -1,7 +1,9 @@
 """How the CPU kernels are compiled.
 
-The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working
-(``math.isfinite`` does not: it is x - x == 0 inside, which ``reassoc`` may cancel).
+The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working, and
+``reassoc``: Numba compiles the body of a parallel loop twice, alone for the process at hand and as a part of
+the kernel for the cache, and with it the two round differently. A training resumed by another process would
+then end in other bits than one that was not interrupted.
 Every kernel walks over items or blocks of a fixed size, and an item's arithmetic does not depend on
 its neighbours in the loop, which makes results bitwise independent of the number of threads.
 """
@@ -20,7 +22,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
-FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
+FAST = frozenset({"contract", "nsz", "arcp"})
 
 
 def kernel(function: F) -> F:

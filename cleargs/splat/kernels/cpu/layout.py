@@ -44,10 +44,9 @@ SUM_BLUE = 8
 SUM_DEPTH = 9
 PAIR_COLUMNS = 10
 
-# A tile is 16 x 16 px, cut into 32 row pieces of 8 x 1 px: piece 16 h + r is row r of half h.
 TILE = 16
-PIECES = 32
-TILE_PIXELS = 256
+"""Width and height of a tile, px."""
+TILE_PIXELS = TILE * TILE
 
 MAX_PAIRS = 2**31 - 1
 """(tile, splat) pairs are numbered with 32 bits."""

@@ -27,7 +27,7 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
-from cleargs.splat.kernels.cpu.simd import LANES, abs8, broadcast8, load8, select8, store8
+from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, magnitude, select, store
 
 RADIUS = constants.SSIM_RADIUS
 TAPS = 2 * RADIUS + 1
@@ -85,11 +85,11 @@ def vertical_means(y: int, image: Floats, target: Floats, window: Floats, rows: 
     height, length = image.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
     for i in range(PAD, length - PAD, LANES):
-        sum_x = sum_y = sum_xx = sum_yy = sum_xy = broadcast8(ZERO)
+        sum_x = sum_y = sum_xx = sum_yy = sum_xy = broadcast(ZERO)
         for source in range(first, last + 1):
             weight = window[source - y + RADIUS]
-            a = load8(image, source * length + i)
-            b = load8(target, source * length + i)
+            a = load(image, source * length + i)
+            b = load(target, source * length + i)
             weighted_a = a * weight
             weighted_b = b * weight
             sum_x = sum_x + weighted_a
@@ -97,11 +97,11 @@ def vertical_means(y: int, image: Floats, target: Floats, window: Floats, rows: 
             sum_xx = sum_xx + weighted_a * a
             sum_yy = sum_yy + weighted_b * b
             sum_xy = sum_xy + weighted_a * b
-        store8(rows, MEAN_X * length + i, sum_x)
-        store8(rows, MEAN_Y * length + i, sum_y)
-        store8(rows, MEAN_XX * length + i, sum_xx)
-        store8(rows, MEAN_YY * length + i, sum_yy)
-        store8(rows, MEAN_XY * length + i, sum_xy)
+        store(rows, MEAN_X * length + i, sum_x)
+        store(rows, MEAN_Y * length + i, sum_y)
+        store(rows, MEAN_XX * length + i, sum_xx)
+        store(rows, MEAN_YY * length + i, sum_yy)
+        store(rows, MEAN_XY * length + i, sum_xy)
 
 
 @device
@@ -128,15 +128,15 @@ def similarity_row(
     height, length = image.shape
     vertical_means(y, image, target, window, rows)
     for i in range(PAD, length - PAD, LANES):
-        m = n = p = q = r = broadcast8(ZERO)
+        m = n = p = q = r = broadcast(ZERO)
         for tap in range(TAPS):
             weight = window[tap]
             j = i + CHANNELS * (tap - RADIUS)
-            m = m + load8(rows, MEAN_X * length + j) * weight
-            n = n + load8(rows, MEAN_Y * length + j) * weight
-            p = p + load8(rows, MEAN_XX * length + j) * weight
-            q = q + load8(rows, MEAN_YY * length + j) * weight
-            r = r + load8(rows, MEAN_XY * length + j) * weight
+            m = m + load(rows, MEAN_X * length + j) * weight
+            n = n + load(rows, MEAN_Y * length + j) * weight
+            p = p + load(rows, MEAN_XX * length + j) * weight
+            q = q + load(rows, MEAN_YY * length + j) * weight
+            r = r + load(rows, MEAN_XY * length + j) * weight
         mn = m * n
         squares = m * m + n * n
         a1 = TWO * mn + C1
@@ -145,13 +145,13 @@ def similarity_row(
         b2 = (p + q - squares) + C2
         inverse = ONE / (b1 * b2)
         similarity = a1 * a2 * inverse
-        counts = load8(counted, y * length + i)
-        store8(values, i, similarity * counts)
+        counts = load(counted, y * length + i)
+        store(values, i, similarity * counts)
         scale = inverse * counts
         by_mean = TWO * (n * (a2 - a1) + m * similarity * (b1 - b2)) * scale
-        store8(maps, (BY_MEAN * height + y) * length + i, by_mean)
-        store8(maps, (BY_SQUARE * height + y) * length + i, ZERO - similarity * b1 * scale)
-        store8(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
+        store(maps, (BY_MEAN * height + y) * length + i, by_mean)
+        store(maps, (BY_SQUARE * height + y) * length + i, ZERO - similarity * b1 * scale)
+        store(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
 
 
 @device
@@ -159,8 +159,8 @@ def differences_row(y: int, image: Floats, target: Floats, values: Floats) -> No
     """|x - y| of each value of a row into ``values``."""
     length = image.shape[1]
     for i in range(PAD, length - PAD, LANES):
-        difference = load8(image, y * length + i) - load8(target, y * length + i)
-        store8(values, i, abs8(difference))
+        difference = load(image, y * length + i) - load(target, y * length + i)
+        store(values, i, magnitude(difference))
 
 
 @kernel
@@ -193,15 +193,15 @@ def vertical_maps(y: int, maps: Floats, window: Floats, rows: Floats) -> None:
     _, height, length = maps.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
     for i in range(PAD, length - PAD, LANES):
-        by_mean = by_square = by_product = broadcast8(ZERO)
+        by_mean = by_square = by_product = broadcast(ZERO)
         for source in range(first, last + 1):
             weight = window[source - y + RADIUS]
-            by_mean = by_mean + load8(maps, (BY_MEAN * height + source) * length + i) * weight
-            by_square = by_square + load8(maps, (BY_SQUARE * height + source) * length + i) * weight
-            by_product = by_product + load8(maps, (BY_PRODUCT * height + source) * length + i) * weight
-        store8(rows, BY_MEAN * length + i, by_mean)
-        store8(rows, BY_SQUARE * length + i, by_square)
-        store8(rows, BY_PRODUCT * length + i, by_product)
+            by_mean = by_mean + load(maps, (BY_MEAN * height + source) * length + i) * weight
+            by_square = by_square + load(maps, (BY_SQUARE * height + source) * length + i) * weight
+            by_product = by_product + load(maps, (BY_PRODUCT * height + source) * length + i) * weight
+        store(rows, BY_MEAN * length + i, by_mean)
+        store(rows, BY_SQUARE * length + i, by_square)
+        store(rows, BY_PRODUCT * length + i, by_product)
 
 
 @kernel
@@ -222,20 +222,20 @@ def differentiate(
         rows = np.zeros((3, length), np.float32)
         values = np.empty(length, np.float32)
         vertical_maps(y, maps, window, rows)
-        plus, minus, zero = broadcast8(l1_scale), broadcast8(-l1_scale), broadcast8(ZERO)
+        plus, minus, zero = broadcast(l1_scale), broadcast(-l1_scale), broadcast(ZERO)
         for i in range(PAD, length - PAD, LANES):
             by_mean = by_square = by_product = zero
             for tap in range(TAPS):
                 weight = window[tap]
                 j = i + CHANNELS * (tap - RADIUS)
-                by_mean = by_mean + load8(rows, BY_MEAN * length + j) * weight
-                by_square = by_square + load8(rows, BY_SQUARE * length + j) * weight
-                by_product = by_product + load8(rows, BY_PRODUCT * length + j) * weight
-            a = load8(image, y * length + i)
-            b = load8(target, y * length + i)
-            sign = select8(a > b, plus, select8(a < b, minus, zero))
+                by_mean = by_mean + load(rows, BY_MEAN * length + j) * weight
+                by_square = by_square + load(rows, BY_SQUARE * length + j) * weight
+                by_product = by_product + load(rows, BY_PRODUCT * length + j) * weight
+            a = load(image, y * length + i)
+            b = load(target, y * length + i)
+            sign = select(a > b, plus, select(a < b, minus, zero))
             similarity = by_mean + TWO * a * by_square + b * by_product
-            store8(values, i, (sign + similarity * ssim_scale) * load8(counted, y * length + i))
+            store(values, i, (sign + similarity * ssim_scale) * load(counted, y * length + i))
         for x in range(width):
             for channel in range(CHANNELS):
                 gradient[y, x, channel] = values[PAD + CHANNELS * x + channel]

@@ -129,7 +129,7 @@ def residual(
 
 @device
 def is_finite(x: Any) -> bool:
-    """Within the range of float32. A comparison, as reassociation may cancel the x - x of math.isfinite."""
+    """Within the range of float32, into which the float64 is going to be stored."""
     finite: bool = abs(x) <= FLOAT32_MAX
     return finite
 

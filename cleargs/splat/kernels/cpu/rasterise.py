@@ -7,16 +7,21 @@ Per pixel, over the tile's splats from near to far, with T the transmittance so 
     colour += alpha T c,   depth += alpha T z,   T *= 1 - alpha
 
 and in the end image = colour + T background. Backward, from far to near, with g = dL/d(pixel), w = alpha T
-and S the part of g · pixel that lies behind the splat,
+and S what g · pixel would be if only what lies behind the splat were there, seen through nothing,
 
-    v = dL/d(ln alpha) = w (g · c) - S alpha / (1 - alpha),   0 where alpha is clamped.
+    v = dL/d(ln alpha) = w (g · c - S),   0 where alpha is clamped,      S += alpha (g · c - S).
 
 Only the sums of v times 1, u, dy, u², u dy, dy² and of w g are needed of a (tile, splat) pair
 (layout.SUM_*); gradients.backpropagate turns them into gradients once per Gaussian. Each pair owns a row
 of scratch, so there are no atomics, no races and no dependence on the number of threads.
 
-A tile's pixels live in a small buffer in "half-major" order: vector j = 16 h + r is row r of the tile's
-half h, eight pixels wide. Only the vectors that the ellipse touches are visited, found for all 32 at once.
+A tile's pixels live in a small buffer, cut into pieces: the LANES pixels of a row that make a vector. Piece
+16 h + r is row r of the tile's h-th block of LANES columns (there is one block where a vector holds a whole
+row, else two). Only the pieces that the ellipse touches are visited, found for all at once.
+
+A splat's geometry in the tile is computed for a batch of splats before any of them is blended: the loads of
+many splats then wait for memory together, and the loop over a splat's pieces knows early where it ends. What
+the next batch needs is fetched meanwhile.
 Depth is an optional fourth channel: the array is None where it is not wanted, and Numba drops the code.
 """
 
@@ -38,9 +43,9 @@ from cleargs.splat.kernels.cpu.layout import (
     LOG2_OPACITY,
     MEAN_X,
     MEAN_Y,
-    PIECES,
     RED,
     SKEW,
+    SPLAT_COLUMNS,
     SUM_BLUE,
     SUM_DEPTH,
     TILE,
@@ -48,32 +53,38 @@ from cleargs.splat.kernels.cpu.layout import (
 )
 from cleargs.splat.kernels.cpu.simd import (
     LANES,
-    any8,
-    broadcast8,
+    any_lane,
+    broadcast,
     lane_numbers,
     lane_sum,
-    lane_sums,
-    load8,
+    load,
     lowest_bit,
     mask_bits,
-    max8,
-    min8,
-    negative_magnitude8,
-    select8,
-    store8,
+    maximum,
+    minimum,
+    negative_magnitude,
+    prefetch,
+    prefetch_to_write,
+    select,
+    store,
+    store_lane_sums,
 )
 
-ZERO, ONE, HALF, SEVEN, EIGHT = (np.float32(x) for x in (0, 1, 0.5, 7, 8))
+ZERO, ONE, HALF = (np.float32(x) for x in (0, 1, 0.5))
 ALPHA_MAX = np.float32(constants.ALPHA_MAX)
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 TRANSMITTANCE_STOP = np.float32(constants.TRANSMITTANCE_STOP)
 TOUCH_CUT = np.float32(constants.LOG2_ALPHA_CUT - 2e-3)
-"""log2(alpha) from which a row piece is visited; the decision itself is made per pixel."""
+"""log2(alpha) from which a piece is visited; the decision itself is made per pixel."""
 
-ALIVE_INTERVAL = 16
-"""After this many splats the vectors whose pixels are all finished are taken off the list."""
+BATCH = 16
+"""So many splats are set up before they are blended. Then pieces with no live pixel are dropped."""
 
-# Geometry of the splat at hand, behind the pixel buffers: one value per tile row or column.
+PIECES = TILE_PIXELS // LANES
+ALL_PIECES = np.int64(2**PIECES - 1)
+LAST_LANE = np.float32(LANES - 1)
+
+# Geometry of the batch's splats, behind the pixel buffers: one value per tile row or column of each.
 ROW_LOG2 = 0  # log2 alpha on the ridge of each row, [16]
 ROW_RIDGE = 16  # dx of the ridge of each row, [16]
 ROW_DY = 32  # dy of each row, [16]
@@ -88,7 +99,7 @@ GREEN_FORWARD = 768
 BLUE_FORWARD = 1024
 DEPTH_FORWARD = 1280
 GEOMETRY_FORWARD = 1536
-FORWARD_SIZE = GEOMETRY_FORWARD + GEOMETRY_SIZE
+FORWARD_SIZE = GEOMETRY_FORWARD + BATCH * GEOMETRY_SIZE
 
 # Pixel buffers of the backward pass.
 T_BACKWARD = 0
@@ -98,11 +109,9 @@ GRAD_RED = 768
 GRAD_GREEN = 1024
 GRAD_BLUE = 1280
 GRAD_DEPTH = 1536
-LAST_OF_PIECE = 1792  # the largest LAST of each vector, [32]
+LAST_OF_PIECE = 1792  # the largest LAST of each piece, [PIECES]
 GEOMETRY_BACKWARD = 1824
-BACKWARD_SIZE = GEOMETRY_BACKWARD + GEOMETRY_SIZE
-
-ALL_PIECES = np.int64(2**PIECES - 1)
+BACKWARD_SIZE = GEOMETRY_BACKWARD + BATCH * GEOMETRY_SIZE
 
 
 def _exp2_coefficients() -> tuple[np.float32, ...]:
@@ -122,9 +131,9 @@ EXP2_MIN = np.float32(-9)
 
 
 @inlined
-def exp2_8(t: Any) -> Any:
+def exp2(t: Any) -> Any:
     """2^t for t <= 0; below -9 (alpha under 1/512) it returns 2^-9, which the cut removes."""
-    t = max8(t, broadcast8(EXP2_MIN))
+    t = maximum(t, broadcast(EXP2_MIN))
     t2 = t * t
     root = (P0 + t * P1) + t2 * ((P2 + t * P3) + t2 * (P4 + t * P5))  # Estrin: a short chain of operations
     root = root * root
@@ -133,41 +142,47 @@ def exp2_8(t: Any) -> Any:
 
 
 @inlined
-def row_pieces_in_half(ridge: Any, row_log2: Any, bend_x: np.float32, left: np.float32) -> Any:
-    """Which of eight rows reach alpha >= 1/255 between ``left`` and ``left`` + 7 (dx of pixel centres)."""
-    nearest = min8(max8(ridge, broadcast8(left)), broadcast8(left + SEVEN)) - ridge
-    return mask_bits(row_log2 - nearest * nearest * bend_x >= TOUCH_CUT)
-
-
-@inlined
 def set_up_splat(
     splats: Floats, g: Any, left: np.float32, top: np.float32, buffer: Floats, geometry: int
 ) -> Any:
-    """Write the splat's geometry in this tile and return the bit mask of the vectors that it touches."""
+    """Write the splat's geometry in this tile and return the bit mask of the pieces that it touches."""
     bend_x, bend_y, skew = splats[g, BEND_X], splats[g, BEND_Y], splats[g, SKEW]
-    log2_opacity = splats[g, LOG2_OPACITY]
-    dx = left + HALF - splats[g, MEAN_X]
-    dy0 = lane_numbers() + (top + HALF - splats[g, MEAN_Y])
-    dy1 = dy0 + EIGHT
-    log0 = log2_opacity - dy0 * dy0 * bend_y
-    log1 = log2_opacity - dy1 * dy1 * bend_y
-    ridge0 = dy0 * skew
-    ridge1 = dy1 * skew
-    columns = lane_numbers() + dx
-    store8(buffer, geometry + ROW_LOG2, log0)
-    store8(buffer, geometry + ROW_LOG2 + LANES, log1)
-    store8(buffer, geometry + ROW_RIDGE, ridge0)
-    store8(buffer, geometry + ROW_RIDGE + LANES, ridge1)
-    store8(buffer, geometry + ROW_DY, dy0)
-    store8(buffer, geometry + ROW_DY + LANES, dy1)
-    store8(buffer, geometry + COLUMN_DX, columns)
-    store8(buffer, geometry + COLUMN_DX + LANES, columns + EIGHT)
-    right = dx + EIGHT
-    touched = row_pieces_in_half(ridge0, log0, bend_x, dx)
-    touched |= row_pieces_in_half(ridge1, log1, bend_x, dx) << 8
-    touched |= row_pieces_in_half(ridge0, log0, bend_x, right) << 16
-    touched |= row_pieces_in_half(ridge1, log1, bend_x, right) << 24
+    dx, dy0 = left + HALF - splats[g, MEAN_X], top + HALF - splats[g, MEAN_Y]
+    touched = np.int64(0)
+    for first in range(0, TILE, LANES):
+        offset = np.float32(first)
+        dy = lane_numbers() + (dy0 + offset)
+        ridge = dy * skew
+        row_log2 = splats[g, LOG2_OPACITY] - dy * dy * bend_y
+        store(buffer, geometry + ROW_LOG2 + first, row_log2)
+        store(buffer, geometry + ROW_RIDGE + first, ridge)
+        store(buffer, geometry + ROW_DY + first, dy)
+        store(buffer, geometry + COLUMN_DX + first, lane_numbers() + (dx + offset))
+        for column in range(0, TILE, LANES):
+            # Which of the rows reach alpha >= 1/255 between the centres of the block's outer pixels.
+            outer = dx + np.float32(column)
+            nearest = minimum(maximum(ridge, broadcast(outer)), broadcast(outer + LAST_LANE)) - ridge
+            rows = mask_bits(row_log2 - nearest * nearest * bend_x >= TOUCH_CUT)
+            touched |= rows << np.int64(column // LANES * TILE + first)
     return touched
+
+
+@inlined
+def row_of(piece: Any) -> Any:
+    """Row of the tile in which a piece lies."""
+    return np.uint64(piece & (TILE - 1))
+
+
+@inlined
+def first_column(piece: Any) -> Any:
+    """Column of the tile at which a piece starts."""
+    return np.uint64((piece // TILE) * LANES)
+
+
+@inlined
+def splat_offset(pair_ids: Array, pair: Any) -> Any:
+    """Place of a pair's splat in the array of splats."""
+    return np.uint64(pair_ids[np.uint64(pair)]) * np.uint64(SPLAT_COLUMNS)
 
 
 @device
@@ -179,55 +194,62 @@ def forward_tile(
     pair_ids: Array,
     splats: Floats,
     buffer: Floats,
+    touches: Array,
     depth: Floats | None,
 ) -> None:
-    """Blend the pairs ``begin`` to ``end`` into the pixel buffers."""
-    zero = broadcast8(ZERO)
-    alpha_max = broadcast8(ALPHA_MAX)
+    """Blend the pairs ``begin`` to ``end`` into the pixel buffers. ``touches`` is int64 [BATCH] scratch."""
+    zero = broadcast(ZERO)
+    alpha_max = broadcast(ALPHA_MAX)
     alive = ALL_PIECES
     start = begin
     while start < end and alive != 0:
-        stop = min(start + ALIVE_INTERVAL, end)
+        stop = min(start + BATCH, end)
+        for pair in range(start, stop):
+            prefetch(splats, splat_offset(pair_ids, min(pair + BATCH, end - 1)))
+            geometry = GEOMETRY_FORWARD + (pair - start) * GEOMETRY_SIZE
+            pieces = set_up_splat(splats, pair_ids[np.uint64(pair)], left, top, buffer, geometry)
+            touches[pair - start] = pieces & alive
         for pair in range(start, stop):
             g = pair_ids[np.uint64(pair)]
-            touched = set_up_splat(splats, g, left, top, buffer, GEOMETRY_FORWARD) & alive
+            geometry = GEOMETRY_FORWARD + (pair - start) * GEOMETRY_SIZE
+            touched = touches[np.uint64(pair - start)]
             bend_x = splats[g, BEND_X]
             red, green, blue, z = splats[g, RED], splats[g, GREEN], splats[g, BLUE], splats[g, DEPTH]
-            number = broadcast8(np.float32(pair - begin + 1))
+            number = broadcast(np.float32(pair - begin + 1))
             while touched != 0:
                 piece = lowest_bit(touched)
                 touched &= touched - 1
-                row = np.uint64(GEOMETRY_FORWARD + (piece & 15))
-                column = GEOMETRY_FORWARD + COLUMN_DX + ((piece >> 4) << 3)
+                row = np.uint64(geometry) + row_of(piece)
                 pixel = piece * LANES
-                u = load8(buffer, column) - buffer[row + np.uint64(ROW_RIDGE)]
+                u = load(buffer, np.uint64(geometry + COLUMN_DX) + first_column(piece))
+                u = u - buffer[row + np.uint64(ROW_RIDGE)]
                 log2_alpha = buffer[row + np.uint64(ROW_LOG2)] - u * u * bend_x
-                before = load8(buffer, T_FORWARD + pixel)
-                alpha = min8(exp2_8(log2_alpha), alpha_max)
-                alpha = select8(alpha >= ALPHA_CUT, alpha, zero)
+                before = load(buffer, T_FORWARD + pixel)
+                alpha = minimum(exp2(log2_alpha), alpha_max)
+                alpha = select(alpha >= ALPHA_CUT, alpha, zero)
                 weight = alpha * before
                 after = before - weight
                 goes_on = after >= TRANSMITTANCE_STOP
-                weight = select8(goes_on, weight, zero)
-                store8(buffer, T_FORWARD + pixel, select8(goes_on, after, negative_magnitude8(before)))
-                last = select8(weight > ZERO, number, zero)
-                store8(buffer, LAST_FORWARD + pixel, max8(last, load8(buffer, LAST_FORWARD + pixel)))
-                store8(buffer, RED_FORWARD + pixel, load8(buffer, RED_FORWARD + pixel) + weight * red)
-                store8(buffer, GREEN_FORWARD + pixel, load8(buffer, GREEN_FORWARD + pixel) + weight * green)
-                store8(buffer, BLUE_FORWARD + pixel, load8(buffer, BLUE_FORWARD + pixel) + weight * blue)
+                weight = select(goes_on, weight, zero)
+                store(buffer, T_FORWARD + pixel, select(goes_on, after, negative_magnitude(before)))
+                last = select(weight > ZERO, number, zero)
+                store(buffer, LAST_FORWARD + pixel, maximum(last, load(buffer, LAST_FORWARD + pixel)))
+                store(buffer, RED_FORWARD + pixel, load(buffer, RED_FORWARD + pixel) + weight * red)
+                store(buffer, GREEN_FORWARD + pixel, load(buffer, GREEN_FORWARD + pixel) + weight * green)
+                store(buffer, BLUE_FORWARD + pixel, load(buffer, BLUE_FORWARD + pixel) + weight * blue)
                 if depth is not None:
-                    store8(buffer, DEPTH_FORWARD + pixel, load8(buffer, DEPTH_FORWARD + pixel) + weight * z)
+                    store(buffer, DEPTH_FORWARD + pixel, load(buffer, DEPTH_FORWARD + pixel) + weight * z)
         start = stop
         alive = np.int64(0)
         for piece in range(PIECES):
-            if any8(load8(buffer, T_FORWARD + piece * LANES) > ZERO):
+            if any_lane(load(buffer, T_FORWARD + piece * LANES) > ZERO):
                 alive |= np.int64(1) << piece
 
 
 @inlined
 def pixel_offset(row: int, column: int) -> Any:
-    """Place of a tile's pixel in a half-major buffer."""
-    return np.uint64(((column >> 3) << 7) + row * LANES + (column & 7))
+    """Place of a tile's pixel in a buffer."""
+    return np.uint64((column // LANES) * (TILE * LANES) + row * LANES + column % LANES)
 
 
 @kernel
@@ -248,6 +270,7 @@ def forward(
     tiles_y = (height + TILE - 1) // TILE
     for tile in prange(tiles_x * tiles_y):
         buffer = np.empty(FORWARD_SIZE, np.float32)
+        touches = np.empty(BATCH, np.int64)
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         for i in range(GEOMETRY_FORWARD):
@@ -265,6 +288,7 @@ def forward(
             pair_ids,
             splats,
             buffer,
+            touches,
             depth,
         )
         for row in range(rows):
@@ -290,73 +314,96 @@ def backward_tile(
     pair_slots: Array,
     splats: Floats,
     buffer: Floats,
+    touches: Array,
     pair_sums: Floats,
     grad_depth: Floats | None,
 ) -> None:
-    """Walk the pairs ``end`` - 1 down to ``begin`` and write each one's sums to its row of ``pair_sums``."""
-    zero = broadcast8(ZERO)
-    alpha_max = broadcast8(ALPHA_MAX)
-    nowhere = broadcast8(EXP2_MIN)
+    """Walk the pairs ``end`` - 1 down to ``begin`` and write each one's sums to its row of ``pair_sums``.
+
+    ``touches`` is int64 [BATCH] scratch.
+    """
+    zero = broadcast(ZERO)
+    alpha_max = broadcast(ALPHA_MAX)
+    nowhere = broadcast(EXP2_MIN)
     stride = pair_sums.shape[1]
-    for pair in range(end - 1, begin - 1, -1):
-        g = pair_ids[np.uint64(pair)]
-        bend_x = splats[g, BEND_X]
-        red, green, blue, z = splats[g, RED], splats[g, GREEN], splats[g, BLUE], splats[g, DEPTH]
-        number = np.float32(pair - begin + 1)
-        touched = set_up_splat(splats, g, left, top, buffer, GEOMETRY_BACKWARD)
-        contributes = mask_bits(load8(buffer, LAST_OF_PIECE) >= number)
-        contributes |= mask_bits(load8(buffer, LAST_OF_PIECE + 8) >= number) << 8
-        contributes |= mask_bits(load8(buffer, LAST_OF_PIECE + 16) >= number) << 16
-        contributes |= mask_bits(load8(buffer, LAST_OF_PIECE + 24) >= number) << 24
-        touched &= contributes
-        sum_v = sum_vu = sum_vy = sum_vuu = sum_vuy = sum_vyy = zero
-        sum_red = sum_green = sum_blue = sum_depth = zero
-        while touched != 0:
-            piece = lowest_bit(touched)
-            touched &= touched - 1
-            row = np.uint64(GEOMETRY_BACKWARD + (piece & 15))
-            column = GEOMETRY_BACKWARD + COLUMN_DX + ((piece >> 4) << 3)
-            pixel = piece * LANES
-            dy = buffer[row + np.uint64(ROW_DY)]
-            u = load8(buffer, column) - buffer[row + np.uint64(ROW_RIDGE)]
-            log2_alpha = buffer[row + np.uint64(ROW_LOG2)] - u * u * bend_x
-            log2_alpha = select8(load8(buffer, LAST_BACKWARD + pixel) >= number, log2_alpha, nowhere)
-            raw_alpha = exp2_8(log2_alpha)
-            alpha = select8(raw_alpha >= ALPHA_CUT, min8(raw_alpha, alpha_max), zero)
-            inverse = ONE / (ONE - alpha)
-            before = load8(buffer, T_BACKWARD + pixel) * inverse
-            store8(buffer, T_BACKWARD + pixel, before)
-            weight = alpha * before
-            grad_r = load8(buffer, GRAD_RED + pixel)
-            grad_g = load8(buffer, GRAD_GREEN + pixel)
-            grad_b = load8(buffer, GRAD_BLUE + pixel)
-            gain = grad_r * red + grad_g * green + grad_b * blue
+    stop = end
+    while stop > begin:
+        start = max(stop - BATCH, begin)
+        for pair in range(stop - 1, start - 1, -1):
+            prefetch_to_write(pair_sums, np.uint64(pair_slots[np.uint64(pair)]) * np.uint64(stride))
+            prefetch(splats, splat_offset(pair_ids, max(pair - BATCH, begin)))
+            geometry = GEOMETRY_BACKWARD + (pair - start) * GEOMETRY_SIZE
+            pieces = set_up_splat(splats, pair_ids[np.uint64(pair)], left, top, buffer, geometry)
+            number = np.float32(pair - begin + 1)
+            contributes = np.int64(0)
+            for first in range(0, PIECES, LANES):
+                contributes |= mask_bits(load(buffer, LAST_OF_PIECE + first) >= number) << np.int64(first)
+            touches[pair - start] = pieces & contributes
+        for pair in range(stop - 1, start - 1, -1):
+            g = pair_ids[np.uint64(pair)]
+            geometry = GEOMETRY_BACKWARD + (pair - start) * GEOMETRY_SIZE
+            touched = touches[np.uint64(pair - start)]
+            bend_x = splats[g, BEND_X]
+            red, green, blue, z = splats[g, RED], splats[g, GREEN], splats[g, BLUE], splats[g, DEPTH]
+            number = np.float32(pair - begin + 1)
+            sum_v = sum_vu = sum_vy = sum_vuu = sum_vuy = sum_vyy = zero
+            sum_red = sum_green = sum_blue = sum_depth = zero
+            while touched != 0:
+                piece = lowest_bit(touched)
+                touched &= touched - 1
+                row = np.uint64(geometry) + row_of(piece)
+                pixel = piece * LANES
+                dy = buffer[row + np.uint64(ROW_DY)]
+                u = load(buffer, np.uint64(geometry + COLUMN_DX) + first_column(piece))
+                u = u - buffer[row + np.uint64(ROW_RIDGE)]
+                log2_alpha = buffer[row + np.uint64(ROW_LOG2)] - u * u * bend_x
+                log2_alpha = select(load(buffer, LAST_BACKWARD + pixel) >= number, log2_alpha, nowhere)
+                raw_alpha = exp2(log2_alpha)
+                alpha = select(raw_alpha >= ALPHA_CUT, minimum(raw_alpha, alpha_max), zero)
+                before = load(buffer, T_BACKWARD + pixel) / (ONE - alpha)
+                store(buffer, T_BACKWARD + pixel, before)
+                weight = alpha * before
+                grad_r = load(buffer, GRAD_RED + pixel)
+                grad_g = load(buffer, GRAD_GREEN + pixel)
+                grad_b = load(buffer, GRAD_BLUE + pixel)
+                gain = grad_r * red + grad_g * green + grad_b * blue
+                if grad_depth is not None:
+                    grad_z = load(buffer, GRAD_DEPTH + pixel)
+                    gain = gain + grad_z * z
+                    sum_depth = sum_depth + weight * grad_z
+                behind = load(buffer, BEHIND + pixel)
+                gain = gain - behind
+                store(buffer, BEHIND + pixel, behind + alpha * gain)
+                v = select(raw_alpha < ALPHA_MAX, weight * gain, zero)
+                vu = v * u
+                vy = v * dy
+                sum_v = sum_v + v
+                sum_vu = sum_vu + vu
+                sum_vy = sum_vy + vy
+                sum_vuu = sum_vuu + vu * u
+                sum_vuy = sum_vuy + vu * dy
+                sum_vyy = sum_vyy + vy * dy
+                sum_red = sum_red + weight * grad_r
+                sum_green = sum_green + weight * grad_g
+                sum_blue = sum_blue + weight * grad_b
+            slot = np.uint64(pair_slots[np.uint64(pair)])
+            # Columns SUM_V to SUM_GREEN, in the order of the layout.
+            store_lane_sums(
+                pair_sums,
+                slot * np.uint64(stride),
+                sum_v,
+                sum_vu,
+                sum_vy,
+                sum_vuu,
+                sum_vuy,
+                sum_vyy,
+                sum_red,
+                sum_green,
+            )
+            pair_sums[slot, SUM_BLUE] = lane_sum(sum_blue)
             if grad_depth is not None:
-                grad_z = load8(buffer, GRAD_DEPTH + pixel)
-                gain = gain + grad_z * z
-                sum_depth = sum_depth + weight * grad_z
-            own = weight * gain
-            behind = load8(buffer, BEHIND + pixel)
-            v = select8(raw_alpha < ALPHA_MAX, own - alpha * (behind * inverse), zero)
-            store8(buffer, BEHIND + pixel, behind + own)
-            vu = v * u
-            vy = v * dy
-            sum_v = sum_v + v
-            sum_vu = sum_vu + vu
-            sum_vy = sum_vy + vy
-            sum_vuu = sum_vuu + vu * u
-            sum_vuy = sum_vuy + vu * dy
-            sum_vyy = sum_vyy + vy * dy
-            sum_red = sum_red + weight * grad_r
-            sum_green = sum_green + weight * grad_g
-            sum_blue = sum_blue + weight * grad_b
-        slot = np.uint64(pair_slots[np.uint64(pair)])
-        # Columns SUM_V to SUM_GREEN, in the order of the layout.
-        sums = lane_sums(sum_v, sum_vu, sum_vy, sum_vuu, sum_vuy, sum_vyy, sum_red, sum_green)
-        store8(pair_sums, slot * np.uint64(stride), sums)
-        pair_sums[slot, SUM_BLUE] = lane_sum(sum_blue)
-        if grad_depth is not None:
-            pair_sums[slot, SUM_DEPTH] = lane_sum(sum_depth)
+                pair_sums[slot, SUM_DEPTH] = lane_sum(sum_depth)
+        stop = start
 
 
 @kernel
@@ -380,6 +427,7 @@ def backward(
     tiles_y = (height + TILE - 1) // TILE
     for tile in prange(tiles_x * tiles_y):
         buffer = np.empty(BACKWARD_SIZE, np.float32)
+        touches = np.empty(BATCH, np.int64)
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         columns, rows = min(TILE, width - left), min(TILE, height - top)
         for i in range(GEOMETRY_BACKWARD):
@@ -396,7 +444,7 @@ def backward(
                     buffer[GRAD_DEPTH + i] = grad_depth[y, x]
                 buffer[T_BACKWARD + i] = rest
                 buffer[LAST_BACKWARD + i] = last[y, x]
-                buffer[BEHIND + i] = rest * behind
+                buffer[BEHIND + i] = behind
                 buffer[GRAD_RED + i] = red
                 buffer[GRAD_GREEN + i] = green
                 buffer[GRAD_BLUE + i] = blue
@@ -422,6 +470,7 @@ def backward(
             pair_slots,
             splats,
             buffer,
+            touches,
             pair_sums,
             grad_depth,
         )

@@ -1,10 +1,13 @@
-"""Eight float32 lanes as an explicit Numba type.
+"""Some float32 lanes as an explicit Numba type: sixteen where registers hold 512 bits, else eight.
 
-LLVM does not vectorise the rasteriser's loops by itself (too many possible aliases, trip counts of
-eight), which costs a factor of three. ``f32x8`` is an LLVM vector: one AVX register, two of SSE or
-NEON, half of AVX-512; LLVM picks. ``mask8`` is the result of a comparison.
+LLVM does not vectorise the rasteriser's loops by itself (too many possible aliases, short trip counts),
+which costs a factor of three. ``lanes`` is an LLVM vector: one register of AVX or AVX-512, two of SSE or
+NEON. ``mask`` is the result of a comparison.
 
-Arithmetic (+ - * /) and comparisons (< <= > >=) work between ``f32x8`` values and with float32 scalars
+Sixteen lanes are one row of a tile: half as many instructions as with eight where a splat reaches into both
+halves of a row. They are used on AVX-512 alone, since elsewhere two registers would work where one is enough.
+
+Arithmetic (+ - * /) and comparisons (< <= > >=) work between ``lanes`` values and with float32 scalars
 on either side. Loads and stores take an array and an element offset and check no bounds.
 """
 
@@ -14,14 +17,26 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import binding, ir
+from numba import config
 from numba.core import cgutils, types
 from numba.core.typing import templates
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
 from numba.np import arrayobj
 
-LANES = 8
+
+def _register_lanes() -> int:
+    """float32 lanes of a vector on the machine that Numba compiles for."""
+    settings: Any = config
+    if settings.CPU_NAME is None:
+        return 16 if binding.get_host_cpu_features().get("avx512f", False) else 8
+    return 16 if "+avx512f" in (settings.CPU_FEATURES or "") else 8
+
+
+LANES = _register_lanes()
+SUMS = 8
+"""Vectors whose lane sums `store_lane_sums` takes at once."""
 
 # Numba's functions for extensions are not annotated.
 _signature: Any = templates.signature
@@ -32,13 +47,14 @@ _make_array: Any = arrayobj.make_array
 _initialise_storage: Any = models.PrimitiveModel.__init__
 _declare: Any = cgutils.get_or_insert_function
 
-# As in jit.FAST: no nnan, no ninf.
-_FLAGS = ("contract", "nsz", "arcp", "reassoc")
+# As in jit.FAST.
+_FLAGS = ("contract", "nsz", "arcp")
 # min and max of numbers that the caller knows not to be NaN.
 _NO_NAN = ("nnan", "nsz")
 
 _I1, _I32, _I64 = ir.IntType(1), ir.IntType(32), ir.IntType(64)
 _BITS = ir.IntType(LANES)
+_BYTES = ir.IntType(8).as_pointer()
 _F32 = ir.FloatType()
 _VECTOR = ir.VectorType(_F32, LANES)
 _INT_VECTOR = ir.VectorType(_I32, LANES)
@@ -47,15 +63,15 @@ _UNDEFINED = ir.Constant(_VECTOR, ir.Undefined)
 
 
 class _VectorType(types.Type):
-    """The type of eight float32 lanes."""
+    """The type of LANES float32 lanes."""
 
 
 class _MaskType(types.Type):
-    """The type of eight comparison results."""
+    """The type of LANES comparison results."""
 
 
-f32x8 = _VectorType("f32x8")
-mask8 = _MaskType("mask8")
+lanes = _VectorType(f"f32x{LANES}")
+mask = _MaskType(f"mask{LANES}")
 
 
 def _register_storage(numba_type: type, llvm_type: ir.Type) -> None:
@@ -92,7 +108,7 @@ def _register_operator(
 
 
 def _register_operators() -> None:
-    pairs = [(f32x8, f32x8), (f32x8, types.float32), (types.float32, f32x8)]
+    pairs = [(lanes, lanes), (lanes, types.float32), (types.float32, lanes)]
     arithmetic = {
         operator.add: "fadd",
         operator.sub: "fsub",
@@ -104,7 +120,7 @@ def _register_operators() -> None:
         def calculate(builder: Any, x: Any, y: Any, name: str = name) -> Any:
             return getattr(builder, name)(x, y, flags=_FLAGS)
 
-        _register_operator(function, [_signature(f32x8, *pair) for pair in pairs], calculate)
+        _register_operator(function, [_signature(lanes, *pair) for pair in pairs], calculate)
 
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, symbol in comparisons.items():
@@ -112,7 +128,7 @@ def _register_operators() -> None:
         def compare(builder: Any, x: Any, y: Any, symbol: str = symbol) -> Any:
             return builder.fcmp_ordered(symbol, x, y)
 
-        _register_operator(function, [_signature(mask8, *pair) for pair in pairs], compare)
+        _register_operator(function, [_signature(mask, *pair) for pair in pairs], compare)
 
 
 _register_operators()
@@ -130,20 +146,20 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type
 
 
 @_intrinsic
-def load8(typing_context: Any, array: Any, offset: Any) -> Any:
-    """Eight consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
+def load(typing_context: Any, array: Any, offset: Any) -> Any:
+    """LANES consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = builder.load(_address(context, builder, sig.args[0], args[0], sig.args[1], args[1]))
         value.align = 4
         return value
 
-    return f32x8(array, offset), generate
+    return lanes(array, offset), generate
 
 
 @_intrinsic
-def store8(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write eight lanes to consecutive elements of a float32 array."""
+def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Write all lanes to consecutive elements of a float32 array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         address = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
@@ -153,23 +169,48 @@ def store8(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
     return types.void(array, offset, value), generate
 
 
+def _prefetch(write: int) -> Callable[..., Any]:
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
+        address = builder.bitcast(address, _BYTES)
+        function_type = ir.FunctionType(ir.VoidType(), [_BYTES, _I32, _I32, _I32])
+        function = _declare(builder.module, function_type, "llvm.prefetch.p0")
+        keep, data = ir.Constant(_I32, 3), ir.Constant(_I32, 1)
+        builder.call(function, [address, ir.Constant(_I32, write), keep, data])
+        return context.get_dummy_value()
+
+    return generate
+
+
 @_intrinsic
-def broadcast8(typing_context: Any, scalar: Any) -> Any:
+def prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
+    """Fetch an element's cache line, soon to be read."""
+    return types.void(array, offset), _prefetch(0)
+
+
+@_intrinsic
+def prefetch_to_write(typing_context: Any, array: Any, offset: Any) -> Any:
+    """Fetch an element's cache line, soon to be written."""
+    return types.void(array, offset), _prefetch(1)
+
+
+@_intrinsic
+def broadcast(typing_context: Any, scalar: Any) -> Any:
     """The same float32 in every lane."""
-    return f32x8(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])
+    return lanes(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])
 
 
 @_intrinsic
 def lane_numbers(typing_context: Any) -> Any:
-    """0.0, 1.0, ... 7.0."""
+    """0.0, 1.0, ... LANES - 1."""
     numbers = ir.Constant(_VECTOR, [float(lane) for lane in range(LANES)])
-    return f32x8(), lambda context, builder, sig, args: numbers
+    return lanes(), lambda context, builder, sig, args: numbers
 
 
 @_intrinsic
-def select8(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
+def select(typing_context: Any, where: Any, yes: Any, no: Any) -> Any:
     """Lane by lane ``yes`` where the mask is set, else ``no``."""
-    return f32x8(mask8, f32x8, f32x8), lambda context, builder, sig, args: builder.select(*args)
+    return lanes(mask, lanes, lanes), lambda context, builder, sig, args: builder.select(*args)
 
 
 def _call(name: str, n: int, flags: tuple[str, ...]) -> Callable[..., Any]:
@@ -184,58 +225,58 @@ def _call(name: str, n: int, flags: tuple[str, ...]) -> Callable[..., Any]:
 # min and max call LLVM's functions because select(x < y, load p, y) followed by a store to p turns into
 # a masked store (vmaskmov), which is microcoded on AMD: it nearly doubled the forward pass.
 @_intrinsic
-def min8(typing_context: Any, x: Any, y: Any) -> Any:
+def minimum(typing_context: Any, x: Any, y: Any) -> Any:
     """Lane-wise minimum; neither side may be NaN."""
-    return f32x8(f32x8, f32x8), _call("llvm.minnum.v8f32", 2, _NO_NAN)
+    return lanes(lanes, lanes), _call(f"llvm.minnum.v{LANES}f32", 2, _NO_NAN)
 
 
 @_intrinsic
-def max8(typing_context: Any, x: Any, y: Any) -> Any:
+def maximum(typing_context: Any, x: Any, y: Any) -> Any:
     """Lane-wise maximum; neither side may be NaN."""
-    return f32x8(f32x8, f32x8), _call("llvm.maxnum.v8f32", 2, _NO_NAN)
+    return lanes(lanes, lanes), _call(f"llvm.maxnum.v{LANES}f32", 2, _NO_NAN)
 
 
 @_intrinsic
-def abs8(typing_context: Any, x: Any) -> Any:
+def magnitude(typing_context: Any, x: Any) -> Any:
     """|x|."""
-    return f32x8(f32x8), _call("llvm.fabs.v8f32", 1, ())
+    return lanes(lanes), _call(f"llvm.fabs.v{LANES}f32", 1, ())
 
 
 @_intrinsic
-def sqrt8(typing_context: Any, x: Any) -> Any:
+def square_root(typing_context: Any, x: Any) -> Any:
     """Correctly rounded square root."""
-    return f32x8(f32x8), _call("llvm.sqrt.v8f32", 1, ())
+    return lanes(lanes), _call(f"llvm.sqrt.v{LANES}f32", 1, ())
 
 
 @_intrinsic
-def negative_magnitude8(typing_context: Any, x: Any) -> Any:
+def negative_magnitude(typing_context: Any, x: Any) -> Any:
     """-|x| by setting the sign bit."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], _INT_VECTOR)
         return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(2**31)] * LANES)), _VECTOR)
 
-    return f32x8(f32x8), generate
+    return lanes(lanes), generate
 
 
 @_intrinsic
-def any8(typing_context: Any, mask: Any) -> Any:
+def any_lane(typing_context: Any, where: Any) -> Any:
     """True when a lane is set."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.icmp_unsigned("!=", builder.bitcast(args[0], _BITS), ir.Constant(_BITS, 0))
 
-    return types.boolean(mask8), generate
+    return types.boolean(mask), generate
 
 
 @_intrinsic
-def mask_bits(typing_context: Any, mask: Any) -> Any:
+def mask_bits(typing_context: Any, where: Any) -> Any:
     """The mask as an int64, lane 0 in bit 0."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], _BITS), _I64)
 
-    return types.int64(mask8), generate
+    return types.int64(mask), generate
 
 
 @_intrinsic
@@ -250,34 +291,64 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
 
 @_intrinsic
 def lane_sum(typing_context: Any, x: Any) -> Any:
-    """Sum of the eight lanes."""
+    """Sum of all lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
-        function = _declare(builder.module, function_type, "llvm.vector.reduce.fadd.v8f32")
-        return builder.call(function, [ir.Constant(_F32, 0.0), args[0]], fastmath=_FLAGS)
+        function = _declare(builder.module, function_type, f"llvm.vector.reduce.fadd.v{LANES}f32")
+        # Without reassoc the lanes would be added one after the other; here no code around it can change it.
+        return builder.call(function, [ir.Constant(_F32, 0.0), args[0]], fastmath=(*_FLAGS, "reassoc"))
 
-    return types.float32(f32x8), generate
+    return types.float32(lanes), generate
 
 
-def _add_shuffled(builder: Any, x: Any, y: Any, left: list[int], right: list[int]) -> Any:
-    def pick(lanes: list[int]) -> Any:
-        return builder.shuffle_vector(x, y, ir.Constant(_INT_VECTOR, lanes))
+def _add_picked(builder: Any, x: Any, y: Any, left: list[int], right: list[int]) -> Any:
+    """Lanes ``left`` of x and y taken as one vector, plus their lanes ``right``."""
+
+    def pick(numbers: list[int]) -> Any:
+        kind = ir.VectorType(_I32, len(numbers))
+        return builder.shuffle_vector(x, y, ir.Constant(kind, numbers))
 
     return builder.fadd(pick(left), pick(right), flags=_FLAGS)
 
 
 @_intrinsic
-def lane_sums(typing_context: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """The lane sums of eight vectors as one vector: a transposition with additions in three steps."""
+def store_lane_sums(
+    typing_context: Any,
+    array: Any,
+    offset: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    d: Any,
+    e: Any,
+    f: Any,
+    g: Any,
+    h: Any,
+) -> Any:
+    """Write the lane sums of eight vectors to consecutive elements of a float32 array.
+
+    Vectors are added in pairs, the halves of each onto one another: after three steps each of the eight has
+    an eighth of the lanes of one vector.
+    """
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = list(args)
-        pairs = ([0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15])
-        quads = ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
-        halves = ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
-        for left, right in (pairs, quads, halves):
-            rows = [_add_shuffled(builder, rows[i], rows[i + 1], left, right) for i in range(0, len(rows), 2)]
-        return rows[0]
+        rows, block = list(args[2:]), LANES
+        while len(rows) > 1:
+            blocks = range(0, 2 * LANES, block)
+            left = [lane for start in blocks for lane in range(start, start + block // 2)]
+            right = [lane + block // 2 for lane in left]
+            rows = [
+                _add_picked(builder, x, y, left, right) for x, y in zip(rows[::2], rows[1::2], strict=True)
+            ]
+            block //= 2
+        total = rows[0]
+        if block == 2:
+            total = _add_picked(builder, total, total, list(range(0, LANES, 2)), list(range(1, LANES, 2)))
+        offset = context.cast(builder, args[1], sig.args[1], types.intp)
+        data = _make_array(sig.args[0])(context, builder, args[0]).data
+        address = builder.bitcast(builder.gep(data, [offset]), ir.VectorType(_F32, SUMS).as_pointer())
+        builder.store(total, address).align = 4
+        return context.get_dummy_value()
 
-    return f32x8(*[f32x8] * 8), generate
+    return types.void(array, offset, *[lanes] * SUMS), generate
