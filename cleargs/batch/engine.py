@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import shutil
 import signal
 import socket
@@ -11,12 +12,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 
 from cleargs.batch.folder import BatchFolder
-from cleargs.errors import InputError, StageError
+from cleargs.errors import InputError, StageError, StoreError
 from cleargs.pipeline.lease import lease, living_holder
 
 ENGINE_VARIABLE = "CLEARGS_SNAKEMAKE"
@@ -25,6 +26,12 @@ LOOK_EVERY = 1.0
 """Seconds between two looks at how far the scenes are."""
 REST = 10.0
 """At least so many times as long as a look took: a thousand scenes are thousands of small files."""
+LEAVE = 20.0
+"""Seconds that an interrupted engine gets. It takes back its jobs at once, but ends only after its next look
+at them, which may be three minutes away."""
+WORKING = "process {} on {}"
+INTERRUPTED = re.compile(r"process (\d+) on (.+), interrupted at (\d+)")
+"""What the lock file says of an engine."""
 
 
 def find_snakemake() -> Path:
@@ -34,7 +41,7 @@ def find_snakemake() -> Path:
     """
     named = os.environ.get(ENGINE_VARIABLE)
     if named:
-        if not os.access(named, os.X_OK):
+        if not (Path(named).is_file() and os.access(named, os.X_OK)):
             raise InputError(
                 f"${ENGINE_VARIABLE} names {named}, which is no program",
                 hint="let it name the snakemake of an environment",
@@ -79,21 +86,20 @@ def engine_command(folder: BatchFolder, profile: Path, *, cores: int, dry_run: b
 def only_batch(folder: BatchFolder) -> Iterator[int]:
     """Be the only batch at work in ``folder``; yields the lock's handle, which the engine is to inherit.
 
-    The lock lives as long as the engine, also where the command that started it was killed. Where the file
-    system has no locks, the lease tells. Raises StageError when another batch is at work.
+    The lock lives as long as the engine, also where the command that started it was killed; one that was
+    interrupted is waited for. Where the file system has no locks, the lease tells. Raises StageError when
+    another batch is at work, StoreError when the folder cannot be made.
     """
-    folder.root.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot make {folder.root}: {error.strerror}", hint="choose another -o") from error
     handle = os.open(folder.root / "batch.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        busy = living_holder(folder.root / "batch.lease") is not None
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            busy = True
-        except OSError:
-            pass  # a file system without locks
-        if busy:
-            engine = os.pread(handle, 200, 0).decode()
+        if living_holder(folder.root / "batch.lease") is not None or not (
+            _take(handle) or _take_after_interrupted(handle, folder)
+        ):
+            engine = _read_lock(handle)
             raise StageError(
                 f"a batch of this sheet is at work already{f' ({engine})' if engine else ''}",
                 hint="watch it with cleargs batch-status; it may be interrupted, what is done is kept",
@@ -125,8 +131,8 @@ def run_engine(command: Sequence[str], folder: BatchFolder, lock: int, look: Cal
             pass_fds=(lock,),
             start_new_session=True,  # so that a Ctrl-C reaches it once, from here
         )
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, f"process {engine.pid} on {socket.gethostname()}".encode(), 0)
+        working = WORKING.format(engine.pid, socket.gethostname())
+        _write_lock(lock, working)
         try:
             pause = LOOK_EVERY
             while not _ended(engine, pause):
@@ -134,10 +140,23 @@ def run_engine(command: Sequence[str], folder: BatchFolder, lock: int, look: Cal
                 look()
                 pause = max(LOOK_EVERY, REST * (time.monotonic() - begin))
         except KeyboardInterrupt:
+            _write_lock(lock, f"{working}, interrupted at {time.time():.0f}")
             os.killpg(engine.pid, signal.SIGINT)
             raise
     look()
     return engine.returncode
+
+
+def engine_at_work(folder: BatchFolder) -> str | None:
+    """Which engine holds the lock, also one whose command was killed; None when none does, or locks fail."""
+    try:
+        handle = os.open(folder.root / "batch.lock", os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        return None if _take(handle) else _read_lock(handle)
+    finally:
+        os.close(handle)
 
 
 def _ended(engine: subprocess.Popen[bytes], seconds: float) -> bool:
@@ -147,6 +166,46 @@ def _ended(engine: subprocess.Popen[bytes], seconds: float) -> bool:
         return True
     except subprocess.TimeoutExpired:
         return False
+
+
+def _take(lock: int) -> bool:
+    """Try to take the lock; whether it is ours, or the file system has no locks."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def _take_after_interrupted(lock: int, folder: BatchFolder) -> bool:
+    """Take the lock from an engine of this host that was interrupted: wait for its end, then end it.
+
+    That loses nothing: what it may have left at work on a cluster is taken for what it is, work of others.
+    """
+    found = INTERRUPTED.fullmatch(_read_lock(lock))
+    if found is None or found[2] != socket.gethostname():
+        return False
+    while time.time() < int(found[3]) + LEAVE:
+        if _take(lock):
+            return True
+        time.sleep(0.2)
+    with suppress(OSError):
+        # Containers may share a host's name, but not its processes.
+        if str(folder.root).encode() in Path(f"/proc/{found[1]}/cmdline").read_bytes():
+            os.killpg(int(found[1]), signal.SIGKILL)
+    time.sleep(0.5)
+    return _take(lock)
+
+
+def _read_lock(lock: int) -> str:
+    return os.pread(lock, 200, 0).decode()
+
+
+def _write_lock(lock: int, text: str) -> None:
+    os.ftruncate(lock, 0)
+    os.pwrite(lock, text.encode(), 0)
 
 
 def _locked(folder: BatchFolder) -> bool:

@@ -23,10 +23,12 @@ class Wanted(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cpus: int | None = Field(None, ge=1, description="CPU cores, also the number of threads")
-    memory_gb: float | None = Field(None, gt=0, description="memory, GB (1000 MB)")
-    minutes: int | None = Field(None, ge=1, description="run time limit, minutes")
-    gpus: int | None = Field(None, ge=0, description="GPUs")
+    cpus: int | None = Field(None, ge=1, le=1024, description="CPU cores, also the number of threads")
+    memory_gb: float | None = Field(None, gt=0, le=100_000, description="memory, GB (1000 MB)")
+    minutes: int | None = Field(
+        None, ge=1, le=525_600, description="run time limit, minutes (at most a year)"
+    )
+    gpus: int | None = Field(None, ge=0, le=64, description="GPUs")
 
 
 class Resources(BaseModel):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -19,8 +19,10 @@ from cleargs.pipeline.config import Config, Document, check_document, merge, rea
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import settings as flat
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+NAME_RULE = "letters, digits, and _ . - after the first, at most 100"
 FIELDS = ("name", "input", "recipe", "set", "resources")
+RESOURCES = ", ".join(Wanted.model_fields)
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,9 @@ class Scene:
 
 def read_scenes(path: Path, dag: Dag) -> list[Scene]:
     """The scenes of the sheet ``path``. Raises SheetError with all mistakes, InputError for no sheet."""
-    checker = _Checker(path.absolute().parent, dag)
-    scenes = [scene for row in read_rows(path) if (scene := checker.scene(row)) is not None]
+    rows, problems = read_rows(path)
+    checker = _Checker(path.absolute().parent, dag, problems)
+    scenes = [scene for row in rows if (scene := checker.scene(row)) is not None]
     if checker.problems:
         raise SheetError(path, sorted(checker.problems))
     return scenes
@@ -49,10 +52,10 @@ def read_scenes(path: Path, dag: Dag) -> list[Scene]:
 class _Checker:
     """Collects what is wrong with the rows of one sheet."""
 
-    def __init__(self, folder: Path, dag: Dag) -> None:
+    def __init__(self, folder: Path, dag: Dag, problems: Iterable[Problem]) -> None:
         self.folder = folder
         self.dag = dag
-        self.problems: set[Problem] = set()
+        self.problems = set(problems)
         self._names: dict[str, int] = {}
         self._recipe = cache(self._read_recipe)
 
@@ -80,7 +83,7 @@ class _Checker:
             self._note(row.line, "the scene has no name")
             return ""
         if not NAME.fullmatch(name):
-            self._note(line, f"the name {name!r} may hold letters, digits, and _ . - after the first")
+            self._note(line, f"the name {name!r} may hold {NAME_RULE}")
         elif name in self._names:
             self._note(line, f"the name {name!r} is taken on line {self._names[name]}")
         self._names.setdefault(name, line)
@@ -89,8 +92,8 @@ class _Checker:
     def _source(self, row: Row) -> Path:
         """The input, relative to the folder of the sheet."""
         given = row.values.get("input")
-        if not isinstance(given, str):
-            self._note(row.line, "the scene has no input")
+        if not isinstance(given, str) or not given.strip():
+            self._note(row.line_of("input"), "the scene has no input")
             return self.folder
         source = self.folder / given
         if not source.exists():
@@ -145,6 +148,9 @@ class _Checker:
         for name, table in tables.items():
             if name not in wanted:
                 self._note(row.line_of(f"resources.{name}"), f"resources: there is no stage {name!r}")
+                continue
+            if not isinstance(table, dict):
+                self._note(row.line_of(f"resources.{name}"), f"resources.{name} is a table of {RESOURCES}")
                 continue
             try:
                 wanted[name] = Wanted.model_validate(table)

@@ -17,6 +17,8 @@ ASSIGNMENT = re.compile(r"\s*([^=#\[\]]+?)\s*=")
 TABLE = re.compile(r"\s*\[([^\[\]]+)\]")
 PLAIN = ("name", "input", "recipe")
 """Columns of a CSV sheet that are taken as they are."""
+NEEDED = ("name", "input")
+FIRST_LINE = "the first line names the columns, with commas between them"
 
 
 @dataclass(frozen=True, order=True)
@@ -57,20 +59,23 @@ class Row:
         return self.lines.get(name, self.line)
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The scenes that the sheet ``path`` lists: CSV where its name ends so, TOML otherwise.
+def read_rows(path: Path) -> tuple[list[Row], list[Problem]]:
+    """The scenes that the sheet ``path`` lists, and what is wrong with single cells: CSV where its name ends
+    so, TOML otherwise.
 
-    Raises InputError when the file cannot be read or is no such file, SheetError for a CSV with bad cells.
+    Raises InputError when the file cannot be read or is no such file, SheetError where nothing can be made of
+    a CSV.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         cause = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise InputError(f"cannot read {path}: {cause}", hint="give a sheet, TOML or CSV") from error
-    rows = _csv_rows(path, text) if path.suffix.lower() == ".csv" else _toml_rows(path, text)
-    if not rows:
+    is_csv = path.suffix.lower() == ".csv"
+    rows, problems = _csv_rows(path, text) if is_csv else (_toml_rows(path, text), [])
+    if not rows and not problems:
         raise InputError(f"{path} lists no scene", hint='write [[scene]], name = "room", input = "room.mp4"')
-    return rows
+    return rows, problems
 
 
 # -- TOML --------------------------------------------------------------------------------------------------
@@ -126,30 +131,39 @@ def _plain(name: str) -> str:
 # -- CSV ---------------------------------------------------------------------------------------------------
 
 
-def _csv_rows(path: Path, text: str) -> list[Row]:
+def _csv_rows(path: Path, text: str) -> tuple[list[Row], list[Problem]]:
     """Columns ``name``, ``input``, ``recipe``; any other is a setting (``g0.steps``) or a resource
     (``resources.g0.minutes``). An empty cell says nothing."""
-    reader = csv.reader(text.splitlines(keepends=True))
-    header = [column.strip() for column in next(reader, [])]
+    (_, header), *rows = _table(path, text)
+    missing = [name for name in NEEDED if name not in header]
+    if missing:
+        raise SheetError(path, [Problem(1, f"there is no column {name}; {FIRST_LINE}") for name in missing])
     problems = [Problem(1, f"column {name!r} is given twice") for name in _repeated(header)]
-    rows = []
-    for cells in reader:
-        line = reader.line_num
-        if not any(cell.strip() for cell in cells):
-            continue
+    found = []
+    for line, cells in rows:
         if len(cells) > len(header):
             problems.append(Problem(line, f"{len(cells)} cells, but the header names {len(header)}"))
         values: dict[str, Any] = {}
         for column, cell in zip(header, cells, strict=False):
-            if cell.strip():
+            if cell:
                 try:
-                    values = merge(values, _cell(column, cell.strip()))
-                except ConfigError as error:
-                    problems.append(Problem(line, str(error)))
-        rows.append(Row(line, values))
-    if problems:
-        raise SheetError(path, problems)
-    return rows
+                    values = merge(values, _cell(column, cell))
+                except ConfigError:
+                    text = f"{cell!r} stands below {column!r}, which names no setting"
+                    problems.append(Problem(line, text))
+        if any(cells):
+            found.append(Row(line, values))
+    return found, problems
+
+
+def _table(path: Path, text: str) -> list[tuple[int, list[str]]]:
+    """All rows, numbered, the header first."""
+    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+    try:
+        table = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise SheetError(path, [Problem(reader.line_num, f"no CSV: {error}")]) from error
+    return table or [(1, [])]
 
 
 def _cell(column: str, cell: str) -> dict[str, Any]:
@@ -160,4 +174,4 @@ def _cell(column: str, cell: str) -> dict[str, Any]:
 
 
 def _repeated(names: list[str]) -> Iterator[str]:
-    yield from sorted({name for name in names if names.count(name) > 1})
+    yield from sorted({name for name in names if name and names.count(name) > 1})

@@ -59,6 +59,8 @@ def _unfinished(folder: BatchFolder, scene: str, stage: str, finished: int, *, e
         return SceneState(scene, "failed", stage, finished, f"{cause}; see {folder.engine_log}", log=log)
     if status.state == "running":
         return SceneState(scene, "running", stage, finished, _last_line(log), _where(status), log)
+    if status.state == "done":  # what it was done from has changed since
+        return SceneState(scene, "waiting", stage, finished)
     return SceneState(scene, "waiting", stage, finished, status.state, log=log)
 
 

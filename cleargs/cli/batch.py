@@ -55,7 +55,7 @@ Examples:
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
     show_default=True,
-    help="Where to compute; auto looks at this machine.",
+    help="Where to compute. Today auto is the CPU.",
 )
 @click.option("--cores", type=click.IntRange(min=1), help="Cores for local jobs.  [default: all]")
 @json_option

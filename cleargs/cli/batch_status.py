@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from cleargs.batch.engine import engine_at_work
 from cleargs.batch.status import scene_states
 from cleargs.cli.batch import batch_folder, folder_option, print_states, sheet_argument
 from cleargs.cli.common import json_option
@@ -25,5 +26,6 @@ def batch_status(sheet: Path, folder: Path | None, as_json: bool) -> int:
         raise InputError(f"there was no batch in {root.root}", hint=f"start one: cleargs batch {sheet}")
     print_states(scene_states(root, plan), plan, as_json)
     holder = living_holder(root.root / "batch.lease")
-    click.echo(f"at work: {holder.host}, process {holder.pid}" if holder else "no batch is at work", err=True)
+    engine = f"process {holder.pid} on {holder.host}" if holder else engine_at_work(root)
+    click.echo(f"at work: {engine}" if engine else "no batch is at work", err=True)
     return 0

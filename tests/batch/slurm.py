@@ -9,11 +9,12 @@ import getpass
 import os
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,7 @@ SlurmctldHost={host}(127.0.0.1)
 SlurmUser={user}
 SlurmdUser={user}
 AuthType=auth/munge
-# Requeued jobs wait until their credentials are void: seconds instead of two minutes.
+# Requeued jobs wait until their credentials are void: 5 seconds, the least there is, instead of two minutes.
 AuthInfo=socket={folder}/munge/socket,cred_expire=5
 CredType=cred/munge
 CommunicationParameters=NoCtldInAddrAny,NoInAddrAny
@@ -49,11 +50,11 @@ SelectType=select/cons_tres
 SelectTypeParameters=CR_Core_Memory
 SlurmdParameters=config_overrides
 ReturnToService=1
-KillWait=2
+KillWait=1
 MinJobAge=300
 GresTypes=gpu
-NodeName=n1 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[1]} CPUs=4 RealMemory=8000 Gres=gpu:1
-NodeName=n2 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[2]} CPUs=4 RealMemory=8000 Gres=gpu:1
+NodeName=n1 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[1]} CPUs=4 RealMemory=32000 Gres=gpu:1
+NodeName=n2 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[2]} CPUs=4 RealMemory=32000 Gres=gpu:1
 PartitionName=all Nodes=n1,n2 Default=YES MaxTime=INFINITE State=UP
 """
 
@@ -68,6 +69,7 @@ class Slurm:
     """A running cluster."""
 
     folder: Path
+    daemons: ExitStack
 
     def __call__(self, command: str, *arguments: str) -> str:
         """Output of a command of Slurm."""
@@ -83,6 +85,22 @@ class Slurm:
         while answer not in (said := self("scontrol", "show", *question.split())):
             assert time.monotonic() < deadline, f"never {answer}: {said}"
             time.sleep(0.2)
+
+    def start_controller(self) -> None:
+        """Start slurmctld."""
+        _start(self.daemons, self.folder, "slurmctld", "-D", "-f", str(self.folder / "slurm.conf"))
+
+    def restart_controller(self) -> None:
+        """Kill slurmctld with SIGKILL and start it again, as when its machine dies and comes back."""
+        os.kill(int((self.folder / "slurmctld.pid").read_text()), signal.SIGKILL)
+        self.start_controller()
+        _until(self._controller_answers, self.folder)
+
+    def _controller_answers(self) -> bool:
+        try:
+            return "is UP" in self("scontrol", "ping")
+        except AssertionError:
+            return False
 
 
 @contextmanager
@@ -115,17 +133,18 @@ def running_slurm(folder: Path) -> Iterator[Slurm]:
         daemons.callback(os.environ.__setitem__, "PATH", before)
         _start(daemons, folder, "munged", "--foreground", "--force", *munge)
         _until(lambda: (folder / "munge" / "socket").exists(), folder)
-        _start(daemons, folder, "slurmctld", "-D", "-f", str(configuration))
+        slurm = Slurm(folder, daemons)
+        slurm.start_controller()
         for node in NODES:
             (folder / f"spool.{node}").mkdir()
             _start(daemons, folder, "slurmd", "-D", "-N", node, "-f", str(configuration))
-        slurm = Slurm(folder)
         _until(lambda: _idle_nodes(slurm) == len(NODES), folder)
         try:
             yield slurm
         finally:
             slurm("scancel", "--user", getpass.getuser())
             _until(lambda: not slurm("squeue", "--noheader"), folder)
+            _kill_leftovers(folder)
 
 
 MUNGE_FILES = {
@@ -142,6 +161,16 @@ def _start(daemons: ExitStack, folder: Path, name: str, *arguments: str) -> None
         process = subprocess.Popen([str(_program(name)), *arguments], stdout=log, stderr=log)
     daemons.callback(process.wait)
     daemons.callback(process.terminate)
+
+
+def _kill_leftovers(folder: Path) -> None:
+    """Kill what jobs of this cluster left behind: where a node is set down, Snakemake waits for its step
+    for ever, and Slurm forgets it."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            begun_here = "SLURM_JOB_ID=" in (environment := (process / "environ").read_text(errors="replace"))
+            if begun_here and str(folder / "bin") in environment:
+                os.kill(int(process.name), signal.SIGKILL)
 
 
 def _idle_nodes(slurm: Slurm) -> int:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
+from toy_batch import ToyBatch
 
+from cleargs.batch.engine import only_batch
+from cleargs.batch.folder import BatchFolder, Plan, Status
+from cleargs.batch.resources import Wanted, resources
+from cleargs.batch.status import scene_states
 from cleargs.cli.main import invoke
+from cleargs.errors import StageError
 
 
 @pytest.fixture
@@ -54,6 +61,57 @@ def test_no_engine_is_said_with_its_remedy(
     assert invoke(["batch", str(tmp_path / "sheet.csv")]) == 2
     cause, remedy = said(capsys)
     assert "not installed" in cause and "make cluster" in remedy
+
+
+@pytest.mark.parametrize("named", ["", "nowhere"])
+def test_an_engine_that_is_no_program_is_said_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, named: str
+) -> None:
+    monkeypatch.setenv("CLEARGS_SNAKEMAKE", str(tmp_path / named))  # the folder itself, or nothing
+    (tmp_path / "sheet.csv").write_text("name,input\n")
+    assert invoke(["batch", str(tmp_path / "sheet.csv")]) == 2
+    assert "which is no program" in said(capsys)[0]
+
+
+@pytest.mark.usefixtures("program")
+def test_a_sheet_in_the_place_of_its_own_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "hall").touch()
+    sheet = tmp_path / "sheet.batch"
+    sheet.write_text('[[scene]]\nname = "hall"\ninput = "hall"\n')
+    assert invoke(["batch", str(sheet)]) == 1
+    cause, remedy = said(capsys)
+    assert str(sheet) in cause and "-o" in remedy
+    assert sheet.is_file()
+
+
+def test_an_interrupted_engine_that_lingers_is_ended_by_the_next_batch(
+    toy: ToyBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Snakemake does on a cluster, where it sleeps for minutes between two looks at its jobs."""
+    lingers = toy.root / "snakemake"
+    lingers.write_text("#!/bin/sh\ntrap '' INT\necho > lingers\nsleep 600\n")
+    lingers.chmod(0o755)
+    monkeypatch.setenv("CLEARGS_SNAKEMAKE", str(lingers))
+    batch = toy.start(cwd=toy.root)
+    toy.wait_until((toy.root / "lingers").exists)
+    with pytest.raises(StageError, match="at work already"), only_batch(toy.folder):
+        pass
+    batch.send_signal(signal.SIGINT)
+    batch.communicate(timeout=60)
+    assert batch.returncode == 130
+    monkeypatch.setattr("cleargs.batch.engine.LEAVE", 1.0)
+    with only_batch(toy.folder):
+        assert not toy.engine_lives()
+
+
+def test_a_result_that_no_longer_holds_is_waited_for_without_a_word(tmp_path: Path) -> None:
+    """A dry run after a change of the capture takes the handle away; its job's last word was "done"."""
+    folder = BatchFolder(tmp_path)
+    stages = {"count": resources("count", None, Wanted(), "cpu")}
+    plan = Plan(watcher=(), program=(), options=(), stages={"count": ()}, scenes={"hall": stages})
+    folder.write_status("hall", "count", Status(state="done", node="n1", started=0))
+    (state,) = scene_states(folder, plan)
+    assert (state.state, state.cause) == ("waiting", "")
 
 
 def test_the_status_of_no_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

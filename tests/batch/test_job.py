@@ -125,7 +125,7 @@ def test_a_cancelled_job_stops_at_once_and_stays_cancelled(tmp_path: Path) -> No
 
 
 def test_a_stage_that_ends_well_while_it_is_waited_for_is_done(tmp_path: Path) -> None:
-    job = Job(tmp_path, "30", "0", "complete", slurm_state="RUNNING")
+    job = Job(tmp_path, "20", "0", "complete", slurm_state="RUNNING")
     job.signal(signal.SIGTERM)
     code, status = job.ended()
     assert (code, status.state) == (0, "done")

@@ -132,8 +132,52 @@ attic,attic,empty.toml,9
     )
     assert sorted(found) == [2, 3, 4]
     assert "square.power = 9" in found[2][0]
-    crowded = mistakes(tmp_path, dag, "sheet.csv", "name,input,input\na,attic,attic,more\n")
-    assert sorted(crowded) == [1, 2]
+    crowded = mistakes(
+        tmp_path, dag, "sheet.csv", "name,input,input,\na,attic,attic,,more\nb,nowhere\nc,attic,,x\n"
+    )
+    assert sorted(crowded) == [1, 2, 3, 4]
+    assert "'x' stands below ''" in " ".join(crowded[4])
+
+
+@pytest.mark.parametrize("text", ["name;input\na;attic\n", "attic,attic\n", "\n"])
+def test_a_csv_sheet_without_its_header_is_told_so(tmp_path: Path, dag: Dag, text: str) -> None:
+    found = mistakes(tmp_path, dag, "sheet.csv", text)
+    assert sorted(found) == [1]
+    assert [line.partition(";")[0] for line in found[1]] == [
+        "there is no column input",
+        "there is no column name",
+    ]
+
+
+def test_a_quote_that_is_not_closed_swallows_no_scene(tmp_path: Path, dag: Dag) -> None:
+    found = mistakes(tmp_path, dag, "sheet.csv", 'name,input\n"attic,attic\nbarn,barn\n')
+    assert found == {3: ["no CSV: unexpected end of data"]}
+
+
+def test_what_a_spreadsheet_writes_is_read(tmp_path: Path, dag: Dag) -> None:
+    """A byte order mark, line ends of two characters, columns and rows without a word."""
+    text = "\ufeffname,input,recipe,,\r\nattic,attic,empty.toml,,\r\n,,,,\r\n"
+    assert list(read(tmp_path, dag, "sheet.csv", text)) == ["attic"]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('input = " "', "the scene has no input"),
+        (f'name = "{"n" * 101}"', "at most 100"),
+        ("resources.square.memory_gb = inf", "less than or equal to"),
+        ("resources.square.memory_gb = nan", "resources.square.memory_gb"),
+        ("resources.square.minutes = 1000000000", "less than or equal to"),
+        ("resources.square = 5", "resources.square is a table of cpus, memory_gb, minutes, gpus"),
+    ],
+)
+def test_values_that_no_job_could_take(tmp_path: Path, dag: Dag, line: str, said: str) -> None:
+    given = {"name": 'name = "attic"', "input": 'input = "attic"'} | {line.partition(" ")[0]: line}
+    found = mistakes(
+        tmp_path, dag, "sheet.toml", "\n".join(['recipe = "empty.toml"', "[[scene]]", *given.values()])
+    )
+    assert [said in text for texts in found.values() for text in texts] == [True]
+    assert min(found) > 2, "the line is that of the value"
 
 
 @pytest.mark.parametrize("text", ["", "[[scene", "scene = 3", "recipe = 'empty.toml'"])

@@ -6,7 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from cleargs.batch.resources import GPU_STAGES
+from cleargs.batch.resources import GPU_STAGES, Wanted, resources
 from cleargs.batch.watch import PATIENCE
 from cleargs.pipeline.dag import installed
 
@@ -31,6 +31,13 @@ def test_the_stages_that_use_a_gpu_are_one_job() -> None:
     grouped = re.findall(r"(\w+)=scene", SLURM)
     names = installed().names
     assert tuple(grouped) == GPU_STAGES == names[names.index(grouped[0]) :]
+
+
+def test_on_a_gpu_all_stages_but_the_first_ask_for_one() -> None:
+    names = installed().names
+    assert [resources(name, None, Wanted(), "cuda").gpu for name in names] == [0, 1, 1, 1, 1]
+    assert [resources(name, None, Wanted(), "cpu").gpu for name in names] == [0, 0, 0, 0, 0]
+    assert [resources("g0", None, Wanted(gpus=gpus), "cuda").gpu for gpus in (0, 2)] == [0, 2]
 
 
 def test_the_warning_leaves_time_for_a_checkpoint() -> None:

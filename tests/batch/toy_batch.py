@@ -9,9 +9,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 import toy
 from toy import toy_dag
 
-from cleargs.batch.engine import engine_command, profile_folder
 from cleargs.batch.folder import BatchFolder
 from cleargs.batch.prepare import Preparation
-from cleargs.batch.scenes import read_scenes
 from cleargs.batch.status import SceneState, scene_states
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo
@@ -71,7 +70,7 @@ class ToyBatch:
         self.sheet.write_text("\n".join([f'recipe = "empty.toml"\n{head}\n', *blocks]))
 
     def start(self, profile: str = "local", **options: Any) -> subprocess.Popen[str]:
-        """A batch as a process of its own."""
+        """A batch as a process of its own; ``options`` are those of Popen."""
         command = [sys.executable, __file__, str(self.root), profile]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
@@ -84,18 +83,34 @@ class ToyBatch:
         plan = self.folder.read_plan()
         return {} if plan is None else {state.scene: state for state in scene_states(self.folder, plan)}
 
+    def lines(self) -> list[str]:
+        """What stages noted so far."""
+        return self.journal.read_text().splitlines() if self.journal.exists() else []
+
     def work_done(self) -> list[str]:
         """What stages noted since the last call."""
-        lines = self.journal.read_text().splitlines() if self.journal.exists() else []
+        lines = self.lines()
         self.journal.unlink(missing_ok=True)
         return lines
 
-    def wait_for(self, line: str, seconds: float = 240.0) -> None:
+    def squares(self) -> list[str]:
+        """The numbers that were squared so far."""
+        return [line for line in self.lines() if line.startswith("square ")]
+
+    def wait_for(self, line: str) -> None:
         """Until a stage has noted ``line``."""
+        self.wait_until(lambda: line in self.lines(), line)
+
+    def wait_until(self, true: Callable[[], bool], what: str = "", seconds: float = 240.0) -> None:
+        """Until ``true`` says so."""
         deadline = time.monotonic() + seconds
-        while line not in (self.journal.read_text().splitlines() if self.journal.exists() else []):
-            assert time.monotonic() < deadline, f"never saw {line!r}: {self.engine_said()}"
+        while not true():
+            assert time.monotonic() < deadline, f"never saw {what!r}: {self.engine_said()}"
             time.sleep(0.05)
+
+    def finished(self, scene: str, stage: str) -> bool:
+        """Whether Snakemake would take a stage for done."""
+        return self.folder.read_handle(scene, stage) is not None
 
     def digests(self, scene: str) -> dict[str, str]:
         """Stage -> digest of what the run folder shows."""
@@ -113,6 +128,11 @@ class ToyBatch:
     def engine(self) -> int:
         """Number of the engine's process, the last one's where none is at work."""
         return int((self.folder.root / "batch.lock").read_text().split()[1])
+
+    def engine_lives(self) -> bool:
+        """Whether the engine's process is there and is no zombie."""
+        state = Path(f"/proc/{self.engine}/stat")
+        return state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z"
 
     def end_engine(self) -> None:
         """Kill the engine, and all that it started on this machine, where a test left it at work."""
@@ -145,23 +165,16 @@ def make_toy_batch(root: Path) -> ToyBatch:
     return toy
 
 
-def main(root: Path, profile: str) -> int:
-    """The program."""
-    from cleargs.cli.batch import run_batch
-    from cleargs.cli.progress import make_reporter
+def main(root: Path, profile: str) -> None:
+    """The program: that of the users, but for the stages."""
+    from cleargs.cli import batch
+    from cleargs.cli.main import main as cleargs
 
-    batch = ToyBatch(root)
-    program = (sys.executable, str(Path(toy.__file__)), str(batch.journal))
-    preparation = Preparation(batch.dag, batch.folder, "cpu", program=program)
-    command = engine_command(batch.folder, profile_folder(profile), cores=2)
-    scenes = read_scenes(batch.sheet, batch.dag)
-    return run_batch(preparation, scenes, command, make_reporter(quiet=False), as_json=True)
+    toys = ToyBatch(root)
+    program = (sys.executable, str(Path(toy.__file__)), str(toys.journal))
+    batch.Preparation = partial(Preparation, program=program)
+    cleargs(["batch", str(toys.sheet), "--profile", profile, "--device", "cpu", "--json"], toys.dag)
 
 
 if __name__ == "__main__":
-    from cleargs.errors import CleargsError
-
-    try:
-        sys.exit(main(Path(sys.argv[1]), sys.argv[2]))
-    except CleargsError as error:
-        sys.exit(f"error: {error}")
+    main(Path(sys.argv[1]), sys.argv[2])
