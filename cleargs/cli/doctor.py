@@ -95,7 +95,8 @@ def _disk(folder: Path) -> Finding:
 
 def _device() -> Finding:
     obstacle = cuda_obstacle()
-    return Finding("device", "ok", "cuda" if obstacle is None else f"cpu ({obstacle})")
+    found = "cpu; --device cuda uses the GPU" if obstacle is None else f"cpu ({obstacle})"
+    return Finding("device", "ok", found)
 
 
 def _writable(what: str, folder: Path) -> Finding:
