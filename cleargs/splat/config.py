@@ -20,7 +20,7 @@ class TrainConfig(BaseModel):
     steps: int = Field(2000, ge=1, le=1_000_000, description="optimisation steps, one view each")
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
     coarse_share: float = Field(
-        0.5, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
+        0.25, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
     )
     coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
 

@@ -131,5 +131,5 @@ def test_rotations_are_rotations() -> None:
 
 
 def test_the_budget_follows_the_pixels_within_bounds() -> None:
-    assert budget_from_pixels(0) < budget_from_pixels(16 * 540 * 960) < budget_from_pixels(10**9)
+    assert 0 < budget_from_pixels(0) < budget_from_pixels(24 * 540 * 960) < budget_from_pixels(10**9)
     assert budget_from_pixels(10**9) == budget_from_pixels(10**10)
