@@ -30,7 +30,7 @@ def budget_from_pixels(pixels: int) -> int:
     """Hard budget of a capture whose active frames hold ``pixels`` pixels in all.
 
     One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
-    within [40,000, 150,000]: fewer cost a small capture a dB (docs/training.md), and with more an iteration on
+    within [40,000, 150,000]: fewer cost a small capture a dB (docs/training.md); with more, an iteration on
     two cores is no longer well under a second.
     """
     return int(np.clip(pixels // 160, 40_000, 150_000))
