@@ -17,7 +17,10 @@ from numba import prange
 from cleargs.bench.probe import KERNELS
 from cleargs.splat import constants
 from cleargs.splat.kernels.cpu.jit import Array, Floats, kernel
-from cleargs.splat.kernels.cpu.layout import (
+from cleargs.splat.kernels.cpu.pipeline import Frame
+from cleargs.splat.kernels.cpu.rasterise import PIECES
+from cleargs.splat.kernels.cpu.simd import LANES
+from cleargs.splat.kernels.layout import (
     BEND_X,
     BEND_Y,
     LOG2_OPACITY,
@@ -26,9 +29,6 @@ from cleargs.splat.kernels.cpu.layout import (
     SKEW,
     TILE,
 )
-from cleargs.splat.kernels.cpu.pipeline import Frame
-from cleargs.splat.kernels.cpu.rasterise import PIECES
-from cleargs.splat.kernels.cpu.simd import LANES
 
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 PIXEL_CENTRE = np.float32(constants.PIXEL_CENTRE)

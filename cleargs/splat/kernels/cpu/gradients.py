@@ -12,7 +12,21 @@ from numba import prange
 
 from cleargs.splat.kernels.cpu.harmonics import sh_basis, sh_direction_gradient
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
-from cleargs.splat.kernels.cpu.layout import (
+from cleargs.splat.kernels.cpu.projection import (
+    BLOCK,
+    DILATION,
+    QUATERNION_EPSILON,
+    ZERO,
+    View,
+    camera_position,
+    cross,
+    dot,
+    projection_rows,
+    residual,
+    scaled_axes,
+    unit_quaternion,
+)
+from cleargs.splat.kernels.layout import (
     BLUE,
     GREEN,
     PAIR_COLUMNS,
@@ -27,20 +41,6 @@ from cleargs.splat.kernels.cpu.layout import (
     SUM_VUY,
     SUM_VY,
     SUM_VYY,
-)
-from cleargs.splat.kernels.cpu.projection import (
-    BLOCK,
-    DILATION,
-    QUATERNION_EPSILON,
-    ZERO,
-    View,
-    camera_position,
-    cross,
-    dot,
-    projection_rows,
-    residual,
-    scaled_axes,
-    unit_quaternion,
 )
 
 

@@ -15,7 +15,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
 from cleargs.splat.kernels.cpu.jit import Array, Floats
-from cleargs.splat.kernels.cpu.layout import MAX_PAIRS, PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH, TILE
+from cleargs.splat.kernels.layout import MAX_PAIRS, PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH, TILE
 from cleargs.splat.kernels.memory import available_memory
 
 PAIR_BUFFERS = ("pair_tiles", "pair_ids", "pair_slots", "pair_sums")

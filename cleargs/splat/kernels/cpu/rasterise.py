@@ -34,23 +34,6 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, inlined, kernel
-from cleargs.splat.kernels.cpu.layout import (
-    BEND_X,
-    BEND_Y,
-    BLUE,
-    DEPTH,
-    GREEN,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    SKEW,
-    SPLAT_COLUMNS,
-    SUM_BLUE,
-    SUM_DEPTH,
-    TILE,
-    TILE_PIXELS,
-)
 from cleargs.splat.kernels.cpu.simd import (
     LANES,
     any_lane,
@@ -68,6 +51,23 @@ from cleargs.splat.kernels.cpu.simd import (
     select,
     store,
     store_lane_sums,
+)
+from cleargs.splat.kernels.layout import (
+    BEND_X,
+    BEND_Y,
+    BLUE,
+    DEPTH,
+    GREEN,
+    LOG2_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    RED,
+    SKEW,
+    SPLAT_COLUMNS,
+    SUM_BLUE,
+    SUM_DEPTH,
+    TILE,
+    TILE_PIXELS,
 )
 
 ZERO, ONE, HALF = (np.float32(x) for x in (0, 1, 0.5))

@@ -1,10 +1,4 @@
-"""Memory layouts that the GPU kernels share; the mathematics is that of the CPU back end's ``layout``.
-
-A *splat* is a projected Gaussian, its ellipse stored with the square completed in x, so that nothing cancels
-in float32 however thin it is:
-
-    log2 alpha = LOG2_OPACITY - BEND_X u² - BEND_Y dy²,
-    u = dx - SKEW dy,    dx = x - MEAN_X,    dy = y - MEAN_Y.
+"""Memory layouts that the GPU kernels share: those of both back ends (``kernels.layout``), and their own.
 
 A *pair* is a (tile, splat) that touch. Pairs have two numberings: their *slot* (all pairs of the nearest
 splat, of the next, ...), in which they are made and in which the backward pass leaves its sums, and their
@@ -19,39 +13,34 @@ from __future__ import annotations
 import math
 
 from cleargs.splat.constants import LOG2_ALPHA_CUT, SSIM_RADIUS, SSIM_SIGMA
-
-# One packed splat: a row of 16 float32.
-MEAN_X = 0  # px
-MEAN_Y = 1  # px
-BEND_X = 2  # px⁻²
-SKEW = 3  # horizontal shift of the ridge per row
-BEND_Y = 4  # px⁻²
-LOG2_OPACITY = 5  # anti-aliasing compensation included
-RED = 6
-GREEN = 7
-BLUE = 8
-DEPTH = 9  # camera z
-EXTENT_X = 10  # px, half width of the ellipse alpha = 1/255
-EXTENT_Y = 11  # px, half height of it
-EXTENT_X_AT = 12  # px, dy of its rightmost point
-SPLAT_COLUMNS = 16
-
-# Sums over the pixels of one pair; with v = dL/d(ln alpha), w = alpha T.
-SUM_V = 0
-SUM_VU = 1
-SUM_VY = 2
-SUM_VUU = 3
-SUM_VUY = 4
-SUM_VYY = 5
-SUM_RED = 6  # of w dL/d(red of the pixel)
-SUM_GREEN = 7
-SUM_BLUE = 8
-SUM_DEPTH = 9
-PAIR_COLUMNS = 10
-
-TILE = 16
-"""Side of a tile, px; a power of two."""
-TILE_PIXELS = TILE * TILE
+from cleargs.splat.kernels.layout import BEND_X as BEND_X
+from cleargs.splat.kernels.layout import BEND_Y as BEND_Y
+from cleargs.splat.kernels.layout import BLUE as BLUE
+from cleargs.splat.kernels.layout import DEPTH as DEPTH
+from cleargs.splat.kernels.layout import EXTENT_X as EXTENT_X
+from cleargs.splat.kernels.layout import EXTENT_X_AT as EXTENT_X_AT
+from cleargs.splat.kernels.layout import EXTENT_Y as EXTENT_Y
+from cleargs.splat.kernels.layout import GREEN as GREEN
+from cleargs.splat.kernels.layout import LOG2_OPACITY as LOG2_OPACITY
+from cleargs.splat.kernels.layout import MAX_PAIRS as MAX_PAIRS
+from cleargs.splat.kernels.layout import MEAN_X as MEAN_X
+from cleargs.splat.kernels.layout import MEAN_Y as MEAN_Y
+from cleargs.splat.kernels.layout import PAIR_COLUMNS as PAIR_COLUMNS
+from cleargs.splat.kernels.layout import RED as RED
+from cleargs.splat.kernels.layout import SKEW as SKEW
+from cleargs.splat.kernels.layout import SPLAT_COLUMNS as SPLAT_COLUMNS
+from cleargs.splat.kernels.layout import SUM_BLUE as SUM_BLUE
+from cleargs.splat.kernels.layout import SUM_DEPTH as SUM_DEPTH
+from cleargs.splat.kernels.layout import SUM_GREEN as SUM_GREEN
+from cleargs.splat.kernels.layout import SUM_RED as SUM_RED
+from cleargs.splat.kernels.layout import SUM_V as SUM_V
+from cleargs.splat.kernels.layout import SUM_VU as SUM_VU
+from cleargs.splat.kernels.layout import SUM_VUU as SUM_VUU
+from cleargs.splat.kernels.layout import SUM_VUY as SUM_VUY
+from cleargs.splat.kernels.layout import SUM_VY as SUM_VY
+from cleargs.splat.kernels.layout import SUM_VYY as SUM_VYY
+from cleargs.splat.kernels.layout import TILE as TILE
+from cleargs.splat.kernels.layout import TILE_PIXELS as TILE_PIXELS
 
 CHUNK = 64
 """Pairs between two checkpoints of the forward pass."""
@@ -76,9 +65,6 @@ VIEW_LEFT = 19  # bounds of x/z and y/z in the Jacobian
 VIEW_RIGHT = 20
 VIEW_TOP = 21
 VIEW_BOTTOM = 22
-
-MAX_PAIRS = 2**31 - 1
-"""Pairs are numbered with 32 bits."""
 
 FLOAT32_MAX = 3.4028234663852886e38
 HALF_LOG2E = 0.5 / math.log(2.0)

@@ -1,4 +1,4 @@
-"""Memory layouts that the CPU kernels share: packed splats, pair sums, tiles.
+"""Memory layouts of both back ends: packed splats, pair sums, tiles.
 
 A *splat* is a projected Gaussian. Its ellipse is stored with the square completed in x. With the
 projected covariance Σ and d = pixel centre - projected mean,
@@ -45,7 +45,7 @@ SUM_DEPTH = 9
 PAIR_COLUMNS = 10
 
 TILE = 16
-"""Width and height of a tile, px."""
+"""Width and height of a tile, px; a power of two."""
 TILE_PIXELS = TILE * TILE
 
 MAX_PAIRS = 2**31 - 1
