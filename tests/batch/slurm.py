@@ -86,21 +86,39 @@ class Slurm:
             assert time.monotonic() < deadline, f"never {answer}: {said}"
             time.sleep(0.2)
 
+    def clear(self) -> None:
+        """Cancel every job and take every node back, whatever a test left behind."""
+        self("scancel", "--user", getpass.getuser())
+        _until(lambda: not self("squeue", "--noheader"), self.folder)
+        for node in NODES:
+            if "idle" not in self("sinfo", "--noheader", "--nodes", node, "--format", "%T"):
+                self("scontrol", "update", f"NodeName={node}", "State=RESUME")
+        _until(lambda: _idle_nodes(self) == len(NODES), self.folder)
+
     def start_controller(self) -> None:
         """Start slurmctld."""
         _start(self.daemons, self.folder, "slurmctld", "-D", "-f", str(self.folder / "slurm.conf"))
 
     def restart_controller(self) -> None:
-        """Kill slurmctld with SIGKILL and start it again, as when its machine dies and comes back."""
+        """Kill slurmctld with SIGKILL and start it again, as when its machine dies and comes back.
+
+        It is killed once its state is on the disk: what it had not saved it would learn from the nodes, but
+        asks them a hundred seconds later.
+        """
+        before = time.time()
+        for job in self("squeue", "--noheader", "--format", "%i").split():
+            self("scontrol", "update", f"JobId={job}", "AdminComment=changed")  # makes it save
+        _until(lambda: (self.folder / "state" / "job_state").stat().st_mtime > before, self.folder)
         os.kill(int((self.folder / "slurmctld.pid").read_text()), signal.SIGKILL)
         self.start_controller()
-        _until(self._controller_answers, self.folder)
+        # A step that ends before the nodes have answered stays "running" to it, and its job gets no other.
+        _until(self._knows_the_nodes, self.folder)
 
-    def _controller_answers(self) -> bool:
+    def _knows_the_nodes(self) -> bool:
         try:
-            return "is UP" in self("scontrol", "ping")
+            return "unk" not in self("sinfo", "--noheader", "--Node")
         except AssertionError:
-            return False
+            return False  # it does not answer yet
 
 
 @contextmanager
@@ -142,8 +160,6 @@ def running_slurm(folder: Path) -> Iterator[Slurm]:
         try:
             yield slurm
         finally:
-            slurm("scancel", "--user", getpass.getuser())
-            _until(lambda: not slurm("squeue", "--noheader"), folder)
             _kill_leftovers(folder)
 
 

@@ -69,6 +69,16 @@ class ToyBatch:
         ]
         self.sheet.write_text("\n".join([f'recipe = "empty.toml"\n{head}\n', *blocks]))
 
+    @property
+    def hold(self) -> Path:
+        """While it exists, a `square` of a sheet with ``held()`` waits behind its first number."""
+        return self.root / "hold"
+
+    def held(self) -> str:
+        """Lines of a sheet that hold every scene amid `square`, until ``hold`` is unlinked."""
+        self.hold.touch()
+        return f"[set]\nsquare.hold = {json.dumps(str(self.hold))}\n"
+
     def start(self, profile: str = "local", **options: Any) -> subprocess.Popen[str]:
         """A batch as a process of its own; ``options`` are those of Popen."""
         command = [sys.executable, __file__, str(self.root), profile]

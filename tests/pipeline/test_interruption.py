@@ -59,13 +59,13 @@ def test_killed_at_any_moment_the_same_command_ends_with_the_same_digests(bench:
 
 
 def test_two_runs_at_once_do_each_stage_once(bench: Bench) -> None:
-    first = start(bench, "square.delay_s=0.2")
-    wait_for(bench, "square 0.txt")
-    first.send_signal(signal.SIGSTOP)  # until the second has met it
-    second = start(bench, "square.delay_s=0.2")
+    (bench.root / "hold").touch()
+    first = start(bench, f"square.hold={bench.root / 'hold'}")
+    wait_for(bench, "held")
+    second = start(bench)
     assert second.stderr is not None
     met = any("square: another run is at work on it; waiting" in line for line in second.stderr)
-    first.send_signal(signal.SIGCONT)
+    (bench.root / "hold").unlink()
     assert met
     for process in (first, second):
         _, errors = process.communicate(timeout=60)
@@ -76,8 +76,9 @@ def test_two_runs_at_once_do_each_stage_once(bench: Bench) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_says_so_and_goes_on(bench: Bench, number: signal.Signals) -> None:
-    process = start(bench, "square.delay_s=0.5")
-    wait_for(bench, "square 1.txt")
+    (bench.root / "hold").touch()
+    process = start(bench, f"square.hold={bench.root / 'hold'}")
+    wait_for(bench, "held")
     os.kill(process.pid, number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -48,6 +48,7 @@ class SquareConfig(BaseModel):
 
     power: int = Field(2, ge=1, le=4)
     delay_s: float = Field(0.0, ge=0, le=1, json_schema_extra={"key": False})
+    hold: str = Field("", description="a file", json_schema_extra={"key": False})
 
 
 class TotalConfig(BaseModel):
@@ -95,7 +96,11 @@ class Count:
 
 @dataclass
 class Square:
-    """numbers -> powers/*.txt, one at a time, so that a killed try goes on."""
+    """numbers -> powers/*.txt, one at a time, so that a killed try goes on.
+
+    Notes ``held`` behind the first number, and waits there while the file ``hold`` exists: a test has all the
+    time it needs to meet this stage at work.
+    """
 
     journal: Path
     VERSION: int = 1
@@ -128,8 +133,15 @@ class Square:
                 total += power
                 write_bytes(state, f"{index + 1} {total}".encode())
                 task.advance()
+                if index == 0 and context.config.hold:
+                    self._wait_while(Path(context.config.hold))
         write_bytes(context.out / "powers" / "total.txt", str(total).encode())
         return StageResult(summary={"total": total})
+
+    def _wait_while(self, hold: Path) -> None:
+        note(self.journal, "held")
+        while hold.exists():
+            time.sleep(0.02)
 
 
 @dataclass
