@@ -70,7 +70,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
-    from cleargs.rivr.gates import judge_harm
+    from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.results import consolidation_summary
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet

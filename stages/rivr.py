@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import RivrConfig
 
-VERSION = 5
+VERSION = 6
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -75,9 +75,9 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
-    from cleargs.rivr.gates import judge_harm
+    from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.restoring import Restorations
-    from cleargs.rivr.results import summary
+    from cleargs.rivr.results import refused_repairs, summary
     from cleargs.rivr.rounds import Rules, pseudo_view, run_round
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision
@@ -94,6 +94,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         primary=load_scorer(config.primary_scorer, networks_on),
         tiebreak=load_scorer(config.tiebreak_scorer, networks_on),
         margin=config.margin,
+        gate=config.gate,
         fuse_sigma=config.fuse_sigma,
         use_fused=config.use_fused,
         threads=threads,
@@ -126,6 +127,11 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
             )
             trainings.append(current)
     write_selection(context.out / "selection.parquet", rows)
+    if 2 * (refused := refused_repairs(rows)) > len(rows):
+        reporter.warn(
+            f"{refused} of {len(rows)} repairs by {expert.name} were refused: they agree with neither the "
+            "raw frame nor the render (candidates.png shows some); the renders stand in for them"
+        )
 
     before = g0.fidelity(supervision.judges, rules.primary, threads)
     after = current.fidelity(supervision.judges, rules.primary, threads)

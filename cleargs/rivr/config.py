@@ -26,6 +26,23 @@ class HarmConfig(BaseModel):
     score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
 
 
+class GateConfig(BaseModel):
+    """When a repair is refused because it disagrees with both the raw frame and the render.
+
+    docs/rivr.md has the measurements behind the thresholds.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_share: float = Field(
+        0.1, ge=0.0, le=1.0, description="share of the blocks that may disagree; 1: no repair is refused"
+    )
+    max_shift: float = Field(0.6, ge=0.0, description="a block disagrees when it is further out of place, px")
+    max_colour: float = Field(
+        0.06, ge=0.0, description="or when its mean light differs by more in any channel, in sRGB"
+    )
+
+
 class RepairDistilConfig(DistilConfig):
     """Joint distillation of raw frames and repairs."""
 
@@ -72,6 +89,7 @@ class RivrConfig(BaseModel):
         "the raw frame; false: the paper's",
     )
     use_fused: bool = Field(True, description="false: the ablation without the fused candidate")
+    gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
     distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
 

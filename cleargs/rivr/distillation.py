@@ -12,7 +12,7 @@ from cleargs.files import atomic_path
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
-from cleargs.rivr.gates import Fidelity
+from cleargs.rivr.harm import Fidelity
 from cleargs.rivr.restoring import observation
 from cleargs.rivr.selection import hide_masked
 from cleargs.splat.compensation import Exposure, read_exposure, write_exposure

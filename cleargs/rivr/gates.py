@@ -1,18 +1,55 @@
-"""What keeps a repair, or a scene distilled from repairs, from doing harm."""
+"""What keeps a repair from becoming supervision: it must agree with the raw frame or with the render.
+
+Blur moves light by a few pixels, but it moves neither what the frame shows nor its mean colour: a repair
+lies, block by block, where the raw frame O_t or the render R_t lies, and has the colours of one of the two.
+The scorers of the selection see one image at a time, so they cannot notice when it does not.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from statistics import fmean
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.rivr.candidates import Image
+from cleargs.rivr.config import GateConfig
 
-def refusal(mask: NDArray[np.bool_] | None) -> str | None:
-    """Why the chosen candidate of a frame must not become a pseudo observation; None when it may.
+BLOCK = 64
+"""Side of the blocks that are compared, px."""
+ALIGNED_EVERY, COLOUR_EVERY = 32, 16
+"""Distance of neighbouring blocks whose place, and whose colour, is compared, px."""
+REACH = 8
+"""Longest shift that is looked for along each axis, px."""
+
+REFUSED = "repair refused: "
+"""How the reason of a choice begins when the repair was not among the candidates."""
+
+_FLAT = 0.02  # a block of lower standard deviation has too little texture to be aligned
+_AT_REST = 0.8  # see `_lengths`
+
+Array = NDArray[np.float64]
+
+
+def objection(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:
+    """Why ``repair`` [H, W, 3] of a frame must not become supervision; None when it may.
+
+    Masked pixels must be the same in all three images (`selection.hide_masked`).
+    """
+    if limits.max_share >= 1.0:
+        return None
+    misplaced = float((shifts(repair, observed, render) > limits.max_shift).mean())
+    if misplaced > limits.max_share:
+        return f"{misplaced:.0%} of its blocks out of place"
+    discoloured = float((colour_differences(repair, observed, render) > limits.max_colour).mean())
+    if discoloured > limits.max_share:
+        return f"{discoloured:.0%} of its blocks off colour"
+    return None
+
+
+def all_masked(mask: NDArray[np.bool_] | None) -> str | None:
+    """Why no candidate of a frame may become supervision; None when one may.
 
     mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
     """
@@ -21,59 +58,87 @@ def refusal(mask: NDArray[np.bool_] | None) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Fidelity:
-    """How well a scene explains the frames that were held back from repair."""
+def shifts(repair: Image, observed: Image, render: Image) -> Array:
+    """How far each block is from its place in the nearer of O_t and R_t, px [rows, columns].
 
-    psnr: tuple[float, ...]
-    """Of each frame's render against its raw observation, dB."""
-    score: tuple[float, ...]
-    """Primary score of each render, 0-100, higher is better."""
-
-    @property
-    def mean_psnr(self) -> float:
-        return fmean(self.psnr)
-
-    @property
-    def mean_score(self) -> float:
-        return fmean(self.score)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a distilled scene may be published, with the figures that decided."""
-
-    frames: tuple[int, ...]
-    psnr_before: float
-    psnr_after: float
-    score_before: float
-    score_after: float
-    harm: str | None
-    """What became worse by more than its margin; None: the distilled scene is published."""
-
-    def summary(self) -> dict[str, Any]:
-        """The verdict as JSON values."""
-        return asdict(self) | {"frames": list(self.frames)}
-
-
-def judge_harm(
-    frames: Sequence[int], before: Fidelity, after: Fidelity, *, psnr_margin: float, score_margin: float
-) -> Verdict:
-    """Compare a distilled scene with G0 on the held-back ``frames``.
-
-    Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
-    ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.
+    0 where the block has too little texture to tell.
     """
-    worse = []
-    if after.mean_psnr < before.mean_psnr - psnr_margin:
-        worse.append(f"PSNR fell by {before.mean_psnr - after.mean_psnr:.2f} dB")
-    if after.mean_score < before.mean_score - score_margin:
-        worse.append(f"primary score fell by {before.mean_score - after.mean_score:.2f}")
-    return Verdict(
-        frames=tuple(frames),
-        psnr_before=before.mean_psnr,
-        psnr_after=after.mean_psnr,
-        score_before=before.mean_score,
-        score_after=after.mean_score,
-        harm=" and ".join(worse) or None,
-    )
+    found = []
+    for row in zip(*(_rows(image) for image in (repair, observed, render)), strict=True):
+        lengths = np.zeros(len(row[0]))
+        textured = row[0].std(axis=(1, 2)) > _FLAT
+        if textured.any():
+            spectra, *witnesses = (_spectra(blocks[textured]) for blocks in row)
+            side = row[0].shape[1]
+            lengths[textured] = np.minimum(*(_lengths(spectra * other.conj(), side) for other in witnesses))
+        found.append(lengths)
+    return np.stack(found)
+
+
+def colour_differences(repair: Image, observed: Image, render: Image) -> Array:
+    """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
+    farthest, in sRGB [rows, columns]."""
+    means, *witnesses = (_block_means(image) for image in (repair, observed, render))
+    nearer: Array = np.minimum(*(np.abs(means - other).max(axis=2) for other in witnesses))
+    return nearer
+
+
+def _block_means(image: Image) -> Array:
+    """[rows, columns, 3]; taken in linear light, which blur keeps, and given in sRGB."""
+    linear = linear_from_srgb(image).astype(np.float64)
+    height, width, _ = linear.shape
+    side = min(BLOCK, height, width)
+    strips = np.stack([linear[y : y + side].mean(axis=0) for y in _starts(height, side, COLOUR_EVERY)])
+    means = [strips[:, x : x + side].mean(axis=1) for x in _starts(width, side, COLOUR_EVERY)]
+    return srgb_from_linear(np.stack(means, axis=1))
+
+
+def _rows(image: Image) -> Iterator[Array]:
+    """The grey blocks of each row of blocks, [N, S, S]: S is `BLOCK`, or the shorter side of the image."""
+    grey = image.mean(axis=2, dtype=np.float64)
+    height, width = grey.shape
+    side = min(BLOCK, height, width)
+    for y in _starts(height, side, ALIGNED_EVERY):
+        starts = _starts(width, side, ALIGNED_EVERY)
+        yield np.stack([grey[y : y + side, x : x + side] for x in starts])
+
+
+def _starts(length: int, side: int, step: int) -> list[int]:
+    """Where the blocks along an axis begin; the last one ends with the image."""
+    return sorted({*range(0, length - side + 1, step), length - side})
+
+
+def _spectra(blocks: Array) -> NDArray[np.complex128]:
+    window = np.hanning(blocks.shape[1])
+    centred = blocks - blocks.mean(axis=(1, 2), keepdims=True)
+    return np.fft.rfft2(centred * window[:, None] * window)
+
+
+def _lengths(cross: NDArray[np.complex128], side: int) -> Array:
+    """Length of each block's shift, px, from its cross-power spectrum [N, S, S // 2 + 1].
+
+    Phase correlation, half whitened: fully, the noise that blur leaves at high frequencies would drown the
+    peak; not at all, the peak would be broad. A symmetric blur of either image leaves it in its place, and
+    the parabola through it and its neighbours gives the fraction. Along a lone edge the correlation is a
+    ridge, and its highest point is chance: where it is nearly as high (`_AT_REST`) without any shift, there
+    is none.
+    """
+    correlation = np.fft.irfft2(cross / np.sqrt(np.abs(cross) + 1e-9), (side, side))
+    reach = min(REACH, side // 2 - 1)
+    near = np.arange(-reach - 1, reach + 2)
+    around = correlation[:, near[:, None], near]
+    inner = around[:, 1:-1, 1:-1].reshape(len(around), -1)
+    y, x = np.divmod(inner.argmax(axis=1), 2 * reach + 1)
+    k = np.arange(len(around))
+    peak = around[k, y + 1, x + 1]
+    dy = _fraction(around[k, y, x + 1], peak, around[k, y + 2, x + 1])
+    dx = _fraction(around[k, y + 1, x], peak, around[k, y + 1, x + 2])
+    lengths = np.hypot(y - reach + dy, x - reach + dx)
+    return np.where(correlation[:, 0, 0] < _AT_REST * peak, lengths, 0.0)
+
+
+def _fraction(before: Array, peak: Array, after: Array) -> Array:
+    """Where the parabola through three samples is highest, from the middle one; at most half a sample off."""
+    bend = before - 2.0 * peak + after
+    offset = np.divide(0.5 * (before - after), bend, out=np.zeros_like(bend), where=bend < 0.0)
+    return np.clip(offset, -0.5, 0.5)

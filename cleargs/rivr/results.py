@@ -8,7 +8,8 @@ from statistics import fmean
 from typing import Any
 
 from cleargs.rivr.candidates import CANDIDATES
-from cleargs.rivr.gates import Verdict
+from cleargs.rivr.gates import REFUSED
+from cleargs.rivr.harm import Verdict
 from cleargs.rivr.tables import Selection
 
 
@@ -49,10 +50,16 @@ def _round(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
         "chosen": _counts(rows),
         "accepted": len(rows) - len(refused),
         "refused": dict(Counter(row.reason for row in refused)),
+        "repairs_refused": refused_repairs(rows),
         "tie_breaks": sum(row.reason.startswith("tie-break") for row in rows),
         "scorers": {"primary": rows[0].primary_metric, "tiebreak": rows[0].tiebreak_metric},
         "mean_scores": means,
     }
+
+
+def refused_repairs(rows: Sequence[Selection]) -> int:
+    """How many repairs the gate kept out of the choice."""
+    return sum(row.reason.startswith(REFUSED) for row in rows)
 
 
 def _counts(rows: Sequence[Selection]) -> dict[str, int]:

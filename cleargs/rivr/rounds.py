@@ -18,9 +18,10 @@ from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, writ
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, Source, fuse
-from cleargs.rivr.gates import refusal
+from cleargs.rivr.config import GateConfig
+from cleargs.rivr.gates import REFUSED, all_masked, objection
 from cleargs.rivr.restoring import observation
-from cleargs.rivr.selection import choose, hide_masked
+from cleargs.rivr.selection import Choice, choose, hide_masked
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import Mask, View
 
@@ -40,6 +41,7 @@ class Rules:
     primary: Scorer
     tiebreak: Scorer
     margin: float
+    gate: GateConfig
     fuse_sigma: float
     use_fused: bool
     threads: int
@@ -92,8 +94,13 @@ def repair(
         {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
         for scorer in (rules.primary, rules.tiebreak)
     )
-    choice = choose(primary, tiebreak, rules.margin)
-    refused = refusal(mask)
+    refused = objection(shown["restored"], observed, shown["render"], rules.gate)
+    choice = (
+        choose(primary, tiebreak, rules.margin)
+        if refused is None
+        else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
+    )
+    masked = all_masked(mask)
     row = Selection(
         round=number,
         frame_id=view.frame_id,
@@ -108,8 +115,8 @@ def repair(
         tiebreak_fused=tiebreak.get("fused"),
         restored_from=source,
         chosen=choice.chosen,
-        accepted=refused is None,
-        reason=refused or choice.reason,
+        accepted=masked is None,
+        reason=masked or choice.reason,
     )
     return row, LayeredImage(layers | {"observed": to_layer(observed)}, _attributes(row))
 

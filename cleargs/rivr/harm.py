@@ -1,0 +1,66 @@
+"""What keeps a scene distilled from repairs from doing harm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from statistics import fmean
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How well a scene explains the frames that were held back from repair."""
+
+    psnr: tuple[float, ...]
+    """Of each frame's render against its raw observation, dB."""
+    score: tuple[float, ...]
+    """Primary score of each render, 0-100, higher is better."""
+
+    @property
+    def mean_psnr(self) -> float:
+        return fmean(self.psnr)
+
+    @property
+    def mean_score(self) -> float:
+        return fmean(self.score)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a distilled scene may be published, with the figures that decided."""
+
+    frames: tuple[int, ...]
+    psnr_before: float
+    psnr_after: float
+    score_before: float
+    score_after: float
+    harm: str | None
+    """What became worse by more than its margin; None: the distilled scene is published."""
+
+    def summary(self) -> dict[str, Any]:
+        """The verdict as JSON values."""
+        return asdict(self) | {"frames": list(self.frames)}
+
+
+def judge_harm(
+    frames: Sequence[int], before: Fidelity, after: Fidelity, *, psnr_margin: float, score_margin: float
+) -> Verdict:
+    """Compare a distilled scene with G0 on the held-back ``frames``.
+
+    Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
+    ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.
+    """
+    worse = []
+    if after.mean_psnr < before.mean_psnr - psnr_margin:
+        worse.append(f"PSNR fell by {before.mean_psnr - after.mean_psnr:.2f} dB")
+    if after.mean_score < before.mean_score - score_margin:
+        worse.append(f"primary score fell by {before.mean_score - after.mean_score:.2f}")
+    return Verdict(
+        frames=tuple(frames),
+        psnr_before=before.mean_psnr,
+        psnr_after=after.mean_psnr,
+        score_before=before.mean_score,
+        score_after=after.mean_score,
+        harm=" and ".join(worse) or None,
+    )
