@@ -29,6 +29,8 @@ REST = 10.0
 LEAVE = 20.0
 """Seconds that an interrupted engine gets. It takes back its jobs at once, but ends only after its next look
 at them, which may be three minutes away."""
+GLANCE = 1.0
+"""Seconds that a new batch tries to take the lock: whoever asks for the state holds it for an instant."""
 WORKING = "process {} on {}"
 INTERRUPTED = re.compile(r"process (\d+) on (.+), interrupted at (\d+)")
 """What the lock file says of an engine."""
@@ -79,7 +81,8 @@ def engine_command(folder: BatchFolder, profile: Path, *, cores: int, dry_run: b
     command = [str(find_snakemake()), "--snakefile", str(_workflows() / "Snakefile")]
     command += ["--directory", str(folder.root), "--profile", str(profile), "--workflow-profile", "none"]
     command += ["--cores", str(cores)] if is_local(profile) else []
-    return command + (["--dry-run", "--quiet"] if dry_run else [])
+    plan = f"plan={folder.plan(dry_run=True).name}"
+    return command + (["--dry-run", "--quiet", "--config", plan] if dry_run else [])
 
 
 @contextmanager
@@ -97,7 +100,7 @@ def only_batch(folder: BatchFolder) -> Iterator[int]:
     handle = os.open(folder.root / "batch.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
         if living_holder(folder.root / "batch.lease") is not None or not (
-            _take(handle) or _take_after_interrupted(handle, folder)
+            _take(handle, patience=GLANCE) or _take_after_interrupted(handle, folder)
         ):
             engine = _read_lock(handle)
             raise StageError(
@@ -154,7 +157,7 @@ def engine_at_work(folder: BatchFolder) -> str | None:
     except OSError:
         return None
     try:
-        return None if _take(handle) else _read_lock(handle)
+        return None if _take(handle, fcntl.LOCK_SH) else _read_lock(handle)
     finally:
         os.close(handle)
 
@@ -168,15 +171,20 @@ def _ended(engine: subprocess.Popen[bytes], seconds: float) -> bool:
         return False
 
 
-def _take(lock: int) -> bool:
-    """Try to take the lock; whether it is ours, or the file system has no locks."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass
-    return True
+def _take(lock: int, kind: int = fcntl.LOCK_EX, *, patience: float = 0.0) -> bool:
+    """Try to take the lock for ``patience`` seconds; whether it is ours, or the file system has no locks."""
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            fcntl.flock(lock, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(0.02)
+        except OSError:
+            return True
+        else:
+            return True
 
 
 def _take_after_interrupted(lock: int, folder: BatchFolder) -> bool:

@@ -7,7 +7,7 @@
     BATCH/handles/<scene>/<stage>.json digests of a finished stage: what Snakemake sees
     BATCH/status/<scene>/<stage>.json  what the stage's job did last
     BATCH/logs/<scene>/<stage>.log     what it said; BATCH/logs/engine.log is Snakemake's
-    BATCH/plan.json                    what the Snakefile reads
+    BATCH/plan.json                    what the Snakefile reads; a dry run has dry-run.json
 """
 
 from __future__ import annotations
@@ -66,9 +66,18 @@ class Plan(BaseModel):
     options: tuple[str, ...]
     """Further options of ``cleargs stage``."""
     stages: dict[str, tuple[str, ...]]
-    """Stage -> the stages that it reads, in order."""
+    """Stage -> the stages that it reads, in order. All of them, also behind `until`: jobs of an earlier batch
+    may be left on the cluster, and read this when they start."""
+    until: str
+    """The last stage that is wanted."""
     scenes: dict[str, dict[str, Resources]]
     """Scene -> stage -> what the job asks for."""
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """The stages up to `until`, in order."""
+        names = tuple(self.stages)
+        return names[: names.index(self.until) + 1]
 
 
 @dataclass(frozen=True)
@@ -82,10 +91,9 @@ class BatchFolder:
         """The shared store."""
         return self.root / "store"
 
-    @property
-    def plan(self) -> Path:
-        """What the Snakefile reads."""
-        return self.root / "plan.json"
+    def plan(self, *, dry_run: bool = False) -> Path:
+        """What the Snakefile reads. A dry run has another: jobs on the cluster may still need this one."""
+        return self.root / ("dry-run.json" if dry_run else "plan.json")
 
     @property
     def engine_log(self) -> Path:
@@ -134,15 +142,14 @@ class BatchFolder:
 
     def read_plan(self) -> Plan | None:
         """The plan of the last batch; None where there was none."""
-        return _read(self.plan, Plan)
+        return _read(self.plan(), Plan)
+
+    def write_plan(self, plan: Plan, *, dry_run: bool = False) -> None:
+        """Write what the Snakefile reads."""
+        _write(self.plan(dry_run=dry_run), plan)
 
     def _status(self, scene: str, stage: str) -> Path:
         return self.root / "status" / scene / f"{stage}.json"
-
-
-def write_plan(folder: BatchFolder, plan: Plan) -> None:
-    """Write what the Snakefile reads."""
-    _write(folder.plan, plan)
 
 
 def _write(path: Path, model: BaseModel) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cleargs.batch.folder import BatchFolder, Plan, write_plan
+from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.resources import Resources, resources
 from cleargs.batch.scenes import Scene
 from cleargs.batch.sheet import Problem
@@ -51,10 +51,10 @@ class Preparation:
         return found
 
     def prepare(self, scenes: Sequence[Scene], reporter: Reporter, *, dry_run: bool = False) -> Plan:
-        """Write the run files, refresh the handles, write the plan. A dry run writes handles and plan only,
-        and opens no capture: its jobs ask for the least.
+        """Write the run files, refresh the handles, write the plan. A dry run writes only handles and a plan
+        of its own, and opens no capture: its jobs ask for the least.
         """
-        stages = self.dag.until(self.until)
+        wanted = self.dag.until(self.until)
         asked: dict[str, dict[str, Resources]] = {}
         with (
             DigestMemo(self.folder.store / "digests.sqlite") as memo,
@@ -67,7 +67,7 @@ class Preparation:
                 if not dry_run:
                     write_run_file(run)
                 done = self._finished(planner)
-                estimates = {} if dry_run else self._estimates(planner, set(stages) - done.keys())
+                estimates = {} if dry_run else self._estimates(planner, set(wanted) - done.keys())
                 for stage in self.dag.names:
                     self.folder.refresh(scene.name, stage, done.get(stage))
                     if stage in done and not dry_run:
@@ -76,17 +76,18 @@ class Preparation:
                         self.folder.forget_status(scene.name, stage)
                 asked[scene.name] = {
                     stage: resources(stage, estimates.get(stage), scene.wanted[stage], self.device)
-                    for stage in stages
+                    for stage in self.dag.names
                 }
                 task.advance()
         plan = Plan(
             watcher=WATCHER,
             program=self.program,
             options=self.options,
-            stages={stage: tuple(self.dag.load(stage).INPUTS) for stage in stages},
+            stages={stage: tuple(self.dag.load(stage).INPUTS) for stage in self.dag.names},
+            until=wanted[-1],
             scenes=asked,
         )
-        write_plan(self.folder, plan)
+        self.folder.write_plan(plan, dry_run=dry_run)
         return plan
 
     def _run(self, scene: Scene) -> Run:

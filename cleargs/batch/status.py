@@ -29,7 +29,7 @@ class SceneState:
 
 def scene_states(folder: BatchFolder, plan: Plan, *, ended: bool = False) -> list[SceneState]:
     """The state of each scene. With ``ended`` the engine is gone: what still says "running" has died."""
-    return [_scene_state(folder, scene, tuple(plan.stages), ended=ended) for scene in plan.scenes]
+    return [_scene_state(folder, scene, plan.wanted, ended=ended) for scene in plan.scenes]
 
 
 def _scene_state(folder: BatchFolder, scene: str, stages: tuple[str, ...], *, ended: bool) -> SceneState:

@@ -110,7 +110,7 @@ def run_batch(
                 )
             _print_jobs(folder, plan, as_json)
             return 0
-        with reporter.task("stages", len(plan.scenes) * len(plan.stages)) as task:
+        with reporter.task("stages", len(plan.scenes) * len(plan.wanted)) as task:
             code = run_engine(command, folder, lock, _teller(folder, plan, reporter, task))
     states = scene_states(folder, plan, ended=True)
     print_states(states, plan, as_json)
@@ -148,7 +148,7 @@ def print_states(states: Sequence[SceneState], plan: Plan, as_json: bool) -> Non
     wide = max(len(state.scene) for state in states)
     for state in states:
         line = (
-            f"{state.scene:<{wide}}  {state.state:<8} {state.finished}/{len(plan.stages)}  {state.stage:<12}"
+            f"{state.scene:<{wide}}  {state.state:<8} {state.finished}/{len(plan.wanted)}  {state.stage:<12}"
         )
         click.echo(" ".join([line, *filter(None, (state.where, state.cause))]).rstrip())
         if state.state in ("failed", "partial") and state.log is not None:
@@ -160,7 +160,7 @@ def print_states(states: Sequence[SceneState], plan: Plan, as_json: bool) -> Non
 def _print_jobs(folder: BatchFolder, plan: Plan, as_json: bool) -> None:
     """How many jobs there would be."""
     jobs = {
-        stage: sum(folder.read_handle(scene, stage) is None for scene in plan.scenes) for stage in plan.stages
+        stage: sum(folder.read_handle(scene, stage) is None for scene in plan.scenes) for stage in plan.wanted
     }
     if as_json:
         print_json({"scenes": len(plan.scenes), "jobs": jobs})

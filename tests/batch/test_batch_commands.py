@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import signal
+import threading
 from pathlib import Path
 
 import pytest
 from toy_batch import ToyBatch
 
-from cleargs.batch.engine import only_batch
+from cleargs.batch.engine import engine_at_work, only_batch
 from cleargs.batch.folder import BatchFolder, Plan, Status
 from cleargs.batch.resources import Wanted, resources
 from cleargs.batch.status import scene_states
@@ -104,11 +107,28 @@ def test_an_interrupted_engine_that_lingers_is_ended_by_the_next_batch(
         assert not toy.engine_lives()
 
 
+def test_who_asks_whether_an_engine_is_at_work_is_in_nobodys_way(tmp_path: Path) -> None:
+    folder = BatchFolder(tmp_path)
+    with only_batch(folder) as lock:
+        os.pwrite(lock, b"process 7 on here", 0)
+        assert engine_at_work(folder) == "process 7 on here"
+    with (tmp_path / "batch.lock").open() as watcher:
+        fcntl.flock(watcher, fcntl.LOCK_SH)  # as another asker does
+        assert engine_at_work(folder) is None
+        release = threading.Timer(0.1, fcntl.flock, (watcher, fcntl.LOCK_UN))
+        release.start()
+        with only_batch(folder):
+            pass
+        release.join()
+
+
 def test_a_result_that_no_longer_holds_is_waited_for_without_a_word(tmp_path: Path) -> None:
     """A dry run after a change of the capture takes the handle away; its job's last word was "done"."""
     folder = BatchFolder(tmp_path)
     stages = {"count": resources("count", None, Wanted(), "cpu")}
-    plan = Plan(watcher=(), program=(), options=(), stages={"count": ()}, scenes={"hall": stages})
+    plan = Plan(
+        watcher=(), program=(), options=(), stages={"count": ()}, until="count", scenes={"hall": stages}
+    )
     folder.write_status("hall", "count", Status(state="done", node="n1", started=0))
     (state,) = scene_states(folder, plan)
     assert (state.state, state.cause) == ("waiting", "")

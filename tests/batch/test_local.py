@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from pathlib import Path
@@ -90,6 +91,21 @@ def test_an_interrupted_batch_ends_its_jobs_and_goes_on_later(toy: ToyBatch) -> 
     code, _ = toy.run()  # which waits for the end of the first engine
     assert code == 0, toy.engine_said()
     assert toy.squares().count("square 0.txt") == 1
+
+
+def test_jobs_of_an_earlier_batch_find_their_rule_in_the_plan_of_a_later_one(toy: ToyBatch) -> None:
+    """Where the login node died they are left on the cluster, and read the plan when they start."""
+    toy.write_sheet(scenes={"attic": ""})
+    code, scenes = toy.run("local", "--until", "square")
+    assert (code, kinds(scenes), scenes["attic"]["finished"]) == (0, {"attic": "done"}, 2)
+    assert not toy.finished("attic", "total")
+    plan = toy.folder.read_plan()
+    assert plan is not None and "total" in plan.stages and "total" in plan.scenes["attic"]
+
+    toy.write_sheet(scenes={"barn": ""})
+    said, errors = toy.start("local", "--dry-run").communicate(timeout=60)
+    assert json.loads(said) == {"scenes": 1, "jobs": {"count": 1, "square": 1, "total": 1}}, errors
+    assert toy.folder.read_plan() == plan
 
 
 def test_odd_names_and_folders(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
-"""Three toy captures and a sheet of them. Also a program: ``python toy_batch.py ROOT PROFILE`` is
-``cleargs batch ROOT/sheet.toml --profile PROFILE --json`` with the toy stages."""
+"""Three toy captures and a sheet of them. Also a program: ``python toy_batch.py ROOT PROFILE OPTIONS...``
+is ``cleargs batch ROOT/sheet.toml --profile PROFILE --json OPTIONS...`` with the toy stages."""
 
 from __future__ import annotations
 
@@ -79,14 +79,14 @@ class ToyBatch:
         self.hold.touch()
         return f"[set]\nsquare.hold = {json.dumps(str(self.hold))}\n"
 
-    def start(self, profile: str = "local", **options: Any) -> subprocess.Popen[str]:
-        """A batch as a process of its own; ``options`` are those of Popen."""
-        command = [sys.executable, __file__, str(self.root), profile]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    def start(self, profile: str = "local", *options: str, **process: Any) -> subprocess.Popen[str]:
+        """A batch as a process of its own; ``process`` goes to Popen."""
+        command = [sys.executable, __file__, str(self.root), profile, *options]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **process)
 
-    def run(self, profile: str = "local") -> tuple[int, dict[str, dict[str, Any]]]:
+    def run(self, profile: str = "local", *options: str) -> tuple[int, dict[str, dict[str, Any]]]:
         """A batch to its end: exit code, and scene -> what became of it."""
-        return finish(self.start(profile))
+        return finish(self.start(profile, *options))
 
     def states(self) -> dict[str, SceneState]:
         """What `cleargs batch-status` would show."""
@@ -175,7 +175,7 @@ def make_toy_batch(root: Path) -> ToyBatch:
     return toy
 
 
-def main(root: Path, profile: str) -> None:
+def main(root: Path, profile: str, *options: str) -> None:
     """The program: that of the users, but for the stages."""
     from cleargs.cli import batch
     from cleargs.cli.main import main as cleargs
@@ -183,8 +183,8 @@ def main(root: Path, profile: str) -> None:
     toys = ToyBatch(root)
     program = (sys.executable, str(Path(toy.__file__)), str(toys.journal))
     batch.Preparation = partial(Preparation, program=program)
-    cleargs(["batch", str(toys.sheet), "--profile", profile, "--device", "cpu", "--json"], toys.dag)
+    cleargs(["batch", str(toys.sheet), "--profile", profile, "--device", "cpu", "--json", *options], toys.dag)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    main(Path(sys.argv[1]), *sys.argv[2:])
