@@ -9,7 +9,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 
-VERSION = 2
+VERSION = 3
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
@@ -73,7 +73,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     return StageResult(
         summary={
             "kind": capture.kind,
-            "poses": "input" if capture.posed else "sfm",
+            "poses": ("refined" if scene.refined else "input") if capture.posed else "sfm",
+            "given_poses_missed_px": None if scene.missed is None else round(scene.missed, 6),
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

@@ -31,6 +31,12 @@ class IngestConfig(BaseModel):
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
     )
+    refine_above: float = Field(
+        1.0,
+        ge=0,
+        description="the input's poses are adjusted to the images where, at these poses, the features miss "
+        "their points by more than this many pixels (median); 0: always",
+    )
     camera_model: SfmModel = Field(
         "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"
     )

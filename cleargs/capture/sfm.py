@@ -1,10 +1,12 @@
-"""Poses and sparse points: SfM where the capture has no poses, triangulation where it has.
+"""Poses and sparse points: SfM where the capture has no poses; where it has, triangulation, and adjustment of
+poses that the images contradict (those of depth cameras and headsets mostly; SfM's hardly ever).
 
 COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -37,6 +39,10 @@ class Reconstruction:
 
     model: SparseModel
     similarity: Similarity
+    missed: float | None
+    """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
+    refined: bool
+    """Whether they were adjusted."""
 
 
 def reconstruct(
@@ -51,18 +57,21 @@ def reconstruct(
     """Poses, cameras and points of the working images in ``folder``.
 
     Poses of the input are normalised in float64 before COLMAP sees them; ``given`` (the input's own sparse
-    model) saves the triangulation. Raises StageError when too few frames get a pose.
+    model) saves the triangulation where its poses are good. Raises StageError when too few frames get a pose.
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
         model = _run(_sfm_job(frames, config), folder, config, seed, threads, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity)
+        return Reconstruction(_moved(model, similarity), similarity, None, refined=False)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
     if given is not None:
-        return Reconstruction(_moved(_adopted(given, posed), similarity), similarity)
+        adopted = _adopted(given, posed)
+        missed = float(np.median(adopted.error))
+        if missed <= config.refine_above:
+            return Reconstruction(_moved(adopted, similarity), similarity, missed, refined=False)
     poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
     model = _run(_triangulation_job(posed, poses), folder, config, seed, threads, reporter)
     if not len(model.point_ids):
@@ -71,7 +80,13 @@ def reconstruct(
             hint="check that poses, axes (OpenGL camera to world) and images belong together, "
             "or set ingest.poses=sfm",
         )
-    return Reconstruction(model, similarity)
+    missed, refined = _what_became_of_poses(folder)
+    if refined:
+        reporter.info(
+            f"at the input's poses features missed their points by {missed:.1f} px (median): adjusted to the "
+            f"images, {np.median(model.error):.1f} px; ingest.refine_above keeps them"
+        )
+    return Reconstruction(model, similarity, missed, refined)
 
 
 def _check_registered(registered: int, total: int, config: IngestConfig, reporter: Reporter) -> None:
@@ -152,10 +167,17 @@ def _run(
             "exhaustive_below": config.exhaustive_below,
             "overlap": config.overlap,
             "loop_candidates": config.loop_candidates,
+            "refine_above": config.refine_above,
         }
         write_json(folder / "job.json", settings)
         run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", threads, reporter)
     return read_model(model)
+
+
+def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
+    """Median reprojection error at the given poses, px, and whether they were refined."""
+    said = json.loads((folder / "model" / "given_poses.json").read_text(encoding="utf-8"))
+    return said["missed_px"], said["refined"]
 
 
 def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:

@@ -17,12 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.child import ChildChannel
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
 
 _PAIRS_PER_BLOCK = 100
+_REFINEMENTS = 4
+_HELD_BY = 15
+"""Fewest points that a frame must see to take part in an adjustment."""
 
 
 def main() -> int:
@@ -50,6 +54,9 @@ def main() -> int:
         model = _map(job, database, partial, channel)
     else:
         model = _triangulate(job, database, partial, channel)
+        missed = _median_error(model)
+        if refined := missed > job["refine_above"]:
+            model = _refine(job, database, model, partial, channel)
     if model is None:
         channel.error(
             "no two frames could be matched well enough to start a reconstruction",
@@ -59,6 +66,9 @@ def main() -> int:
     for entry in partial.iterdir():
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     model.write_binary(partial)
+    if job["poses"] is not None:
+        said = {"missed_px": missed, "refined": refined}
+        (partial / "given_poses.json").write_text(json.dumps(said), encoding="utf-8")
     partial.rename(folder / "model")
     return 0
 
@@ -190,7 +200,7 @@ def _map(
 def _triangulate(
     job: dict[str, Any], database: Path, output: Path, channel: ChildChannel
 ) -> pycolmap.Reconstruction:
-    """Points at the given poses and cameras, which stay as they are."""
+    """Points at the given poses and cameras, which stay as they are here."""
     channel.phase("triangulating", None)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
@@ -206,6 +216,61 @@ def _triangulate(
                 world_to_camera,
             )
     return pycolmap.triangulate_points(model, database, job["images"], output, options=_pipeline_options(job))
+
+
+def _median_error(model: pycolmap.Reconstruction) -> float:
+    """Median over the points of their mean reprojection error, px; 0 without any point."""
+    errors = [point.error for point in model.points3D.values()]
+    return float(np.median(errors)) if errors else 0.0
+
+
+def _refine(
+    job: dict[str, Any], database: Path, model: pycolmap.Reconstruction, output: Path, channel: ChildChannel
+) -> pycolmap.Reconstruction:
+    """Adjust poses and points to the features; the cameras stay.
+
+    At better poses more features find their points, so both are done in turn. The features leave place, turn
+    and size of the whole open: the adjusted cameras are laid over the given ones by a similarity. A frame
+    that few points hold keeps its given pose.
+    """
+    given = {
+        frame_id: pycolmap.Rigid3d(frame.rig_from_world.matrix()) for frame_id, frame in model.frames.items()
+    }
+    before = {image.name: _centre_and_axes(image) for image in model.images.values()}
+    channel.phase("adjusting poses", _REFINEMENTS)
+    for done in range(_REFINEMENTS):
+        pycolmap.bundle_adjustment(model, _adjustment_options())
+        model = pycolmap.triangulate_points(
+            model, database, job["images"], output, options=_pipeline_options(job)
+        )
+        channel.done(done + 1)
+    held = [image for image in model.images.values() if image.num_points3D >= _HELD_BY]
+    similarity = pycolmap.estimate_sim3d(
+        np.array([_centre_and_axes(image) for image in held]).reshape(-1, 3),
+        np.array([before[image.name] for image in held]).reshape(-1, 3),
+    )
+    if similarity is not None:
+        model.transform(similarity)
+    for image in model.images.values():
+        if image.num_points3D < _HELD_BY:
+            model.frames[image.frame_id].rig_from_world = given[image.frame_id]
+    return model
+
+
+def _centre_and_axes(image: pycolmap.Image) -> NDArray[np.float64]:  # [4, 3]
+    """Where a camera is, and the points at distance 1 on its axes: the centres of a straight path alone leave
+    the turn about it open. (1 is the distance of the farthest camera in the normalised world.)"""
+    centre: NDArray[np.float64] = image.projection_center()
+    return np.vstack([centre, centre + image.cam_from_world().rotation.matrix()])
+
+
+def _adjustment_options() -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=False, refine_extra_params=False, print_summary=False
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # wrong matches are still among them
+    options.ceres.solver_options.num_threads = 1
+    return options
 
 
 def _pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:

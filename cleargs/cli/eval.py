@@ -77,7 +77,7 @@ RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet 
 @click.option(
     "--align",
     type=click.Path(path_type=Path),
-    help="Folder whose camera centres align the worlds, where RUN's poses come from SfM.  "
+    help="Folder whose cameras align the worlds, where RUN's poses are not the input's.  "
     "[default: --reference]",
 )
 @click.option(

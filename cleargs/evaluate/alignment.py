@@ -1,12 +1,14 @@
-"""Two worlds become one: the similarity that takes one set of camera centres to another."""
+"""Two worlds become one: the similarity that takes one set of cameras to another."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.cameras import Pose
 from cleargs.capture.world import Similarity
 from cleargs.errors import InputError
 
@@ -24,6 +26,34 @@ class Fit:
     similarity: Similarity
     residual: float
     """RMS distance between fitted and given centres, over the largest distance between two of the latter."""
+
+
+def align_cameras(
+    source: Sequence[Pose],  # cameras in the world to leave
+    target: Sequence[Pose],  # the same ones in the world to enter
+) -> Fit:
+    """The similarity that takes cameras nearest to their like, by place and by direction.
+
+    The centres of a handheld walk lie near a line or a plane, and say little about the turn: half a degree
+    may be left, which costs an image decibels. So they only fix the size; then each camera counts as four
+    points, its centre and one on each axis, as far away as the centres spread.
+
+    Raises InputError for fewer than three cameras, or centres that lie on one line.
+    """
+    theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
+    scale = umeyama(theirs, ours).similarity.scale
+    spread = float(np.sqrt(ours.var(axis=0).sum()))
+    fit = umeyama(_with_axes(source, theirs, spread * scale), _with_axes(target, ours, spread))
+    errors = np.linalg.norm(fit.similarity.points(theirs) - ours, axis=1)
+    extent = float(np.linalg.norm(ours[:, None] - ours[None], axis=2).max())
+    return Fit(fit.similarity, float(np.sqrt((errors**2).mean())) / extent)
+
+
+def _with_axes(
+    poses: Sequence[Pose], centres: NDArray[np.float64], length: float
+) -> NDArray[np.float64]:  # [4 N, 3]
+    axes = np.stack([pose.rotation for pose in poses])  # rows: the camera's axes in the world
+    return np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)])
 
 
 def umeyama(

@@ -31,7 +31,7 @@ from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
 
-EVALUATION_VERSION = 1
+EVALUATION_VERSION = 2
 """Raised when an evaluation of equal inputs would give other figures."""
 
 

@@ -20,7 +20,7 @@ from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.capture.world import Similarity
 from cleargs.errors import InputError
-from cleargs.evaluate.alignment import LARGE_RESIDUAL, umeyama
+from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.evaluate.results import Alignment, PosesFrom
@@ -70,8 +70,9 @@ def reference_of(
 
     ``directory`` holds ``images/`` and ``transforms.json`` in the world of the run's input; None takes the
     frames that the run held out. ``poses`` says whether the reference's poses are rendered, or the run's own
-    of the frames with the same stem. Where the run's poses come from SfM, the worlds are aligned by the
-    camera centres of equal stems: those of the folder ``align``, or of ``directory`` without it.
+    of the frames with the same stem. Where the run's poses come from SfM, or were refined, the worlds
+    are aligned by the cameras of equal stems: those of the folder ``align``, or of ``directory``
+    without it.
 
     Raises InputError when files are missing or damaged, when stems do not match, or nothing was held out.
     """
@@ -96,7 +97,7 @@ def reference_of(
             )
         views = [_view(stem, listed[stem], _own_pose(own[stem])) for stem in matched]
         return _reference(directory, views, poses, Alignment(world="scene", matched=len(matched)))
-    if manifest.summary.get("poses") == "sfm":
+    if manifest.summary.get("poses") in ("sfm", "refined"):
         similarity, alignment = _aligned(
             listed if align is None else _listed(align), own, run_folder, align or directory, reporter
         )
@@ -273,12 +274,12 @@ def _similarity(noted: Any, ingest: Path) -> Similarity:
 def _aligned(
     listed: Mapping[str, _Listed], own: Mapping[str, Frame], run: Path, folder: Path, reporter: Reporter
 ) -> tuple[Similarity, Alignment]:
-    """The similarity from the reference's world to that of a run whose poses come from SfM."""
+    """The similarity from the reference's world to that of a run whose poses are not the input's."""
     matched = sorted(listed.keys() & own.keys(), key=natural_key)
     _require_match(matched, listed, own, run)
     theirs = [_pose(listed[stem]) for stem in matched]
     ours = [_own_pose(own[stem]) for stem in matched]
-    fit = umeyama(np.stack([pose.centre for pose in theirs]), np.stack([pose.centre for pose in ours]))
+    fit = align_cameras(theirs, ours)
     angles = [
         rotation_between(fit.similarity.pose(their).rotation, our.rotation)
         for their, our in zip(theirs, ours, strict=True)
@@ -287,7 +288,7 @@ def _aligned(
         world="umeyama", matched=len(matched), residual=fit.residual, rotation_deg=float(np.mean(angles))
     )
     text = (
-        f"worlds aligned by {len(matched)} camera centres of {folder}: residual {fit.residual:.2%} "
+        f"worlds aligned by {len(matched)} cameras of {folder}: residual {fit.residual:.2%} "
         f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
     )
     if fit.residual > LARGE_RESIDUAL:

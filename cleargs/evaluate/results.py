@@ -34,7 +34,7 @@ class Alignment(_Record):
 
     world: World = Field(
         description="scene: they are in it; ingest: by the similarity of ingest; umeyama: fitted to the "
-        "camera centres of the frames of the same stem, because the run's poses come from SfM."
+        "cameras of the frames of the same stem, because the run's poses are not the input's."
     )
     matched: int = Field(ge=0, description="References whose stem is that of a registered frame of the run.")
     residual: float | None = Field(
