@@ -32,10 +32,10 @@ class IngestConfig(BaseModel):
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
     )
     refine_above: float = Field(
-        1.0,
+        0.6,
         ge=0,
         description="the input's poses are adjusted to the images where, at these poses, the features miss "
-        "their points by more than this many pixels (median); 0: always",
+        "their points by more than this many pixels (median), and at the adjusted ones by at most half",
     )
     camera_model: SfmModel = Field(
         "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"

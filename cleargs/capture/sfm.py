@@ -86,6 +86,11 @@ def reconstruct(
             f"at the input's poses features missed their points by {missed:.1f} px (median): adjusted to the "
             f"images, {np.median(model.error):.1f} px; ingest.refine_above keeps them"
         )
+    elif missed > config.refine_above:
+        reporter.info(
+            f"at the input's poses features miss their points by {missed:.1f} px (median), which no other "
+            "poses explain (a rolling shutter, blur, or a wrong lens may): they stay"
+        )
     return Reconstruction(model, similarity, missed, refined)
 
 

@@ -157,6 +157,17 @@ def test_poses_that_the_images_contradict_are_adjusted(shaken: Path, ingest: Ing
     assert same_bytes(adjusted.out, ingest(shaken, "again", threads=2).out)
 
 
+def test_what_a_rolling_shutter_does_is_not_put_down_to_the_poses(posed: Path, ingest: Ingest) -> None:
+    """The rows of each image swing to and fro, as under a camera that shakes while they are read."""
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    for index, path in enumerate(sorted((posed / "images").iterdir())):
+        swing = 4 * np.sin(4 * np.pi * rows / HEIGHT + index)
+        cv2.imwrite(str(path), cv2.remap(cv2.imread(str(path)), columns + swing, rows, cv2.INTER_LINEAR))
+    done = ingest(posed)
+    assert done.result.summary["given_poses_missed_px"] > 0.6
+    assert done.result.summary["poses"] == "input" and errors_of_poses(done.out) < (1e-6, 1e-9)
+
+
 def test_a_frame_without_features_keeps_its_pose_amid_an_adjustment(shaken: Path, ingest: Ingest) -> None:
     grey = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     cv2.imwrite(str(sorted((shaken / "images").iterdir())[4]), grey)
