@@ -1,10 +1,10 @@
 """The restoration expert ClearGS ships: its network, its training and its export.
 
-    python -m cleargs.models.training.restorer --photos DIR --out restorer.onnx
+    python -m cleargs.models.training.restorer --photos DIR --renders DIR --out restorer.onnx
 
-trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, and writes
-the ONNX model. A killed run goes on from its checkpoint; a finished one only exports. The export needs the
-``onnx`` package. `evaluate_restorer` prints the table of the held-out sources.
+trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
+renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A
+killed run goes on from its checkpoint; a finished one only exports. The export needs the ``onnx`` package. `evaluate_restorer` prints the table of the held-out sources.
 
 Cost of the default recipe: see ``cleargs/models/weights/README.md``.
 """
@@ -17,6 +17,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,7 @@ from torch.nn import functional
 
 from cleargs.errors import InputError
 from cleargs.models.training.degrade import Image, degrade, handheld_degradation, shallow_focus
+from cleargs.models.training.graphics import graphic
 from cleargs.models.training.muon import Muon
 
 HELD_OUT = ("budgie", "elementary", "mate")
@@ -39,6 +41,12 @@ STRIDE = 8
 PATCH = 128
 MARGIN = 20
 """Pixels around a patch that only the blur sees: its borders are then true neighbours, not reflections."""
+
+RENDERED_SHARE, DRAWN_SHARE = 0.3, 0.1
+"""Shares of the patches that are not photographs but renders, and drawn shapes: their edges are as sharp as
+the pixels allow, which those of photographs rarely are."""
+SHRUNK_SHARE, MOST_SHRUNK = 0.6, 3.0
+"""Share of the photographs' patches that are shrunk, and the largest factor: it makes them crisper."""
 
 SHALLOW_SHARE = 0.25
 """Share of the patches that are put out of focus before they count as the truth: the photographs hardly have
@@ -140,27 +148,36 @@ def read_photo(path: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
-def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -> tuple[Image, Image]:
-    """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each.
+def list_renders(folder: Path) -> list[Path]:
+    """The sharp views of the captures made by `cleargs synth` in a folder, sorted.
 
-    Half of the patches are shrunk by up to two, which makes them crisper than the photographs are; of two
-    random places the one with more detail is taken. Defocus is part of the truth (`SHALLOW_SHARE`).
+    Raises InputError when there is none.
     """
-    photo = photos[int(rng.integers(len(photos)))]
-    size = PATCH + 2 * MARGIN
-    scale = rng.uniform(1.0, 2.0) if rng.random() < 0.5 else 1.0
-    side = min(round(size * scale), *photo.shape[:2])
-    crops = []
-    for _ in range(2):
-        y, x = (int(rng.integers(extent - side + 1)) for extent in photo.shape[:2])
-        crops.append(photo[y : y + side, x : x + side])
-    crop = max(crops, key=lambda c: float(np.abs(np.diff(c[::2, :, 1].astype(np.int16), axis=1)).mean()))
-    if side != size:
-        crop = cv2.resize(crop, (size, size), interpolation=cv2.INTER_AREA).astype(np.uint8)
-    crop = np.rot90(crop, int(rng.integers(4)))
-    if rng.random() < 0.5:
-        crop = crop[:, ::-1]
-    sharp = crop.astype(np.float32) / np.float32(255.0)
+    renders = sorted(folder.glob("*/truth/observed/images/*.png"))
+    if not renders:
+        raise InputError(f"no synthetic captures in {folder}", hint="make some with `cleargs synth`")
+    return renders
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What the patches are cut from: photographs and renders, each [H, W, 3] RGB uint8."""
+
+    photos: Sequence[NDArray[np.uint8]]
+    renders: Sequence[NDArray[np.uint8]]
+
+
+def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Image]:
+    """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each. Defocus is part of the truth
+    (`SHALLOW_SHARE`)."""
+    kind = rng.random()
+    if kind < DRAWN_SHARE:
+        sharp = graphic(PATCH + 2 * MARGIN, rng)
+    elif kind < DRAWN_SHARE + RENDERED_SHARE:
+        sharp = _cut(contents.renders, 1.0, rng)
+    else:
+        shrunk = rng.random() < SHRUNK_SHARE
+        sharp = _cut(contents.photos, rng.uniform(1.0, MOST_SHRUNK) if shrunk else 1.0, rng)
     if rng.random() < SHALLOW_SHARE:
         sharp = shallow_focus(sharp, rng)
     blurred = degrade(sharp, handheld_degradation(rng), rng)
@@ -168,10 +185,29 @@ def draw_sample(photos: Sequence[NDArray[np.uint8]], rng: np.random.Generator) -
     return blurred[inner, inner], sharp[inner, inner]
 
 
-def draw_batch(photos: Sequence[NDArray[np.uint8]], seed: int, step: int) -> tuple[Tensor, Tensor]:
+def _cut(images: Sequence[NDArray[np.uint8]], scale: float, rng: np.random.Generator) -> Image:
+    """A patch with its margin, shrunk by ``scale``, turned and mirrored; of two random places that with more
+    detail."""
+    image = images[int(rng.integers(len(images)))]
+    size = PATCH + 2 * MARGIN
+    side = min(round(size * scale), *image.shape[:2])
+    crops = []
+    for _ in range(2):
+        y, x = (int(rng.integers(extent - side + 1)) for extent in image.shape[:2])
+        crops.append(image[y : y + side, x : x + side])
+    crop = max(crops, key=lambda c: float(np.abs(np.diff(c[::2, :, 1].astype(np.int16), axis=1)).mean()))
+    if side != size:
+        crop = cv2.resize(crop, (size, size), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    crop = np.rot90(crop, int(rng.integers(4)))
+    if rng.random() < 0.5:
+        crop = crop[:, ::-1]
+    return crop.astype(np.float32) / np.float32(255.0)
+
+
+def draw_batch(contents: Contents, seed: int, step: int) -> tuple[Tensor, Tensor]:
     """The degraded and sharp batch [BATCH, 3, PATCH, PATCH] of a step, a function of seed and step alone."""
     pairs = [
-        draw_sample(photos, np.random.default_rng([seed, _PURPOSE_SAMPLES, step, index]))
+        draw_sample(contents, np.random.default_rng([seed, _PURPOSE_SAMPLES, step, index]))
         for index in range(BATCH)
     ]
     degraded, sharp = (
@@ -197,11 +233,17 @@ def learning_rate(step: int, steps: int) -> float:
     return LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * min(max(done, 0.0), 1.0)))
 
 
-def train(photo_folder: Path, checkpoint: Path, *, steps: int, seed: int, bfloat16: bool) -> Restorer:
-    """Train from the checkpoint, where there is one, up to ``steps``; return the averaged network."""
-    photos = [read_photo(p) for p in list_photos(photo_folder, held_out=False)]
+def train(
+    contents: Contents, checkpoint: Path, *, steps: int, seed: int, bfloat16: bool, start: Path | None = None
+) -> Restorer:
+    """Train from the checkpoint, where there is one, up to ``steps``; return the averaged network.
+
+    ``start``: the checkpoint of an earlier training whose averaged weights are the first ones of this.
+    """
     torch.manual_seed(seed)
     model = Restorer()
+    if start is not None:
+        model.load_state_dict(torch.load(start, weights_only=True)["average"])
     average = Restorer()
     average.load_state_dict(model.state_dict())
     optimisers = _optimisers(model)
@@ -215,7 +257,7 @@ def train(photo_folder: Path, checkpoint: Path, *, steps: int, seed: int, bfloat
         first = int(state["step"])
     started, window = time.monotonic(), 0.0
     for step in range(first, steps):
-        degraded, sharp = draw_batch(photos, seed, step)
+        degraded, sharp = draw_batch(contents, seed, step)
         for optimiser in optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = learning_rate(step, steps)
@@ -291,6 +333,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--photos", type=Path, required=True, help="folder of sharp photographs SOURCE_NNN.jpg"
     )
+    parser.add_argument(
+        "--renders", type=Path, required=True, help="folder of captures made by `cleargs synth`"
+    )
+    parser.add_argument("--start", type=Path, help="checkpoint of a training whose weights come first")
     parser.add_argument("--out", type=Path, required=True, help="the ONNX file to write")
     parser.add_argument("--checkpoint", type=Path, help="default: the ONNX file's name with .pt")
     parser.add_argument("--steps", type=int, default=6400)
@@ -305,8 +351,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(1)
     checkpoint = options.checkpoint or options.out.with_suffix(".pt")
+    contents = Contents(
+        [read_photo(p) for p in list_photos(options.photos, held_out=False)],
+        [read_photo(p) for p in list_renders(options.renders)],
+    )
     model = train(
-        options.photos, checkpoint, steps=options.steps, seed=options.seed, bfloat16=not options.float32
+        contents,
+        checkpoint,
+        steps=options.steps,
+        seed=options.seed,
+        bfloat16=not options.float32,
+        start=options.start,
     )
     export_onnx(model, options.out)
 
