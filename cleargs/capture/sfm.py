@@ -57,7 +57,8 @@ def reconstruct(
     """Poses, cameras and points of the working images in ``folder``.
 
     Poses of the input are normalised in float64 before COLMAP sees them; ``given`` (the input's own sparse
-    model) saves the triangulation where its poses are good. Raises StageError when too few frames get a pose.
+    model) saves the triangulation where its poses are good, and keeps its points unless they are adjusted.
+    Raises StageError when too few frames get a pose.
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
@@ -67,11 +68,11 @@ def reconstruct(
         return Reconstruction(_moved(model, similarity), similarity, None, refined=False)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
-    if given is not None:
-        adopted = _adopted(given, posed)
+    adopted = None if given is None else _moved(_adopted(given, posed), similarity)
+    if adopted is not None and len(adopted.error):
         missed = float(np.median(adopted.error))
-        if missed <= config.refine_above:
-            return Reconstruction(_moved(adopted, similarity), similarity, missed, refined=False)
+        if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
+            return Reconstruction(adopted, similarity, missed, refined=False)
     poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
     model = _run(_triangulation_job(posed, poses), folder, config, seed, threads, reporter)
     if not len(model.point_ids):
@@ -91,6 +92,8 @@ def reconstruct(
             f"at the input's poses features miss their points by {missed:.1f} px (median), which no other "
             "poses explain (a rolling shutter, blur, or a wrong lens may): they stay"
         )
+    if adopted is not None and len(adopted.error) and not refined:
+        model = adopted
     return Reconstruction(model, similarity, missed, refined)
 
 

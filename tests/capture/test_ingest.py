@@ -186,6 +186,14 @@ def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Inges
     assert errors_of_poses(second.out)[0] < 0.1
 
 
+def test_a_sparse_model_keeps_its_points_where_other_poses_are_no_better(posed: Path, ingest: Ingest) -> None:
+    first = ingest(posed, "first")
+    second = ingest(first.out, "second", refine_above=0, max_features=512)  # would triangulate fewer points
+    assert second.result.summary["poses"] == "input"
+    one, two = load_points(first.out), load_points(second.out)
+    assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
+
+
 def test_sfm_finds_the_arc(images: Path, ingest: Ingest) -> None:
     done = ingest(images, "sfm", threads=2)
     frames = load_frames(done.out)
