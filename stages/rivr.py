@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import RivrConfig
 
-VERSION = 6
+VERSION = 7
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -52,15 +53,17 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Restoring takes about 1 s a megapixel, making and scoring candidates 2 s, a training step 0.3 s (two
-    cores, the embedded models)."""
+    """Undoing motion takes about 3 s a megapixel, restoring 1 s, making and scoring candidates 2 s, a
+    training step 0.3 s (two cores, the embedded models)."""
     from cleargs.rivr.cost import capture_size
 
     config = context.config
     frames, megapixels = capture_size(context.inputs.get("ingest"))
-    restorings = 1 if config.use_observation else config.rounds
+    deblurs = config.use_observation and config.undo_motion
+    restorings = 1 if config.use_observation and not deblurs else config.rounds
     seconds = megapixels * (
-        frames * (1.0 * restorings + 2.0 * config.rounds) + 0.3 * config.rounds * config.distil.steps
+        frames * (1.0 * restorings + (5.0 if deblurs else 2.0) * config.rounds)
+        + 0.3 * config.rounds * config.distil.steps
     )
     return Estimate(
         minutes=seconds / 60.0,
@@ -104,13 +107,21 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         lambda image: expert.restore(image, threads=threads),
         context.checkpoints / "restored",
         use_observation=config.use_observation,
-        prefer_sharper=config.prefer_sharper,
+        undo_motion=config.undo_motion,
     )
 
     g0 = current = Snapshot(context.inputs["g0"], context.device)
     rows, repairs, trainings = [], [], []
     for number in range(1, config.rounds + 1):
-        found = run_round(number, targets, current.render, restored, rules, context.out, reporter)
+        found = run_round(
+            number,
+            targets,
+            current.render,
+            partial(restored, depth_of=current.depth),
+            rules,
+            context.out,
+            reporter,
+        )
         rows += found
         repairs += [
             pseudo_view(supervision.views[row.frame_id], row, context.out) for row in found if row.accepted

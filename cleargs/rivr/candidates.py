@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 Image: TypeAlias = NDArray[np.float32]
 CandidateName: TypeAlias = Literal["render", "restored", "fused"]
 
-Source: TypeAlias = Literal["observation", "render"]
-"""What D_t was restored from: O_t or R_t."""
+Source: TypeAlias = Literal["observation", "deblurred", "render"]
+"""What D_t was restored from: O_t, O_t without the camera's motion, or R_t."""
 
 CANDIDATES: tuple[CandidateName, ...] = ("render", "restored", "fused")
 """R_t, D_t and F_t; in a perfect tie the earlier one is chosen."""

@@ -83,10 +83,10 @@ class RivrConfig(BaseModel):
     use_observation: bool = Field(
         True, description="false: the ablation whose expert restores the render instead of the raw frame"
     )
-    prefer_sharper: bool = Field(
+    undo_motion: bool = Field(
         True,
-        description="with use_observation: the expert restores the render where it shows more detail than "
-        "the raw frame; false: the paper's",
+        description="with use_observation: the raw frame loses the blur and the skew of the camera's motion, "
+        "found by comparing it with the render, before the expert restores it; false: the paper's",
     )
     use_fused: bool = Field(True, description="false: the ablation without the fused candidate")
     gate: GateConfig = Field(GateConfig(), description="when a repair is refused")

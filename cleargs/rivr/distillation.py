@@ -6,27 +6,37 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
+import torch
+from numpy.typing import NDArray
 
 from cleargs.files import atomic_path
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
 from cleargs.rivr.harm import Fidelity
+from cleargs.rivr.motion.undo import as_photographed
 from cleargs.rivr.restoring import observation
 from cleargs.rivr.selection import hide_masked
 from cleargs.splat.compensation import Exposure, read_exposure, write_exposure
 from cleargs.splat.config import DistilConfig
 from cleargs.splat.engine import Engine
+from cleargs.splat.losses import psnr
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import evaluate_views, render_view, train
+from cleargs.splat.trainer import render_view, train
 from cleargs.splat.views import View
 from cleargs.tables import read_table, write_table
 
 SCENE, EXPOSURE, STATE, LOG = "scene.ply", "exposure.parquet", "state.safetensors", "train.parquet"
 REJECTED = "rejected.ply"
+
+LEAST_COVERED = 0.5
+"""Alpha from which a pixel has a depth."""
+NEAREST = 0.05
+"""Of the median depth: floaters before the lens lie nearer."""
 
 
 class Snapshot:
@@ -49,11 +59,32 @@ class Snapshot:
         image: Image = render_view(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
+    def depth(self, view: View) -> NDArray[np.float32]:
+        """Mean depth along the optical axis, [H, W]; the median where the scene is empty or all too near."""
+        rendered = self._engine.forward(
+            self.scene.gaussians, view.camera, antialias=self.scene.antialias, depth=True
+        )
+        assert rendered.depth is not None
+        covered, depth = rendered.alpha.cpu().numpy(), rendered.depth.cpu().numpy()
+        mean = depth / np.maximum(covered, LEAST_COVERED)
+        median = np.median(mean[covered > LEAST_COVERED]) if (covered > LEAST_COVERED).any() else 1.0
+        usable = (covered > LEAST_COVERED) & (mean > NEAREST * median)
+        return np.where(usable, mean, median).astype(np.float32)
+
     def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity:
-        """How well the scene explains the held-back frames."""
-        psnr = evaluate_views(self.scene, judges, self.exposure, engine=self._engine)
-        shown = [hide_masked(self.render(view), *observation(view)) for view in judges]
-        return Fidelity(tuple(psnr), tuple(scorer.score(image, threads=threads) for image in shown))
+        """How well the scene explains the held-back frames.
+
+        Raw frames may be blurred and skewed by the camera's motion. A sharp scene is not to be blamed for
+        that: what is compared with a frame is the render with that frame's motion.
+        """
+        values, scores = [], []
+        for view in judges:
+            render, (observed, mask) = self.render(view), observation(view)
+            photographed = as_photographed(render, observed, mask, view.camera, self.depth(view))
+            counted = None if mask is None else torch.from_numpy(mask)
+            values.append(psnr(torch.from_numpy(photographed), torch.from_numpy(observed), counted))
+            scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
+        return Fidelity(tuple(values), tuple(scores))
 
     def trained(
         self,

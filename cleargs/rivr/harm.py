@@ -13,7 +13,7 @@ class Fidelity:
     """How well a scene explains the frames that were held back from repair."""
 
     psnr: tuple[float, ...]
-    """Of each frame's render against its raw observation, dB."""
+    """Of each frame's render, with the frame's motion, against its raw observation, dB."""
     score: tuple[float, ...]
     """Primary score of each render, 0-100, higher is better."""
 

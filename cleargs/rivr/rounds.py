@@ -17,10 +17,10 @@ from cleargs.errors import StoreError
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, Source, fuse
+from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, fuse
 from cleargs.rivr.config import GateConfig
 from cleargs.rivr.gates import REFUSED, all_masked, objection
-from cleargs.rivr.restoring import observation
+from cleargs.rivr.restoring import Restoration, observation
 from cleargs.rivr.selection import Choice, choose, hide_masked
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import Mask, View
@@ -30,8 +30,8 @@ PREFIX = "cleargs:"
 
 Renderer = Callable[[View], Image]
 """The current scene at a view, through the frame's exposure: R_t."""
-Restorer = Callable[[View, Image], tuple[Image, Source]]
-"""D_t, given the view and its render R_t, and which of O_t and R_t it was made from."""
+Restorer = Callable[[View, Image], Restoration]
+"""D_t, given the view and its render R_t."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,7 @@ def run_round(
             row = recorded_row(out, exr)
             if row is None:
                 rendered = render(view)
-                restored, source = restore(view, rendered)
-                row, image = repair(number, view, exr, rendered, restored, source, rules)
+                row, image = repair(number, view, exr, rendered, restore(view, rendered), rules)
                 write_exr(out / exr, image)
             rows.append(row)
             task.update(done=len(rows), note=_tally(rows))
@@ -75,7 +74,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: View, exr: str, rendered: Image, restored: Image, source: Source, rules: Rules
+    number: int, view: View, exr: str, rendered: Image, restoration: Restoration, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -83,7 +82,7 @@ def repair(
     whoever goes on from the file sees what was scored.
     """
     observed, mask = observation(view)
-    layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
+    layers = {"render": to_layer(rendered), "restored": to_layer(restoration.image)}
     if rules.use_fused:
         fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)
         layers["fused"] = to_layer(fused)
@@ -101,6 +100,7 @@ def repair(
         else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
     )
     masked = all_masked(mask)
+    deblurred = restoration.deblurred
     row = Selection(
         round=number,
         frame_id=view.frame_id,
@@ -113,12 +113,17 @@ def repair(
         tiebreak_render=tiebreak["render"],
         tiebreak_restored=tiebreak["restored"],
         tiebreak_fused=tiebreak.get("fused"),
-        restored_from=source,
+        restored_from=restoration.source,
+        blur_px=None if deblurred is None else float(np.float32(deblurred.blur_px)),
+        skew_px=None if deblurred is None else float(np.float32(deblurred.skew_px)),
         chosen=choice.chosen,
         accepted=masked is None,
         reason=masked or choice.reason,
     )
-    return row, LayeredImage(layers | {"observed": to_layer(observed)}, _attributes(row))
+    layers["observed"] = to_layer(observed)
+    if deblurred is not None:
+        layers["deblurred"] = to_layer(deblurred.image)
+    return row, LayeredImage(layers, _attributes(row))
 
 
 def recorded_row(out: Path, exr: str) -> Selection | None:
@@ -129,8 +134,8 @@ def recorded_row(out: Path, exr: str) -> Selection | None:
         attributes: dict[str, Any] = dict(read_exr(out / exr, PREFIX).attributes)
         values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
         frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
-        without_fused = {"primary_fused": None, "tiebreak_fused": None}
-        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(without_fused | values))
+        absent: dict[str, Any] = dict.fromkeys(("primary_fused", "tiebreak_fused", "blur_px", "skew_px"))
+        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
     except (StoreError, KeyError, TypeError):
         return None
 

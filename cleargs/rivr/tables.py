@@ -25,10 +25,18 @@ SELECTION = pa.schema(
     [
         column("round", pa.int32(), "from 1"),
         column("frame_id", pa.int32(), "target frame t"),
-        column("exr", pa.string(), "layers render, restored, fused, observed; relative to the rivr folder"),
+        column(
+            "exr",
+            pa.string(),
+            "layers render, restored, fused, observed, deblurred; below the rivr folder",
+        ),
         *_scores("primary", "decides"),
         *_scores("tiebreak", "decides among the candidates within rivr.margin of the best primary score"),
-        column("restored_from", pa.string(), "what the expert restored to D_t: observation or render"),
+        column(
+            "restored_from", pa.string(), "what the expert restored to D_t: observation, deblurred or render"
+        ),
+        column("blur_px", pa.float32(), "mean way of the pixels while exposed, as undone", nullable=True),
+        column("skew_px", pa.float32(), "their mean way from the first to the last row", nullable=True),
         column("chosen", pa.string(), "render, restored or fused"),
         column("accepted", pa.bool_(), "whether the chosen candidate became a pseudo observation"),
         column("reason", pa.string(), "why it was chosen, or why a gate refused it"),
@@ -61,6 +69,8 @@ class Selection:
     tiebreak_restored: float
     tiebreak_fused: float | None
     restored_from: Source
+    blur_px: float | None
+    skew_px: float | None
     chosen: CandidateName
     accepted: bool
     reason: str

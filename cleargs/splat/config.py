@@ -125,5 +125,5 @@ class DistilConfig(TrainConfig):
         ge=0,
         description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
     )
-    pseudo_share: float = Field(0.5, ge=0, le=1, description="share of the steps that draw a repaired view")
+    pseudo_share: float = Field(0.7, ge=0, le=1, description="share of the steps that draw a repaired view")
     pseudo_weight: float = Field(1.0, ge=0, description="factor on the loss of a repaired view")

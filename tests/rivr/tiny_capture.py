@@ -105,10 +105,10 @@ class Capture:
 
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
-    """Two rounds of a few steps, with harm margins that nothing exceeds; D_t comes from the raw frame."""
+    """Two rounds of a few steps, with harm margins that nothing exceeds; the expert sees the raw frames."""
     settings: dict[str, Any] = {
         "rounds": 2,
-        "prefer_sharper": False,
+        "undo_motion": False,
         "distil": {"steps": 12, "checkpoint_interval": 5},
         "harm": {"psnr_margin": 100, "score_margin": 100},
     }
