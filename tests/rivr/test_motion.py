@@ -142,8 +142,9 @@ def test_undoing_it_is_worth_more_than_frame_or_render(truth: Image, depth: Imag
     assert psnr(result.image, truth) > max(psnr(observed, truth), psnr(render, truth)) + 0.2
     basis = flow_basis(CAMERA, depth)
     blur, skew = (np.hypot(*np.tensordot(part, basis, 1)).mean() for part in (motion.blur, motion.skew))
-    assert result.blur_px == pytest.approx(blur, abs=1.0)
-    assert result.skew_px == pytest.approx(skew, abs=1.0)
+    # A soft render leaves part of a blur unseen, of a short one the larger part; a skew is found to 0.2 px.
+    assert result.blur_px == pytest.approx(blur, abs=2.0)
+    assert result.skew_px == pytest.approx(skew, abs=0.3)
 
 
 def test_a_sharp_frame_stays_nearly_as_it_is(truth: Image, depth: Image) -> None:
