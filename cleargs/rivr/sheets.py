@@ -19,7 +19,8 @@ SHEET_FRAMES = 6
 
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
-    """One line a row: the observation and its candidates with both scores, the chosen one marked."""
+    """One line a row: the observation, the same without its motion, and its candidates with both scores, the
+    chosen one marked."""
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
 
@@ -50,6 +51,9 @@ def write_before_after_sheet(
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:
     layers = read_exr(rivr / row.exr).layers
     tiles = [Tile(from_layer(layers["observed"]), f"frame {row.frame_id}, round {row.round}: observed")]
+    if "deblurred" in layers:
+        motion = f"undone: blur {row.blur_px:.1f} px, skew {row.skew_px:.1f} px"
+        tiles.append(Tile(from_layer(layers["deblurred"]), motion))
     for name in CANDIDATES:
         if name in layers:
             scores = f"{getattr(row, f'primary_{name}'):.1f} / {getattr(row, f'tiebreak_{name}'):.1f}"
