@@ -30,7 +30,8 @@ VARIANTS: tuple[Variant, ...] = (
     Variant(
         "rivr-no-observation", "RIVR without observation", "consolidate", ("rivr.use_observation=false",)
     ),
-    Variant("rivr-no-fused", "RIVR without fused", "consolidate", ("rivr.use_fused=false",)),
+    Variant("rivr-as-is", "RIVR of frames with their motion", "consolidate", ("rivr.undo_motion=false",)),
+    Variant("rivr-fused", "RIVR with fused", "consolidate", ("rivr.use_fused=true",)),
     Variant("rivr", "ClearGS before consolidation", "rivr"),
     Variant("full", "ClearGS", "consolidate"),
 )

@@ -88,7 +88,11 @@ class RivrConfig(BaseModel):
         description="with use_observation: the raw frame loses the blur and the skew of the camera's motion, "
         "found by comparing it with the render, before the expert restores it; false: the paper's",
     )
-    use_fused: bool = Field(True, description="false: the ablation without the fused candidate")
+    use_fused: bool = Field(
+        False,
+        description="a third candidate, the render with the detail of what was restored; true: the paper's. "
+        "With undo_motion the restored frame has the render's detail already, and would have it twice",
+    )
     gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
     distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")

@@ -105,10 +105,11 @@ class Capture:
 
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
-    """Two rounds of a few steps, with harm margins that nothing exceeds; the expert sees the raw frames."""
+    """Two rounds of a few steps; no margin of harm is exceeded; raw frames as they are, three candidates."""
     settings: dict[str, Any] = {
         "rounds": 2,
         "undo_motion": False,
+        "use_fused": True,
         "distil": {"steps": 12, "checkpoint_interval": 5},
         "harm": {"psnr_margin": 100, "score_margin": 100},
     }
