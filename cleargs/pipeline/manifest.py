@@ -54,6 +54,10 @@ class Manifest(BaseModel):
     started: str
     """UTC, ISO 8601."""
     seconds: float
+    cpu_seconds: float | None = None
+    """Processor time of all threads and child processes; None where an earlier version did the work."""
+    peak_memory_gb: float | None = None
+    """Largest resident memory of the process while the stage ran, GB (1e9 bytes)."""
     device: str
     summary: dict[str, Any]
     """The figures that the stage reports."""

@@ -25,6 +25,7 @@ from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line
 from cleargs.pipeline.run_file import RUN_FILE, Run, noted_source, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
+from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
 
 
@@ -156,9 +157,10 @@ class Runner:
         stage = self.dag.load(name)
         work = self.store.open_work(recipe.key, fresh=forced, entry=entry)
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
-        started, clock = datetime.now(UTC), time.monotonic()
+        started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         result = stage.run(context)
         seconds = time.monotonic() - clock
+        cost = {"seconds": seconds, "cpu_seconds": usage.cpu_seconds, "peak_memory_gb": usage.peak_memory_gb}
         if not result.missing:
             absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
             if absent:
@@ -166,7 +168,7 @@ class Runner:
                     f"{name} ended without its outputs {', '.join(absent)}",
                     hint=f"this is a fault of the stage; please report it with {self.run.folder / RUN_FILE}",
                 )
-        manifest = self._manifest(recipe, result, work.out, started, seconds)
+        manifest = self._manifest(recipe, result, work.out, started, cost)
         published = self.store.publish(work, manifest)
         if forced and entry is not None and entry.manifest is not None:
             if entry.manifest.digest == manifest.digest:
@@ -176,7 +178,12 @@ class Runner:
         return published
 
     def _manifest(
-        self, recipe: Recipe, result: StageResult, out: Path, started: datetime, seconds: float
+        self,
+        recipe: Recipe,
+        result: StageResult,
+        out: Path,
+        started: datetime,
+        cost: Mapping[str, float],
     ) -> Manifest:
         files = {
             name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
@@ -194,7 +201,9 @@ class Runner:
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            seconds=round(seconds, 3),
+            seconds=round(cost["seconds"], 3),
+            cpu_seconds=round(cost["cpu_seconds"], 3),
+            peak_memory_gb=round(cost["peak_memory_gb"], 3),
             device=self.run.device,
             summary=plain_json(result.summary),
         )
