@@ -28,7 +28,6 @@ from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from cleargs.evaluate.cells import Cell
     from cleargs.evaluate.comparison import Made, Recipe, Sample
     from cleargs.evaluate.variants import Variant
 
@@ -76,13 +75,24 @@ Examples:
     metavar="NAME,...",
     help=f"Which variants: {', '.join(variant.name for variant in VARIANTS)}.  [default: all]",
 )
-@click.option("--seeds", default="0", show_default=True, callback=_seeds, help="Seeds of the runs.")
+@click.option(
+    "--seeds",
+    default="0",
+    show_default=True,
+    callback=_seeds,
+    help="Seeds of the trainings of each capture.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help="Training steps of every variant in all, in the recipe's proportions.  [default: the recipe's]",
+)
 @click.option(
     "--reference",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Sharp images to compare with.  [default: CAPTURE/truth, else the held-out frames]",
 )
-@click.option("--lpips", default="alex", show_default=True, callback=_nets, help="Networks of LPIPS.")
+@click.option("--lpips", default="alex,vgg", show_default=True, callback=_nets, help="Networks of LPIPS.")
 @click.option(
     "--workflow", default="default", show_default=True, metavar="NAME|FILE.toml", help="The recipe."
 )
@@ -97,6 +107,7 @@ def compare(
     out: Path,
     variants: str,
     seeds: tuple[int, ...],
+    steps: int | None,
     reference: Path | None,
     lpips: tuple[LpipsNet, ...],
     workflow: str,
@@ -108,13 +119,12 @@ def compare(
 ) -> int:
     """Train variants of the method on captures, or take finished runs, and print the paper's tables.
 
-    All-view training, dropping blurry frames, RVA with and without coverage, and RIVR without observation or
-    without fusion stand beside the whole method. Captures of one protocol are samples of one column; with
-    several, or several seeds, a difference smaller than its spread is called none. Stages that variants
-    share are made once, and the same command goes on where it stopped.
+    All variants of a capture train for the same number of steps, with the same budget of Gaussians and the
+    same SH degree. Captures of one protocol are samples of one column; with several, or several seeds, a
+    difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
+    same command goes on where it stopped.
     """
-    from cleargs.evaluate.cells import Cells
-    from cleargs.evaluate.comparison import Recipe, Sample, existing, judge, make_scenes
+    from cleargs.evaluate.comparison import Recipe, Sample, compare_scenes, existing, make_scenes
     from cleargs.evaluate.tables import markdown
     from cleargs.files import write_bytes, write_json
     from cleargs.report.comparison import comparison_sheet, plot_comparison
@@ -131,10 +141,7 @@ def compare(
     out = out.absolute()
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
-    recipe = Recipe(dag, workflow, overrides, resolve_device(device), threads_or_all(threads), options)
-    cells: list[Cell] = []
-    failures: list[str] = []
-    scenes = []
+    recipe = Recipe(dag, workflow, overrides, resolve_device(device), threads_or_all(threads), options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])
@@ -142,32 +149,23 @@ def compare(
             samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
             _check_names(samples)
             made = make_scenes(out, samples, chosen, recipe, store, reporter)
-        for scene in made:
-            if isinstance(scene, str):
-                reporter.warn(scene)
-                failures.append(scene)
-                continue
-            cells += judge(out, scene, recipe, store, reporter)
-            scenes.append(scene)
-    if not cells:
-        raise InputError("nothing could be compared", hint="the warnings above say why")
-    found = Cells(cells)
-    labels = {scene.variant.name: scene.variant.label for scene in scenes}
+        compared = compare_scenes(out, made, recipe, store, reporter)
+    found, labels = compared.results.cells, compared.labels
     baselines = BASELINES if not runs else found.variants()[:1]
-    text = _head(chosen if not runs else (), seeds, recipe) + markdown(found, labels, baselines)
+    text = _head(chosen if not runs else (), seeds, recipe) + markdown(compared.results, labels, baselines)
     write_bytes(out / "comparison.md", text.encode())
-    document = {"cells": [cell.model_dump() for cell in cells], "failures": failures}
+    document = compared.document()
     write_json(out / "comparison.json", document)
     plot_comparison(out / "comparison.png", found, labels)
     shown = (found.variants()[0], *(name for name in ("rva", "full") if name in labels))
-    captures = {scene.sample.name: scene.sample.capture for scene in scenes}
+    captures = {scene.sample.name: scene.sample.capture for scene in compared.scenes}
     comparison_sheet(out / "sheet.png", out, found, labels, shown, captures)
     if as_json:
         print_json(document)
     else:
         click.echo(text)
         click.echo(f"written: {out}/comparison.md, comparison.json, comparison.png, sheet.png")
-    return DONE_IN_PART if failures else 0
+    return DONE_IN_PART if compared.failures else 0
 
 
 def _head(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> str:
@@ -178,14 +176,18 @@ def _head(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> 
     lines = ["# Comparison", "", f"LPIPS v0.1 with {nets}; device {recipe.device}."]
     if variants:
         settings = "".join(f" --set {override}" for override in recipe.overrides)
-        lines.append(f"Recipe `{recipe.workflow}{settings}`; seeds {', '.join(map(str, seeds))}.")
+        steps = f"{recipe.steps or 'as many as the whole method'}"
+        lines.append(
+            f"Recipe `{recipe.workflow}{settings}`; seeds {', '.join(map(str, seeds))}; steps: {steps}."
+        )
         lines += ["", *(f"* {variant.label}: {_settings(variant)}" for variant in variants)]
     lines += ["", ", ".join(f"{name} {version}" for name, version in versions().items())]
     return "\n".join(lines) + "\n\n"
 
 
 def _settings(variant: Variant) -> str:
-    changes = ", ".join(f"`{override}`" for override in variant.overrides) or "the recipe"
+    recipe = "the recipe" if variant.workflow is None else f"the recipe `{variant.workflow}`"
+    changes = ", ".join((recipe, *(f"`{override}`" for override in variant.overrides)))
     return f"{changes}; the scene of `{variant.stage}`"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
@@ -35,6 +36,13 @@ class Cell(BaseModel):
     shared_seconds: float
     """Wall time of the stages that it shares with earlier variants."""
     gaussians: int
+    steps: int
+    """Training steps of all stages behind the scene, as logged."""
+    sh_degree: int
+    cpu_seconds: float | None
+    """Processor time of all stages behind the scene, shared ones included; None where it was not noted."""
+    peak_memory_gb: float | None
+    """Largest resident memory of any of them, GB (1e9 bytes)."""
     evaluation: str
     """Folder below that of the comparison: ``eval.json`` and the evaluated images."""
 
@@ -48,9 +56,29 @@ class Spread:
     count: int
 
     @property
+    def half_width(self) -> float | None:
+        """Half the 95 % interval of the mean (Student's t); None for a single value."""
+        if self.deviation is None:
+            return None
+        return student_t(self.count - 1) * self.deviation / math.sqrt(self.count)
+
+    @property
     def is_none(self) -> bool:
-        """Whether a mean difference is smaller than its spread over the samples."""
-        return self.deviation is not None and abs(self.mean) < self.deviation
+        """Whether the 95 % interval of a mean difference holds 0."""
+        return self.half_width is not None and abs(self.mean) <= self.half_width
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether there is an interval and it does not hold 0."""
+        return self.half_width is not None and not self.is_none
+
+
+@cache
+def student_t(freedom: int) -> float:
+    """The 97.5 % quantile of Student's t with so many degrees of freedom."""
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, freedom))
 
 
 def spread(values: Sequence[float]) -> Spread:
@@ -87,12 +115,16 @@ class Cells:
 
     def values(self, views: ViewSet, column: str, variant: str, metric: str) -> dict[str, float]:
         """Sample -> value."""
-        found = {}
-        for cell in self.cells:
-            value = cell.means.get(metric)
-            if (cell.views, cell.column, cell.variant) == (views, column, variant) and value is not None:
-                found[cell.sample] = value
-        return found
+        return {
+            cell.sample: value
+            for cell in self.of(views, column, variant)
+            if (value := cell.means.get(metric)) is not None
+        }
+
+    def of(self, views: ViewSet, column: str, variant: str) -> list[Cell]:
+        """The cells of all samples."""
+        wanted = (views, column, variant)
+        return [cell for cell in self.cells if (cell.views, cell.column, cell.variant) == wanted]
 
     def spread(self, views: ViewSet, column: str, variant: str, metric: str) -> Spread | None:
         """Over the samples; None where there is no value."""

@@ -9,20 +9,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from cleargs.errors import CleargsError, InputError
-from cleargs.evaluate.cells import Cell, ViewSet
+from cleargs.evaluate.cells import Cell, Cells, ViewSet
+from cleargs.evaluate.choices import Choice, Choices, judge_choices
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.results import Evaluation
+from cleargs.evaluate.roles import Roles, count_roles
+from cleargs.evaluate.tables import Results
 from cleargs.evaluate.variants import Variant
+from cleargs.evaluate.work import Work, decide_work, variant_config
 from cleargs.files import write_bytes
-from cleargs.pipeline.config import load_config, read_toml
+from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import canonical_json
 from cleargs.pipeline.manifest import Manifest, linked_manifest
@@ -30,6 +34,7 @@ from cleargs.pipeline.run_file import RUN_FILE, Device, Run, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
+from cleargs.splat.constants import SH_DEGREES
 
 EVALUATION_VERSION = 2
 """Raised when an evaluation of equal inputs would give other figures."""
@@ -68,6 +73,8 @@ class Recipe:
     device: Device
     threads: int
     options: EvalOptions
+    steps: int | None = None
+    """Training steps of every variant; None: those of the whole method under the recipe."""
 
 
 @dataclass
@@ -93,10 +100,64 @@ class Made:
     run: Path
     seconds: float
     shared_seconds: float
+    manifests: tuple[Manifest, ...]
+    """Of all stages up to the scene's."""
 
     @property
     def scene(self) -> Path:
         return self.run / self.variant.stage / "scene.ply"
+
+
+@dataclass
+class Compared:
+    """All scenes of a comparison, judged."""
+
+    scenes: list[Made] = field(default_factory=list)
+    cells: list[Cell] = field(default_factory=list)
+    roles: list[Roles] = field(default_factory=list)
+    choices: list[Choices] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def results(self) -> Results:
+        return Results(Cells(self.cells), self.roles, self.choices)
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Variant -> what it is called."""
+        return {scene.variant.name: scene.variant.label for scene in self.scenes}
+
+    def document(self) -> dict[str, Any]:
+        """``comparison.json``."""
+        lists: dict[str, Sequence[BaseModel]] = {
+            "cells": self.cells,
+            "roles": self.roles,
+            "choices": self.choices,
+        }
+        return {
+            **{name: [item.model_dump(mode="json") for item in found] for name, found in lists.items()},
+            "failures": self.failures,
+        }
+
+
+def compare_scenes(
+    out: Path, made: Iterable[Made | str], recipe: Recipe, store: Store, reporter: Reporter
+) -> Compared:
+    """Judge every scene; a line in place of one says why it could not be made."""
+    found = Compared()
+    for scene in made:
+        if isinstance(scene, str):
+            reporter.warn(scene)
+            found.failures.append(scene)
+            continue
+        found.cells += judge(out, scene, recipe, store, reporter)
+        found.roles.append(roles_of(scene))
+        if (choices := choices_of(out, scene, store)) is not None:
+            found.choices.append(choices)
+        found.scenes.append(scene)
+    if not found.cells:
+        raise InputError("nothing could be compared", hint="the warnings above say why")
+    return found
 
 
 def make_scenes(
@@ -112,29 +173,61 @@ def make_scenes(
     A variant that fails ends neither its sample nor the others.
     """
     for sample in samples:
-        ledger = Ledger()
+        ledger, work = Ledger(), None
         for variant in variants:
-            folder = out / sample.name / variant.name
-            settings = (*recipe.overrides, *variant.overrides)
-            config = load_config(recipe.dag, recipe.workflow, settings, sample.seed)
-            run = Run(folder, sample.capture.absolute(), config, store.root, recipe.device)
             reporter.info(f"{sample.name}, {variant.label}")
             try:
-                runner = Runner(recipe.dag, run, store, recipe.threads, reporter)
+                if work is None:
+                    work = _work_of(out, sample, variant, recipe, store, reporter)
+                config = variant_config(
+                    recipe.dag, variant, recipe.workflow, recipe.overrides, sample.seed, work
+                )
+                runner = _runner(out, sample, variant, config, recipe, store, reporter)
                 outcomes = runner.run_until(variant.stage)
             except CleargsError as error:
                 yield f"{sample.name}, {variant.label}: {error}"
                 continue
-            last = outcomes[-1].manifest
-            if last.status == "partial":
-                yield f"{sample.name}, {variant.label}: {', '.join((*last.inherited, *last.missing))}"
+            manifests = tuple(outcome.manifest for outcome in outcomes)
+            if manifests[-1].status == "partial":
+                lacking = ", ".join((*manifests[-1].inherited, *manifests[-1].missing))
+                yield f"{sample.name}, {variant.label}: {lacking}"
                 continue
-            yield Made(sample, variant, folder, *ledger.charge([outcome.manifest for outcome in outcomes]))
+            made = Made(sample, variant, runner.run.folder, *ledger.charge(manifests), manifests)
+            if (trained := trained_steps(made)) != work.steps:
+                reporter.warn(
+                    f"{sample.name}, {variant.label}: {trained} of {work.steps} steps, since no repair was "
+                    "accepted that could be distilled"
+                )
+            yield made
+
+
+def _runner(
+    out: Path,
+    sample: Sample,
+    variant: Variant,
+    config: Config,
+    recipe: Recipe,
+    store: Store,
+    reporter: Reporter,
+) -> Runner:
+    folder = out / sample.name / variant.name
+    run = Run(folder, sample.capture.absolute(), config, store.root, recipe.device)
+    return Runner(recipe.dag, run, store, recipe.threads, reporter)
+
+
+def _work_of(
+    out: Path, sample: Sample, variant: Variant, recipe: Recipe, store: Store, reporter: Reporter
+) -> Work:
+    """What all variants of a sample get, from its ingest, which is made in the run of the first of them."""
+    config = load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed)
+    runner = _runner(out, sample, variant, config, recipe, store, reporter)
+    return decide_work(config, runner.run_until("ingest")[-1].folder, recipe.steps)
 
 
 def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporter) -> list[Cell]:
     """The cells of one scene, one a set of views. Raises InputError when there is nothing to compare with."""
     cells = []
+    gaussians, sh_degree = size_of(made.scene)
     for view_set in view_sets(made):
         evaluation, folder = evaluated(out, made, view_set, recipe, store, reporter)
         cells.append(
@@ -147,7 +240,11 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
                 images=len(evaluation.images),
                 seconds=made.seconds,
                 shared_seconds=made.shared_seconds,
-                gaussians=gaussians_of(made.scene),
+                gaussians=gaussians,
+                steps=trained_steps(made),
+                sh_degree=sh_degree,
+                cpu_seconds=_all_noted(sum, [manifest.cpu_seconds for manifest in made.manifests]),
+                peak_memory_gb=_all_noted(max, [manifest.peak_memory_gb for manifest in made.manifests]),
                 evaluation=folder.relative_to(out).as_posix(),
             )
         )
@@ -228,6 +325,43 @@ def evaluated(
     return evaluation, folder
 
 
+def roles_of(made: Made) -> Roles:
+    """The training frames of a scene by role. Raises StoreError."""
+    return Roles(
+        column=made.sample.column,
+        sample=made.sample.name,
+        variant=made.variant.name,
+        frames=count_roles(made.run / "rva"),
+    )
+
+
+def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
+    """How RIVR chose, against the truth; None where there is no RIVR or no truth. Kept by content."""
+    from cleargs.evaluate.judges import load_judges
+
+    rivr = next((manifest for manifest in made.manifests if manifest.stage == "rivr"), None)
+    truth = made.sample.capture / "truth"
+    if rivr is None or not truth.is_dir():
+        return None
+    distances = load_judges(EvalOptions(lpips=("alex",), scorers=())).lpips
+    parts = {
+        "version": EVALUATION_VERSION,
+        "rivr": rivr.digest,
+        "truth": store.memo.digests_of(truth),
+        "metrics": sorted(distances),
+    }
+    path = out / "choices" / f"{hashlib.sha256(canonical_json(parts).encode()).hexdigest()}.json"
+    try:
+        rows = TypeAdapter(tuple[Choice, ...]).validate_json(path.read_bytes())
+    except (OSError, ValidationError):  # not made yet, or damaged
+        rows = tuple(judge_choices(made.run, made.sample.capture, distances.get("lpips_alex")))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, TypeAdapter(tuple[Choice, ...]).dump_json(rows))
+    if not rows:
+        return None
+    return Choices(column=made.sample.column, sample=made.sample.name, variant=made.variant.name, rows=rows)
+
+
 def existing(run: Path, dag: Dag, reference: Path | None) -> Made:
     """The last scene of a finished run, as a variant of its own name. Raises InputError when it has none."""
     noted = read_run_file(run, dag)
@@ -235,22 +369,41 @@ def existing(run: Path, dag: Dag, reference: Path | None) -> Made:
         if linked_manifest(run, stage) is not None:
             variant = Variant(run.resolve().name, run.resolve().name, stage)
             sample = Sample(noted.source, noted.config.seed, reference)
-            manifests = [
+            manifests = tuple(
                 found for name in dag.until(stage) if (found := linked_manifest(run, name)) is not None
-            ]
-            return Made(sample, variant, run, sum(manifest.seconds for manifest in manifests), 0.0)
+            )
+            seconds = sum(manifest.seconds for manifest in manifests)
+            return Made(sample, variant, run, seconds, 0.0, manifests)
     raise InputError(f"{run} has no scene yet", hint=f"first: cleargs run INPUT -o {run}")
 
 
-def gaussians_of(scene: Path) -> int:
-    """The number of Gaussians in a PLY, from its header."""
+def trained_steps(made: Made) -> int:
+    """The steps behind a scene: the rows of the logs of all its trainings."""
+    from pyarrow import parquet
+
+    logs = [made.run / manifest.stage / "train.parquet" for manifest in made.manifests]
+    return sum(parquet.read_metadata(log).num_rows for log in logs if log.is_file())
+
+
+def size_of(scene: Path) -> tuple[int, int]:
+    """The number of Gaussians in a PLY and their SH degree, from its header."""
+    count, rest = 0, 0
     with scene.open("rb") as file:
         for line in file:
             if line.startswith(b"element vertex"):
-                return int(line.split()[2])
+                count = int(line.split()[2])
+            rest += line.startswith(b"property float f_rest_")
             if line.startswith(b"end_header"):
                 break
-    raise InputError(f"{scene} is not a Gaussian scene", hint="make it again with `cleargs run`")
+    if not count:
+        raise InputError(f"{scene} is not a Gaussian scene", hint="make it again with `cleargs run`")
+    return count, SH_DEGREES[1 + rest // 3]
+
+
+def _all_noted(combine: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
+    """The combined values; None where one is missing."""
+    noted = [value for value in values if value is not None]
+    return combine(noted) if noted and len(noted) == len(values) else None
 
 
 def _matrices(folder: Path) -> list[Any]:

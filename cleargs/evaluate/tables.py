@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from cleargs.evaluate.cells import Cells, Spread, ViewSet
+from cleargs.evaluate.choices import Choices, agreement
 from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.roles import KINDS, Roles
 
 TITLES: Mapping[ViewSet, str] = {
     "observed": "At the input's true poses, against the sharp truth",
@@ -15,6 +18,8 @@ TITLES: Mapping[ViewSet, str] = {
     "reference": "Against the given reference",
 }
 NAMES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
+COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+"""Metrics whose differences are tabled."""
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -23,27 +28,46 @@ def metric_title(metric: str) -> str:
     return f"{NAMES.get(metric, metric)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
 
 
-def markdown(cells: Cells, labels: Mapping[str, str], baselines: Sequence[str]) -> str:
-    """All tables: per set of views one table a metric, differences to the baselines; then the cost.
+@dataclass(frozen=True)
+class Results:
+    """All that a comparison found."""
 
-    ``labels`` maps each variant to what it is called. A mean stands with the sample standard deviation where
-    there are several samples; a paired difference smaller than its spread is marked as none.
+    cells: Cells
+    roles: Sequence[Roles]
+    choices: Sequence[Choices]
+
+
+def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]) -> str:
+    """All tables: per set of views one table a metric, differences to the baselines; then the work, the roles
+    of the frames and how well RIVR chose.
+
+    ``labels`` maps each variant to what it is called. A mean stands with the sample standard deviation, a
+    paired difference with half its 95 % interval (Student's t over the samples); one whose interval holds 0
+    is marked as none.
     """
-    parts = []
+    cells, parts = found.cells, []
     for views in cells.view_sets():
         parts.append(f"## {TITLES[views]}")
         for metric in cells.metrics():
             parts.append(f"### {metric_title(metric)}")
-            parts.append(_metric_table(cells, labels, views, metric))
+            parts.append(metric_table(cells, labels, views, metric))
         for baseline in baselines:
             if baseline in cells.variants():
                 parts.append(f"### Minus {labels[baseline]}")
-                parts.append(_difference_table(cells, labels, views, baseline))
-    parts += ["## Cost", _cost_table(cells, labels)]
+                parts.append(difference_table(cells, labels, views, baseline))
+    parts += [
+        "## Work",
+        work_table(cells, labels),
+        "## Roles of the frames",
+        roles_table(found.roles, labels),
+    ]
+    if found.choices:
+        parts += ["## The choice against the truth", choices_table(found.choices, labels)]
     return "\n\n".join(parts) + "\n"
 
 
-def _metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> str:
+def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> str:
+    """A metric of every variant by column, the best of a column in bold."""
     columns = cells.columns(views)
     rows = []
     for variant in cells.variants():
@@ -56,10 +80,12 @@ def _metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metri
     return table(["", *columns], rows)
 
 
-def _difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> str:
-    """PSNR, SSIM and LPIPS of every other variant minus the baseline's; for LPIPS the share of it too."""
+def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> str:
+    """PSNR, SSIM and LPIPS of every other variant minus the baseline's, paired within samples, with 95 %
+    intervals; for LPIPS the share of the baseline's too.
+    """
     columns = cells.columns(views)
-    metrics = [metric for metric in ("psnr", "ssim", "lpips_alex", "lpips_vgg") if metric in cells.metrics()]
+    metrics = [metric for metric in COMPARED if metric in cells.metrics()]
     rows = []
     for variant in cells.variants():
         if variant == baseline:
@@ -68,29 +94,76 @@ def _difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, b
             row = [labels[variant], NAMES[metric]]
             for column in columns:
                 difference = cells.difference(views, column, variant, baseline, metric)
-                row.append(_difference(difference, cells.spread(views, column, baseline, metric), metric))
+                row.append(difference_text(difference, cells.spread(views, column, baseline, metric), metric))
             rows.append(row)
     return table(["", "", *columns], rows)
 
 
-def _cost_table(cells: Cells, labels: Mapping[str, str]) -> str:
-    """Mean wall seconds a sample: stages of the variant's own + stages shared with variants above it."""
-    views = cells.view_sets()[0]
-    columns = cells.columns(views)
+def work_table(cells: Cells, labels: Mapping[str, str]) -> str:
+    """What each variant was given and what it took: means over all samples, ranges of what must be equal."""
     rows = []
     for variant in cells.variants():
-        row = [labels[variant]]
-        for column in columns:
-            chosen = [
-                cell
-                for cell in cells.cells
-                if (cell.views, cell.column, cell.variant) == (views, column, variant)
+        # One cell a scene: the sets of views share all of this.
+        chosen = list({cell.sample: cell for cell in cells.cells if cell.variant == variant}.values())
+        rows.append(
+            [
+                labels[variant],
+                _range(cell.steps for cell in chosen),
+                _range(cell.gaussians for cell in chosen),
+                _range(cell.sh_degree for cell in chosen),
+                _mean([cell.cpu_seconds for cell in chosen], 0),
+                _mean([cell.peak_memory_gb for cell in chosen], 2),
+                f"{_mean([cell.seconds for cell in chosen], 0)} + "
+                f"{_mean([cell.shared_seconds for cell in chosen], 0)}",
             ]
-            own = sum(cell.seconds for cell in chosen) / len(chosen) if chosen else 0.0
-            shared = sum(cell.shared_seconds for cell in chosen) / len(chosen) if chosen else 0.0
-            row.append(f"{own:.0f} s + {shared:.0f} s" if chosen else "")
-        rows.append(row)
-    return table(["own + shared stages", *columns], rows)
+        )
+    head = ["", "steps", "Gaussians", "SH degree", "CPU s", "peak memory, GB", "wall s, own + shared stages"]
+    return table(head, rows)
+
+
+def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> str:
+    """Frames of all samples of a column by role; variants whose counts agree share a row."""
+    rows = []
+    for column in dict.fromkeys(scene.column for scene in roles):
+        groups: dict[tuple[int, ...], list[str]] = {}
+        scenes = [scene for scene in roles if scene.column == column]
+        for variant in dict.fromkeys(scene.variant for scene in scenes):
+            own = [scene.frames for scene in scenes if scene.variant == variant]
+            counts = tuple(sum(frames[kind] for frames in own) for kind in KINDS)
+            groups.setdefault(counts, []).append(variant)
+        for counts, variants in groups.items():
+            rows.append([column, ", ".join(labels[name] for name in variants), *map(str, counts)])
+    return table(["", "", *KINDS], rows)
+
+
+def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> str:
+    """How often the chosen candidate is the best, over all rows of all samples of a column."""
+    rows = []
+    for column, variant in dict.fromkeys((scene.column, scene.variant) for scene in choices):
+        own = [scene for scene in choices if (scene.column, scene.variant) == (column, variant)]
+        found = agreement([row for scene in own for row in scene.rows])
+        by_lpips = "n/a" if found.by_lpips is None else f"{100 * found.by_lpips:.0f} %"
+        rows.append(
+            [
+                column,
+                labels[variant],
+                str(found.rows),
+                f"{100 * found.by_psnr:.0f} %",
+                by_lpips,
+                f"{100 * found.by_chance:.0f} %",
+                f"{found.lost_psnr:.2f}",
+            ]
+        )
+    head = [
+        "",
+        "",
+        "rows",
+        "best by PSNR",
+        "best by LPIPS (AlexNet)",
+        "by chance",
+        "lost against the best, dB",
+    ]
+    return table(head, rows)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -104,6 +177,16 @@ def number(value: float, metric: str) -> str:
     return f"{value:.{_DIGITS.get(metric, 2)}f}"
 
 
+def _range(values: Iterable[int]) -> str:
+    found = sorted(set(values))
+    return f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
+
+
+def _mean(values: Sequence[float | None], digits: int) -> str:
+    noted = [value for value in values if value is not None]
+    return f"{sum(noted) / len(noted):.{digits}f}" if noted else "n/a"
+
+
 def _value(found: Spread | None, metric: str) -> str:
     if found is None:
         return "n/a"
@@ -111,13 +194,14 @@ def _value(found: Spread | None, metric: str) -> str:
     return text if found.deviation is None else f"{text} ± {number(found.deviation, metric)}"
 
 
-def _difference(found: Spread | None, base: Spread | None, metric: str) -> str:
+def difference_text(found: Spread | None, base: Spread | None, metric: str) -> str:
+    """A paired difference with half its 95 % interval."""
     if found is None:
         return "n/a"
     digits = _DIGITS.get(metric, 2)
     text = f"{found.mean:+.{digits}f}"
-    if found.deviation is not None:
-        text += f" ± {found.deviation:.{digits}f}"
+    if found.half_width is not None:
+        text += f" ± {found.half_width:.{digits}f}"
     if found.is_none:
         return f"none ({text})"
     if metric in LOWER_IS_BETTER and base is not None and base.mean > 0:

@@ -11,7 +11,7 @@ from cleargs.errors import InputError
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make a scene from a capture."""
+    """One way to make a scene from a capture. How long it trains is no matter of its own: see `work`."""
 
     name: str
     label: str
@@ -19,26 +19,49 @@ class Variant:
     stage: str
     """Whose ``scene.ply`` is judged."""
     overrides: tuple[str, ...] = ()
-    """Settings that differ from the run's recipe, as ``--set`` takes them."""
+    """Settings that differ from the recipe, as ``--set`` takes them."""
+    workflow: str | None = None
+    """A recipe of its own (all but its ingest); None: that of the comparison."""
 
+
+_PAPER_RVA = ("rva.active_share=0",)
+"""Suppressed frames come back for an empty trajectory bin alone."""
+_WEIGHT_ONE = (
+    "rva.strong_base=1",
+    "rva.strong_gain=0",
+    "rva.attenuated_base=1",
+    "rva.attenuated_gain=0",
+    "rva.reactivated_weight=1",
+)
+"""Every active frame weighs as much as a strong one."""
 
 VARIANTS: tuple[Variant, ...] = (
     Variant("all-view", "all-view G0", "g0", ("rva.enabled=false",)),
     Variant("drop-blurry", "drop-blurry G0", "g0", ("rva.weighting=binary",)),
-    Variant("rva-no-coverage", "RVA G0 without coverage", "g0", ("rva.coverage=false",)),
+    Variant("rva-paper", "RVA G0, the paper's", "g0", _PAPER_RVA),
+    Variant("rva-no-coverage", "the same w/o coverage", "g0", (*_PAPER_RVA, "rva.coverage=false")),
+    Variant("rva-binary", "the same, weights 0 and 1", "g0", (*_PAPER_RVA, *_WEIGHT_ONE)),
     Variant("rva", "RVA G0", "g0"),
     Variant(
-        "rivr-no-observation", "RIVR without observation", "consolidate", ("rivr.use_observation=false",)
+        "no-repairs",
+        "ClearGS w/o repairs",
+        "consolidate",
+        ("rivr.distil.pseudo_share=0", "consolidate.distil.pseudo_share=0"),
     ),
-    Variant("rivr-as-is", "RIVR of frames with their motion", "consolidate", ("rivr.undo_motion=false",)),
-    Variant("rivr-fused", "RIVR with fused", "consolidate", ("rivr.use_fused=true",)),
-    Variant("rivr", "ClearGS before consolidation", "rivr"),
+    Variant("rivr-no-observation", "ClearGS w/o Obs.", "consolidate", ("rivr.use_observation=false",)),
+    Variant("rivr", "ClearGS w/o consolidation", "rivr"),
     Variant("full", "ClearGS", "consolidate"),
+    Variant("paper-open", "paper's method, open models", "consolidate", workflow="paper-open"),
+    Variant("no-fused", "the same w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"),
 )
-"""From the plainest to the whole method. Those of equal settings share all stages; all share the ingest."""
+"""From the plainest to the whole method, then the paper's. Those of equal settings share all stages; all
+share the ingest."""
 
 BASELINES = ("all-view", "drop-blurry")
 """What the others are measured against."""
+
+WHOLE = "full"
+"""The whole method."""
 
 
 def find_variants(names: Sequence[str]) -> tuple[Variant, ...]:

@@ -24,7 +24,7 @@ PLOTTED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
     """Write a PNG of the differences to the first variant: a row a metric, a panel a set of views; a point a
-    variant and column, with the spread of the paired difference where there are several samples."""
+    variant and column, with the 95 % interval of the paired difference where there are several samples."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -59,7 +59,7 @@ def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet,
         panel.errorbar(
             [place + (number - (len(others) - 1) / 2) * 0.1 for place, _ in shown],
             [value.mean for _, value in shown],
-            [value.deviation or 0.0 for _, value in shown],
+            [value.half_width or 0.0 for _, value in shown],
             fmt="o",
             markersize=4,
             label=labels[variant],

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from cleargs.evaluate.cells import Cell, Cells, ViewSet, spread
-from cleargs.evaluate.tables import markdown
+import pytest
+
+from cleargs.evaluate.cells import Cell, Cells, ViewSet, spread, student_t
+from cleargs.evaluate.roles import FOR_SHARE, KINDS, Roles
+from cleargs.evaluate.tables import Results, markdown
 
 LABELS = {"all-view": "all-view G0", "full": "ClearGS"}
 
@@ -19,8 +22,17 @@ def cell(variant: str, sample: str, views: ViewSet = "observed", **means: float 
         seconds=2.0,
         shared_seconds=1.0,
         gaussians=10,
+        steps=100,
+        sh_degree=1,
+        cpu_seconds=4.0,
+        peak_memory_gb=0.5,
         evaluation="evaluations/x",
     )
+
+
+def roles(strong: int, reactivated: int) -> Roles:
+    frames = dict.fromkeys(map(str, KINDS), 0) | {"strong": strong, FOR_SHARE: reactivated}
+    return Roles(column="mixed", sample="s", variant="full", frames=frames)
 
 
 def cells(*gains: float) -> Cells:
@@ -40,20 +52,40 @@ def test_the_spread_of_one_value_is_unknown() -> None:
     assert spread([1.0, 3.0]).deviation == 2.0**0.5
 
 
+def test_intervals_against_values_by_hand() -> None:
+    # Quantiles from a printed table of Student's t, 97.5 %: 12.706, 2.776 and 2.262 for 1, 4 and 9 degrees of
+    # freedom.
+    assert student_t(1) == pytest.approx(12.706, abs=5e-4)
+    assert student_t(4) == pytest.approx(2.776, abs=5e-4)
+    assert student_t(9) == pytest.approx(2.262, abs=5e-4)
+    # 1 .. 5: mean 3, deviation sqrt(10 / 4), half width 2.776 sqrt(2.5) / sqrt(5) = 2.776 sqrt(0.5) = 1.963.
+    found = spread([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert found.half_width == pytest.approx(1.963, abs=5e-4)
+    assert found.is_sure and not found.is_none
+    # The same around 1.5: the interval is 1.5 +- 1.963 and holds 0.
+    found = spread([-0.5, 0.5, 1.5, 2.5, 3.5])
+    assert found.is_none and not found.is_sure
+    # A mean twice its deviation: enough for the deviation, not for the interval of two values.
+    assert spread([1.0, 3.0]).is_none
+    # One value has no interval, and so claims nothing.
+    assert spread([3.0]).half_width is None and not spread([3.0]).is_sure
+
+
 def test_differences_are_paired_within_samples() -> None:
-    difference = cells(1.0, 1.25).difference("observed", "mixed", "full", "all-view", "psnr")
+    difference = cells(1.0, 1.25, 1.125).difference("observed", "mixed", "full", "all-view", "psnr")
     assert difference is not None
     # The samples' levels differ by 5 dB; the gains do not, and only these count.
     assert difference.mean == 1.125
     assert difference.deviation is not None and difference.deviation < 0.2
-    assert not difference.is_none
+    assert difference.is_sure
 
 
-def test_a_difference_below_its_spread_is_none() -> None:
+def test_a_difference_whose_interval_holds_0_is_none() -> None:
     found = cells(1.0, -1.0, 0.2)
     difference = found.difference("observed", "mixed", "full", "all-view", "psnr")
     assert difference is not None and difference.is_none
-    assert "none (+0.07 ± 1.01)" in markdown(found, LABELS, ("all-view",))
+    # Mean 0.0667, deviation 1.0066, times 4.303 / sqrt(3).
+    assert "none (+0.07 ± 2.50)" in markdown(Results(found, (), ()), LABELS, ("all-view",))
 
 
 def test_a_sample_without_its_baseline_takes_no_part() -> None:
@@ -70,10 +102,12 @@ def test_best_is_lowest_for_lpips_and_highest_elsewhere() -> None:
 
 
 def test_tables() -> None:
-    text = markdown(cells(1.0), LABELS, ("all-view", "drop-blurry"))
+    text = markdown(Results(cells(1.0), (roles(4, 2), roles(3, 3)), ()), LABELS, ("all-view", "drop-blurry"))
     assert "| all-view G0 | 20.00 |" in text
     assert "| ClearGS | **21.00** |" in text
     assert "| ClearGS | LPIPS (AlexNet) | -0.1000 (-25 %) |" in text
-    assert "| ClearGS | 2 s + 1 s |" in text
+    assert "| ClearGS | 100 | 10 | 1 | 4 | 0.50 | 2 + 1 |" in text
+    assert "| mixed | ClearGS | 7 | 0 | 0 | 0 | 5 | 0 |" in text, "frames of both samples"
+    assert "against the truth\n\n|" not in text, "without RIVR there is no choice to judge"
     assert "musiq" not in text, "a metric that was never measured has no table"
     assert "drop-blurry" not in text, "a baseline that was not run has no table"

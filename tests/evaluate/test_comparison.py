@@ -8,10 +8,14 @@ from pathlib import Path
 import pytest
 
 from cleargs.cli.main import invoke
-from cleargs.evaluate.variants import VARIANTS, Variant
+from cleargs.errors import ConfigError
+from cleargs.evaluate.variants import VARIANTS, WHOLE, Variant
+from cleargs.evaluate.work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.progress import SilentReporter
+from cleargs.splat.initialise import sh_degree_from_views
+from cleargs.splat.strategy import budget_from_pixels
 from cleargs.synth.capture import make_capture
 
 SETTINGS = {
@@ -39,6 +43,10 @@ def out(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+TOTAL = 12 + 6 + 6
+"""Steps of the whole method with these settings; the recipe `smoke` has one round."""
+
+
 def compare(capture: Path, *more: str) -> int:
     settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
     return invoke(["compare", str(capture), "--workflow", "smoke", "--quiet", *settings, *more])
@@ -46,8 +54,63 @@ def compare(capture: Path, *more: str) -> int:
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_the_settings_of_every_variant_exist(variant: Variant) -> None:
+    plain = load_config(installed(), "default", seed=0)
+    changes = bool(variant.overrides or variant.workflow)
+    assert (variant_config(installed(), variant, "default", (), 0) != plain) == changes
+
+
+def test_every_variant_sees_the_same_images() -> None:
+    found = [variant_config(installed(), v, "default", ("ingest.max_size=320",), 0) for v in VARIANTS]
+    assert all(config.sections["ingest"] == found[0].sections["ingest"] for config in found)
+
+
+@pytest.mark.parametrize("recipe", ["default", "smoke", "paper"])
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
+def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) -> None:
+    plain = load_config(installed(), recipe)
+    for total in (steps_of(plain).total, 1000, 7777):
+        work = Work(steps=total, budget=12_345, sh_degree=2)
+        config = variant_config(installed(), variant, recipe, (), 0, work)
+        assert steps_of(config, variant.stage).total == total
+        trainings = [
+            config.sections["g0"],
+            config.sections["rivr"].distil,
+            config.sections["consolidate"].distil,
+        ]
+        assert {training.budget for training in trainings} == {12_345}
+        assert config.sections["g0"].sh_degree == 2
+
+
+def test_the_recipe_s_own_total_changes_nothing_but_budget_and_degree() -> None:
+    full = next(variant for variant in VARIANTS if variant.name == WHOLE)
+    plain = load_config(installed(), "default", seed=0)
+    work = Work(steps_of(plain).total, budget=40_000, sh_degree=1)
+    same = (
+        "g0.sh_degree=1",
+        *(f"{name}.budget=40000" for name in ("g0", "rivr.distil", "consolidate.distil")),
+    )
+    assert variant_config(installed(), full, "default", (), 0, work) == load_config(
+        installed(), "default", same, 0
+    )
+
+
+def test_steps_are_split_in_the_recipe_s_proportions() -> None:
+    whole = Steps(g0=2000, round=600, rounds=2, consolidate=600)
+    assert split(whole, "consolidate", 7600) == Steps(4000, 1200, 2, 1200)
+    assert split(whole, "g0", 3800) == Steps(3800, 0, 0, 0)
+    # Without consolidation its 600 steps go to the two rounds.
+    assert split(whole, "rivr", 3800) == Steps(2000, 900, 2, 0)
+    with pytest.raises(ConfigError, match="too few"):
+        split(whole, "consolidate", 3)
+
+
+def test_schedules_that_count_steps_keep_their_share() -> None:
+    full = next(variant for variant in VARIANTS if variant.name == WHOLE)
+    config = variant_config(installed(), full, "default", (), 0, Work(1900, 40_000, 1))
     plain = load_config(installed(), "default")
-    assert (load_config(installed(), "default", variant.overrides) == plain) == (not variant.overrides)
+    for name in ("refine_interval", "sh_interval"):
+        # 1,900 of 3,800 steps
+        assert 2 * getattr(config.sections["g0"], name) == getattr(plain.sections["g0"], name)
 
 
 def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
@@ -61,9 +124,12 @@ def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
     }
     for cell in cells.values():
         assert cell["column"] == "mixed"
-        # Twelve steps make no good scene, but one that shows the room: its mean colour alone gives 12 dB.
+        # Two dozen steps make no good scene, but one that shows the room: its mean colour alone gives 12 dB.
         assert 12.0 < cell["means"]["psnr"] < 40.0
         assert (out / cell["evaluation"] / "eval.json").is_file()
+        assert (cell["steps"], cell["sh_degree"]) == (TOTAL, 1)
+        assert cell["cpu_seconds"] > 0.0 and 0.05 < cell["peak_memory_gb"] < 10.0
+    assert len({cell["gaussians"] for cell in cells.values()}) == 1
     assert cells["rva", "observed"]["evaluation"] != cells["all-view", "observed"]["evaluation"]
     for name in ("comparison.md", "comparison.png", "sheet.png"):
         assert (out / name).stat().st_size > 0
@@ -73,11 +139,41 @@ def test_variants_share_what_they_agree_on(out: Path) -> None:
     stored = {stage: list((out / ".store" / stage).iterdir()) for stage in ("ingest", "rva", "g0")}
     assert len(stored["ingest"]) == 1
     assert len(stored["rva"]) == 3  # all views, binary weights, graded weights
-    assert len(stored["g0"]) == 3  # that of graded weights serves `rva` and `full`
+    assert len(stored["g0"]) == 4  # that of `full` has fewer steps than that of `rva`
     cells = json.loads((out / "comparison.json").read_text())["cells"]
     shared = {cell["variant"]: cell["shared_seconds"] for cell in cells}
     assert shared["all-view"] == 0.0
     assert shared["full"] > shared["rva"] > 0.0
+
+
+def test_roles_and_choices_stand_beside_the_cells(out: Path) -> None:
+    found = json.loads((out / "comparison.json").read_text())
+    roles = {scene["variant"]: scene["frames"] for scene in found["roles"]}
+    assert all(sum(frames.values()) == 6 for frames in roles.values())
+    assert roles["all-view"]["strong"] == 6
+    assert roles["drop-blurry"]["suppressed"] > 0
+    assert roles["rva"] == roles["full"]
+    (scene,) = found["choices"]
+    assert scene["variant"] == "full" and scene["rows"]
+    for row in scene["rows"]:
+        assert {"render", "restored", "observed"} <= row["psnr"].keys() and row["chosen"] in row["psnr"]
+    text = (out / "comparison.md").read_text()
+    assert "| all-view G0 | 24 |" in text and "best by PSNR" in text
+
+
+def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
+    config = load_config(installed(), "default", ("g0.budget=7",), 0)
+    frames = 6 * 160 * 90
+    open_ = decide_work(load_config(installed(), "default", (), 0), out / "room-0" / "rva" / "ingest", None)
+    assert open_ == Work(3800, budget_from_pixels(frames), sh_degree_from_views(6))
+    assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == Work(50, 7, 0)
+
+
+def test_steps_sets_the_total_of_all(capture: Path, out: Path) -> None:
+    assert compare(capture, "-o", str(out), "--variants", "all-view,full", "--steps", "20") == 0
+    cells = json.loads((out / "comparison.json").read_text())["cells"]
+    assert {cell["steps"] for cell in cells} == {20}
+    assert compare(capture, "-o", str(out), "--variants", "all-view,drop-blurry,rva,full") == 0
 
 
 def test_the_same_command_again_makes_nothing(capture: Path, out: Path) -> None:

@@ -1,0 +1,143 @@
+"""Whether RIVR chose well: its candidates measured against the sharp truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from cleargs.capture.tables import load_frames
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.media.exr import from_layer, read_exr
+from cleargs.media.image import read_rgb_float
+from cleargs.rivr.tables import read_selection
+from cleargs.synth.record import FRAMES
+from cleargs.tables import read_table
+
+Image = NDArray[np.float32]
+Distance = Callable[[Image, Image], float]
+
+RAW = "observed"
+"""The layer of the raw frame, which a method that keeps frames may choose too."""
+
+_LEAST_ERROR = 1e-10
+"""Equal images have a PSNR of 100 dB, not an infinite one."""
+
+
+class Choice(BaseModel):
+    """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    round: int
+    frame_id: int
+    chosen: str
+    psnr: dict[str, float]
+    """Candidate -> dB; the raw frame is among them."""
+    lpips: dict[str, float]
+    """Candidate -> LPIPS; empty without its weights."""
+
+    @property
+    def best_by_psnr(self) -> bool:
+        return self.psnr[self.chosen] == max(self.psnr.values())
+
+    @property
+    def best_by_lpips(self) -> bool:
+        return bool(self.lpips) and self.lpips[self.chosen] == min(self.lpips.values())
+
+    @property
+    def lost_psnr(self) -> float:
+        """dB by which the best candidate would have been better."""
+        return max(self.psnr.values()) - self.psnr[self.chosen]
+
+
+class Choices(BaseModel):
+    """All rows of one scene."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    column: str
+    sample: str
+    variant: str
+    rows: tuple[Choice, ...]
+
+
+class Agreement(BaseModel):
+    """How well choices agree with the truth."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rows: int
+    by_psnr: float
+    """Share of the rows whose chosen candidate is the best by PSNR."""
+    by_lpips: float | None
+    by_chance: float
+    """What choosing blindly would reach."""
+    lost_psnr: float
+    """Mean over the rows, dB."""
+
+
+def agreement(rows: Sequence[Choice]) -> Agreement:
+    """The figures of one or more rows."""
+    count = len(rows)
+    return Agreement(
+        rows=count,
+        by_psnr=sum(row.best_by_psnr for row in rows) / count,
+        by_lpips=sum(row.best_by_lpips for row in rows) / count if all(row.lpips for row in rows) else None,
+        by_chance=math.fsum(1 / len(row.psnr) for row in rows) / count,
+        lost_psnr=math.fsum(row.lost_psnr for row in rows) / count,
+    )
+
+
+def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choice]:
+    """Every row of a finished RIVR against ``capture/truth/observed``; none where ``capture`` has no truth.
+
+    A candidate has the exposure of its frame, so the truth is given the frame's true exposure error first:
+    what is compared is detail, not brightness. Frames whose images have another size than the truth are
+    left out. Raises StoreError when a table or an EXR is damaged.
+    """
+    folder, table = capture / "truth" / "observed" / "images", capture / "truth" / "frames.parquet"
+    if not folder.is_dir() or not table.is_file():
+        return []
+    stops = {Path(row["image"]).stem: row["exposure_ev"] for row in read_table(table, FRAMES).to_pylist()}
+    stems = {frame.frame_id: Path(frame.name).stem for frame in load_frames(run / "ingest")}
+    found = []
+    for row in read_selection(run / "rivr" / "selection.parquet"):
+        stem = stems[row.frame_id]
+        truth = exposed(read_rgb_float(folder / f"{stem}.png"), stops[stem])
+        candidates = _candidates(run / "rivr" / row.exr, row.chosen)
+        if any(image.shape != truth.shape for image in candidates.values()):
+            continue
+        found.append(
+            Choice(
+                round=row.round,
+                frame_id=row.frame_id,
+                chosen=row.chosen,
+                psnr={name: _psnr(image, truth) for name, image in candidates.items()},
+                lpips={name: lpips(image, truth) for name, image in candidates.items()} if lpips else {},
+            )
+        )
+    return found
+
+
+def exposed(image: Image, stops: float) -> Image:
+    """An sRGB image as a camera would give it that is off by so many stops."""
+    light = linear_from_srgb(image) * np.float32(2.0**stops)
+    return np.asarray(srgb_from_linear(np.clip(light, 0.0, 1.0)), np.float32)
+
+
+def _psnr(image: Image, truth: Image) -> float:
+    """Of unrounded images, so that candidates which differ by less than 8 bits tell still differ, dB."""
+    error = float(np.square(image - truth).mean(dtype=np.float64))
+    return -10.0 * math.log10(max(error, _LEAST_ERROR))
+
+
+def _candidates(exr: Path, chosen: str) -> Mapping[str, Image]:
+    """What could have been chosen, and the raw frame."""
+    layers = read_exr(exr).layers
+    names = [name for name in ("render", "restored", "fused", RAW) if name in layers]
+    return {name: from_layer(layers[name]) for name in dict.fromkeys((*names, chosen))}

@@ -1,0 +1,39 @@
+"""How many frames of a scene had each role: which of RVA's mechanisms a table exercises at all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from cleargs.rva.allocation import Role, Rule
+from cleargs.rva.tables import FRAMES
+from cleargs.tables import read_table
+
+FOR_COVERAGE = f"{Role.REACTIVATED} for {Rule.COVERAGE}"
+FOR_SHARE = f"{Role.REACTIVATED} for {Rule.ACTIVE_SHARE}"
+KINDS = (Role.STRONG, Role.GEOMETRIC, Role.AUXILIARY, FOR_COVERAGE, FOR_SHARE, Role.SUPPRESSED)
+"""What a frame can be; reactivated ones by the rule that woke them."""
+
+
+class Roles(BaseModel):
+    """The training frames of one scene by role."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    column: str
+    sample: str
+    variant: str
+    frames: dict[str, int]
+    """Each of `KINDS` -> number of frames."""
+
+
+def count_roles(rva: Path) -> dict[str, int]:
+    """Each of `KINDS` -> number of training frames, from the finished folder of RVA. Raises StoreError."""
+    rows = read_table(rva / "frames.parquet", FRAMES).to_pylist()
+    found = Counter(
+        f"{row['role']} for {row['reactivated_for']}" if row["reactivated_for"] else row["role"]
+        for row in rows
+    )
+    return {str(kind): found[kind] for kind in KINDS}
