@@ -124,7 +124,8 @@ def compare(
     difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
     same command goes on where it stopped.
     """
-    from cleargs.evaluate.comparison import Recipe, Sample, compare_scenes, existing, make_scenes
+    from cleargs.evaluate.compared import compare_scenes
+    from cleargs.evaluate.comparison import Recipe, Sample, existing, make_scenes
     from cleargs.evaluate.tables import markdown
     from cleargs.files import write_bytes, write_json
     from cleargs.report.comparison import comparison_sheet, plot_comparison

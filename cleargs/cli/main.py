@@ -27,6 +27,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
+    "evidence": (
+        "cleargs.cli.evidence",
+        "Make the page of results: all tables and pictures.",
+    ),
     "rva": ("cleargs.cli.rva", "Compare evaluators of frames, and check them."),
     "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),

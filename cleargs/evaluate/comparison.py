@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from cleargs.errors import CleargsError, InputError
-from cleargs.evaluate.cells import Cell, Cells, ViewSet
-from cleargs.evaluate.choices import Choice, Choices, judge_choices
+from cleargs.evaluate.cells import Cell, ViewSet
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.results import Evaluation
-from cleargs.evaluate.roles import Roles, count_roles
-from cleargs.evaluate.tables import Results
 from cleargs.evaluate.variants import Variant
 from cleargs.evaluate.work import Work, decide_work, variant_config
 from cleargs.files import write_bytes
@@ -106,58 +103,6 @@ class Made:
     @property
     def scene(self) -> Path:
         return self.run / self.variant.stage / "scene.ply"
-
-
-@dataclass
-class Compared:
-    """All scenes of a comparison, judged."""
-
-    scenes: list[Made] = field(default_factory=list)
-    cells: list[Cell] = field(default_factory=list)
-    roles: list[Roles] = field(default_factory=list)
-    choices: list[Choices] = field(default_factory=list)
-    failures: list[str] = field(default_factory=list)
-
-    @property
-    def results(self) -> Results:
-        return Results(Cells(self.cells), self.roles, self.choices)
-
-    @property
-    def labels(self) -> dict[str, str]:
-        """Variant -> what it is called."""
-        return {scene.variant.name: scene.variant.label for scene in self.scenes}
-
-    def document(self) -> dict[str, Any]:
-        """``comparison.json``."""
-        lists: dict[str, Sequence[BaseModel]] = {
-            "cells": self.cells,
-            "roles": self.roles,
-            "choices": self.choices,
-        }
-        return {
-            **{name: [item.model_dump(mode="json") for item in found] for name, found in lists.items()},
-            "failures": self.failures,
-        }
-
-
-def compare_scenes(
-    out: Path, made: Iterable[Made | str], recipe: Recipe, store: Store, reporter: Reporter
-) -> Compared:
-    """Judge every scene; a line in place of one says why it could not be made."""
-    found = Compared()
-    for scene in made:
-        if isinstance(scene, str):
-            reporter.warn(scene)
-            found.failures.append(scene)
-            continue
-        found.cells += judge(out, scene, recipe, store, reporter)
-        found.roles.append(roles_of(scene))
-        if (choices := choices_of(out, scene, store)) is not None:
-            found.choices.append(choices)
-        found.scenes.append(scene)
-    if not found.cells:
-        raise InputError("nothing could be compared", hint="the warnings above say why")
-    return found
 
 
 def make_scenes(
@@ -323,43 +268,6 @@ def evaluated(
     )
     write_bytes(path, evaluation.model_dump_json(indent=2).encode())
     return evaluation, folder
-
-
-def roles_of(made: Made) -> Roles:
-    """The training frames of a scene by role. Raises StoreError."""
-    return Roles(
-        column=made.sample.column,
-        sample=made.sample.name,
-        variant=made.variant.name,
-        frames=count_roles(made.run / "rva"),
-    )
-
-
-def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
-    """How RIVR chose, against the truth; None where there is no RIVR or no truth. Kept by content."""
-    from cleargs.evaluate.judges import load_judges
-
-    rivr = next((manifest for manifest in made.manifests if manifest.stage == "rivr"), None)
-    truth = made.sample.capture / "truth"
-    if rivr is None or not truth.is_dir():
-        return None
-    distances = load_judges(EvalOptions(lpips=("alex",), scorers=())).lpips
-    parts = {
-        "version": EVALUATION_VERSION,
-        "rivr": rivr.digest,
-        "truth": store.memo.digests_of(truth),
-        "metrics": sorted(distances),
-    }
-    path = out / "choices" / f"{hashlib.sha256(canonical_json(parts).encode()).hexdigest()}.json"
-    try:
-        rows = TypeAdapter(tuple[Choice, ...]).validate_json(path.read_bytes())
-    except (OSError, ValidationError):  # not made yet, or damaged
-        rows = tuple(judge_choices(made.run, made.sample.capture, distances.get("lpips_alex")))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, TypeAdapter(tuple[Choice, ...]).dump_json(rows))
-    if not rows:
-        return None
-    return Choices(column=made.sample.column, sample=made.sample.name, variant=made.variant.name, rows=rows)
 
 
 def existing(run: Path, dag: Dag, reference: Path | None) -> Made:

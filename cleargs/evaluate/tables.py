@@ -68,16 +68,17 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
 
 def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> str:
     """A metric of every variant by column, the best of a column in bold."""
-    columns = cells.columns(views)
-    rows = []
-    for variant in cells.variants():
-        row = [labels[variant]]
-        for column in columns:
-            found = cells.spread(views, column, variant, metric)
-            text = _value(found, metric)
-            row.append(f"**{text}**" if variant == cells.best(views, column, metric) else text)
-        rows.append(row)
-    return table(["", *columns], rows)
+    rows = [[labels[variant], *value_texts(cells, views, variant, metric)] for variant in cells.variants()]
+    return table(["", *cells.columns(views)], rows)
+
+
+def value_texts(cells: Cells, views: ViewSet, variant: str, metric: str) -> list[str]:
+    """A variant's values of a metric by column, in bold where it is the best."""
+    texts = []
+    for column in cells.columns(views):
+        text = _value(cells.spread(views, column, variant, metric), metric)
+        texts.append(f"**{text}**" if variant == cells.best(views, column, metric) else text)
+    return texts
 
 
 def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> str:

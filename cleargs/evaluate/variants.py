@@ -63,6 +63,21 @@ BASELINES = ("all-view", "drop-blurry")
 WHOLE = "full"
 """The whole method."""
 
+QUESTIONS: tuple[tuple[str, str, str], ...] = (
+    ("the whole method, against all-view training", WHOLE, "all-view"),
+    ("the whole method, against dropping blurry frames", WHOLE, "drop-blurry"),
+    ("the whole method, against the paper's with open models", WHOLE, "paper-open"),
+    ("RVA, against all-view training", "rva", "all-view"),
+    ("RIVR and consolidation, against RVA trained as long", WHOLE, "rva"),
+    ("repairs, against the same distillation without them", WHOLE, "no-repairs"),
+    ("consolidation, against as many steps of RIVR", WHOLE, "rivr"),
+    ("the raw frame before the expert, against the render", WHOLE, "rivr-no-observation"),
+    ("coverage compensation", "rva-paper", "rva-no-coverage"),
+    ("graded weights, against binary ones of the same frames", "rva-paper", "rva-binary"),
+    ("the fused candidate", "paper-open", "no-fused"),
+)
+"""What the evidence is asked: (words, variant, variant that it is measured against)."""
+
 
 def find_variants(names: Sequence[str]) -> tuple[Variant, ...]:
     """The variants of these names in the order of `VARIANTS`; all of them for none.

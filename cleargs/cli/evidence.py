@@ -1,0 +1,149 @@
+"""``cleargs evidence``: the page of results, from one command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cleargs.cli.common import (
+    DeviceChoice,
+    opened_store,
+    quiet_option,
+    resolve_device,
+    threads_or_all,
+    work_options,
+)
+from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.cli.progress import make_reporter
+from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.store import STORE_FOLDER
+
+if TYPE_CHECKING:
+    from cleargs.evaluate.evidence import Outcome, Workshop
+
+RECIPE = "default"
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs evidence -o evidence --quick                          a rough page, evidence/results.md
+  cleargs evidence -o evidence --captures data --page docs/results.md
+  cleargs evidence -o evidence --quick --section rooms          one section alone
+"""
+)
+@click.option(
+    "-o",
+    "--output",
+    "out",
+    required=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of captures, runs and tables; an existing one goes on.",
+)
+@click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
+@click.option(
+    "--captures",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of the real captures, by their names in the list; without it their sections say so.",
+)
+@click.option(
+    "--page",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Where the page goes; pictures lie in results/ beside it.  [default: OUT/results.md]",
+)
+@click.option("--section", "sections", multiple=True, metavar="NAME", help="Only this section (repeatable).")
+@click.option(
+    "--list",
+    "listed",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Another list of evidence (TOML) than the one that is frozen.",
+)
+@click.option("--dry-run", is_flag=True, help="Print the plan and make nothing.")
+@work_options
+@quiet_option
+@click.pass_obj
+def evidence(
+    dag: Dag,
+    out: Path,
+    quick: bool,
+    captures: Path | None,
+    page: Path | None,
+    sections: tuple[str, ...],
+    listed: Path | None,
+    dry_run: bool,
+    device: DeviceChoice,
+    threads: int | None,
+    quiet: bool,
+) -> int:
+    """Make the captures, scenes, tables and pictures of the page of results.
+
+    What is compared is listed in one frozen file, on whose captures no default is chosen. The same command
+    goes on where it stopped. What cannot be made (a capture that is not there, say) stands on the page with
+    the reason.
+    """
+    from cleargs.evaluate.comparison import Recipe
+    from cleargs.evaluate.evidence import Workshop, chosen_sections, make_section, minutes, read_evidence
+    from cleargs.files import write_bytes, write_json
+    from cleargs.report.origin import version_of_source
+    from cleargs.report.results_page import Origin, results_page
+
+    chosen = chosen_sections(read_evidence(listed), quick=quick, names=sections)
+    out = out.absolute()
+    page = (page or out / "results.md").absolute()
+    reporter = make_reporter(quiet)
+    options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
+    recipe = Recipe(dag, RECIPE, (), resolve_device(device), threads_or_all(threads), options)
+    found: list[Outcome] = []
+    with opened_store(out / STORE_FOLDER) as store:
+        shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)
+        plan = [(section, minutes(section, shop)) for section in chosen]
+        for section, cost in plan:
+            click.echo(f"{section.name:12} {cost:6.1f} min  {section.title}")
+        click.echo(f"{'in all':12} {sum(cost for _, cost in plan):6.1f} min  on two quiet cores")
+        if dry_run:
+            return 0
+        for section, _ in plan:
+            reporter.info(f"section {section.name}")
+            found.append(make_section(section, shop))
+            _write_pictures(found[-1], shop, page.parent / "results")
+            if found[-1].compared is not None:
+                write_json(out / f"{section.name}.json", found[-1].compared.document())
+    origin = Origin(
+        version=version_of_source(),
+        command=_command(quick=quick, captures=captures is not None, listed=listed is not None),
+        recipe=recipe.workflow,
+        quick=quick,
+        threads=recipe.threads,
+        device=recipe.device,
+    )
+    write_bytes(page, results_page(found, origin).encode())
+    click.echo(f"written: {page}")
+    return DONE_IN_PART if any(outcome.missing for outcome in found) else 0
+
+
+def _command(*, quick: bool, captures: bool, listed: bool) -> str:
+    """The command as a reader would type it: with words for the folders."""
+    words = [
+        "cleargs evidence -o OUT",
+        "--quick" * quick,
+        "--captures DIR" * captures,
+        "--list FILE" * listed,
+    ]
+    return " ".join(word for word in words if word)
+
+
+def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
+    from cleargs.evaluate.variants import WHOLE
+    from cleargs.report.comparison import comparison_sheet, plot_comparison
+
+    if found.compared is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    cells, labels = found.compared.results.cells, found.compared.labels
+    plot_comparison(folder / f"{found.section.name}.png", cells, labels)
+    shown = [name for name in (cells.variants()[0], "rva", WHOLE) if name in labels]
+    captures = {scene.sample.name: scene.sample.capture for scene in found.compared.scenes}
+    comparison_sheet(folder / f"{found.section.name}-sheet.jpg", shop.out, cells, labels, shown, captures)

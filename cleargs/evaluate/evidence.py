@@ -1,0 +1,288 @@
+"""The evidence for the method: what is compared on which captures, and how all of it is made.
+
+``evidence.toml`` lists the frozen test set and the sections of the page. Every section is a comparison like
+those of ``cleargs compare``, in one folder with one store, so that a killed call goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cleargs.errors import CleargsError, ConfigError, InputError
+from cleargs.evaluate.compared import Compared, compare_scenes
+from cleargs.evaluate.comparison import Recipe, Sample, make_scenes
+from cleargs.evaluate.variants import find_variants
+from cleargs.evaluate.work import steps_of, variant_config
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.runner import Runner
+from cleargs.pipeline.store import Store
+from cleargs.progress import Reporter
+from cleargs.synth.capture import make_capture
+
+WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ingest.max_frames=60")
+"""How a scene is trained that becomes a world: on every frame."""
+
+Seed = Annotated[int, Field(ge=0)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class TestSet(_Record):
+    """What no default may be chosen on."""
+
+    __test__ = False  # no test of pytest's
+
+    rooms: tuple[Seed, ...]
+    protocols: tuple[str, ...]
+    worlds: tuple[str, ...]
+    videos: tuple[str, ...]
+
+
+class TuningSet(_Record):
+    """What defaults may be chosen on."""
+
+    rooms_below: int = Field(ge=1)
+
+
+class Section(_Record):
+    """One comparison of the page."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9-]*$")
+    title: str
+    kind: Literal["rooms", "world", "video"]
+    captures: tuple[str, ...] = ()
+    """Real captures below the folder of captures: the worlds, or the videos."""
+    protocols: tuple[str, ...] = ()
+    seeds: tuple[Seed, ...] = Field(min_length=1)
+    frames: int = Field(ge=2)
+    size: tuple[int, int]
+    """Width and height; of a video the larger is the limit of its long side."""
+    steps: int = Field(ge=1)
+    factors: tuple[int, ...] = (1,)
+    """Multiples of ``steps``: a column each, where there are several."""
+    variants: tuple[str, ...]
+    settings: tuple[str, ...] = ()
+
+
+class Evidence(_Record):
+    """``evidence.toml``."""
+
+    test: TestSet
+    tuning: TuningSet
+    quick: tuple[Section, ...]
+    full: tuple[Section, ...]
+
+    @model_validator(mode="after")
+    def _sections_take_the_test_set(self) -> Evidence:
+        if min(self.test.rooms) < self.tuning.rooms_below:
+            raise ValueError("a room of the test set belongs to the tuning set")
+        for section in (*self.quick, *self.full):
+            known = set(self.test.worlds if section.kind == "world" else self.test.videos)
+            foreign = [
+                *(set(section.captures) - known),
+                *(set(section.protocols) - set(self.test.protocols)),
+                *(() if section.kind == "video" else set(section.seeds) - set(self.test.rooms)),
+            ]
+            if foreign:
+                raise ValueError(f"section {section.name}: {foreign[0]} is not in the test set")
+        return self
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture of a section, or why it cannot be made."""
+
+    name: str
+    """As the page calls it."""
+    samples: tuple[Sample, ...] = ()
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a section."""
+
+    section: Section
+    compared: Compared | None
+    """None where nothing of it could be made."""
+    missing: tuple[str, ...]
+    """What could not be made, and why, a line each."""
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """Where evidence is made, and with what."""
+
+    out: Path
+    captures: Path | None
+    """Folder of the real captures."""
+    recipe: Recipe
+    store: Store
+    reporter: Reporter
+
+
+def read_evidence(path: Path | None = None) -> Evidence:
+    """The lists of ``path``; those of the package for None. Raises ConfigError when they cannot be used."""
+    source = path or files("cleargs.evaluate") / "evidence.toml"
+    hint = "compare it with cleargs/evaluate/evidence.toml"
+    try:
+        return Evidence.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the list of evidence: {error}", hint=hint) from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ConfigError(f"list of evidence, {place}: {first['msg']}", hint=hint) from error
+
+
+def make_section(section: Section, shop: Workshop) -> Outcome:
+    """Make the captures of a section, all of its scenes, and judge them."""
+    missing, samples = [], []
+    for capture in _captures(section, shop):
+        if capture.missing:
+            shop.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
+            missing.append(f"{capture.name}: {capture.missing}")
+        samples += capture.samples
+    found = Compared()
+    for factor in section.factors if samples else ():
+        recipe = replace(
+            shop.recipe,
+            overrides=(*shop.recipe.overrides, *_settings(section)),
+            steps=section.steps * factor,
+        )
+        made = make_scenes(
+            shop.out, samples, find_variants(section.variants), recipe, shop.store, shop.reporter
+        )
+        try:
+            one = compare_scenes(shop.out, made, recipe, shop.store, shop.reporter)
+        except InputError as error:
+            missing.append(str(error))
+            continue
+        found.add(one if len(section.factors) == 1 else one.in_columns(f"{factor}x"))
+    return Outcome(section, found if found.cells else None, (*missing, *found.failures))
+
+
+def minutes(section: Section, shop: Workshop) -> float:
+    """Rough time of a section on two quiet cores, everything still to be made."""
+    megapixels = section.size[0] * section.size[1] / 1e6
+    samples = len(section.seeds) * max(1, len(section.protocols)) * max(1, len(section.captures))
+    seconds = 0.0
+    for factor in section.factors:
+        shared: set[tuple[str | None, tuple[str, ...]]] = set()
+        for variant in find_variants(section.variants):
+            try:
+                own = steps_of(variant_config(shop.recipe.dag, variant, shop.recipe.workflow, (), 0))
+            except ConfigError:  # its recipe is not there: it takes no time
+                continue
+            steps = float(section.steps * factor)
+            if variant.stage == "consolidate":
+                # Those that differ in RIVR alone share the first scene.
+                key = (variant.workflow, tuple(line for line in variant.overrides if line.startswith("rva")))
+                steps *= 1.0 - own.g0 / own.total if key in shared else 1.0
+                shared.add(key)
+            seconds += steps * (_STEP_S + _STEP_S_PER_MP * megapixels)
+            seconds += section.frames * (_JUDGE_S + _JUDGE_S_PER_MP * megapixels)
+            if variant.stage != "g0":
+                seconds += section.frames * own.rounds * (_REPAIR_S + _REPAIR_S_PER_MP * megapixels)
+    return samples * seconds / 60
+
+
+# Measured with `cleargs compare` on 12 frames at 240x136 and 16 at 480x270; wall seconds, two threads.
+_STEP_S, _STEP_S_PER_MP = 0.012, 0.25
+_JUDGE_S, _JUDGE_S_PER_MP = 0.05, 4.0
+_REPAIR_S, _REPAIR_S_PER_MP = 0.1, 6.0
+
+
+def _settings(section: Section) -> tuple[str, ...]:
+    """What holds for all variants of a section."""
+    limits = (f"ingest.max_frames={section.frames}", f"ingest.max_size={max(section.size)}")
+    return (*(limits if section.kind == "video" else ()), *section.settings)
+
+
+def _captures(section: Section, shop: Workshop) -> Iterator[Capture]:
+    """The captures of a section as soon as they are there."""
+    if section.kind == "video":
+        for name in section.captures:
+            try:
+                place = _real(name, shop)
+            except CleargsError as error:
+                yield Capture(name, missing=str(error))
+            else:
+                yield Capture(name, tuple(Sample(place, seed, None) for seed in section.seeds))
+        return
+    for world in section.captures if section.kind == "world" else (None,):
+        for protocol in section.protocols:
+            label = protocol if world is None else f"{world}, {protocol}"
+            try:
+                scene = None if world is None else _world(world, shop)
+                places = [_synthetic(section, protocol, seed, world, scene, shop) for seed in section.seeds]
+            except CleargsError as error:
+                yield Capture(label, missing=str(error))
+            else:
+                pairs = zip(places, section.seeds, strict=True)
+                yield Capture(label, tuple(Sample(place, seed, None) for place, seed in pairs))
+
+
+def _real(name: str, shop: Workshop) -> Path:
+    if shop.captures is None:
+        raise InputError("it is a real capture, and --captures was not given", hint="give --captures DIR")
+    if not (shop.captures / name).exists():
+        raise InputError(f"the folder of --captures holds no {name}", hint="put it there")
+    return shop.captures / name
+
+
+def _synthetic(
+    section: Section, protocol: str, seed: int, world: str | None, scene: Path | None, shop: Workshop
+) -> Path:
+    """The folder of a synthetic capture, made where it is not there yet."""
+    width, height = section.size
+    parts = [protocol, *([] if world is None else [world]), f"{section.frames}x{width}x{height}", str(seed)]
+    place = shop.out / "captures" / "-".join(parts)
+    if not place.is_dir():
+        beside = place.with_name(
+            f".{os.getpid()}-{place.name}"
+        )  # a killed maker leaves nothing that looks done
+        shutil.rmtree(beside, ignore_errors=True)
+        make_capture(
+            beside,
+            protocol,
+            frames=section.frames,
+            width=width,
+            height=height,
+            seed=seed,
+            reporter=shop.reporter,
+            scene=scene,
+        )
+        beside.rename(place)
+    return place
+
+
+def _world(name: str, shop: Workshop) -> Path:
+    """The scene of a real capture, trained on every frame where it is not there yet."""
+    recipe, folder = shop.recipe, shop.out / "worlds" / name
+    config = load_config(recipe.dag, recipe.workflow, WORLD_SETTINGS)
+    run = Run(folder, _real(name, shop).absolute(), config, shop.store.root, recipe.device)
+    Runner(recipe.dag, run, shop.store, recipe.threads, shop.reporter).run_until("g0")
+    return folder / "g0" / "scene.ply"
+
+
+def chosen_sections(evidence: Evidence, *, quick: bool, names: Sequence[str]) -> tuple[Section, ...]:
+    """The sections to make. Raises InputError for an unknown name."""
+    sections = evidence.quick if quick else evidence.full
+    known = [section.name for section in sections]
+    for name in names:
+        if name not in known:
+            raise InputError(f"there is no section {name!r}", hint=f"choose among {', '.join(known)}")
+    return tuple(section for section in sections if not names or section.name in names)

@@ -1,0 +1,246 @@
+"""The page of results: a template of words, and tables of what `cleargs evidence` found."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from cleargs.evaluate.cells import Cells, Spread, ViewSet
+from cleargs.evaluate.evidence import Outcome, Section
+from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.tables import (
+    COMPARED,
+    NAMES,
+    TITLES,
+    choices_table,
+    difference_text,
+    metric_title,
+    roles_table,
+    table,
+    value_texts,
+    work_table,
+)
+from cleargs.evaluate.variants import QUESTIONS, VARIANTS, WHOLE
+
+CONFIDENCE = "95 %"
+"""Of all intervals (`cleargs.evaluate.cells.student_t`)."""
+
+_ROUGH = "This is the rough page (`--quick`): small images, short trainings, few captures."
+
+
+@dataclass(frozen=True)
+class Origin:
+    """How a page was made."""
+
+    version: str
+    command: str
+    """Without the names of sections."""
+    recipe: str
+    quick: bool
+    threads: int
+    device: str
+
+    def made(self, section: Section | None = None) -> str:
+        """The line under a table."""
+        only = f" --section {section.name}" if section is not None else ""
+        return f"`{self.command}{only}`, version {self.version}"
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A cell in which the whole method is behind another variant."""
+
+    section: str
+    views: ViewSet
+    column: str
+    against: str
+    metric: str
+    difference: Spread
+
+    @property
+    def verdict(self) -> str:
+        if self.difference.half_width is None:
+            return "one sample"
+        return "sure" if self.difference.is_sure else "none"
+
+
+def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
+    """The whole page as Markdown; pictures are expected in ``results/`` beside it, by the sections' names."""
+    template = (files("cleargs.report") / "results.md").read_text(encoding="utf-8")
+    nets = {
+        metric for found in outcomes if found.compared for metric in found.compared.results.cells.metrics()
+    }
+    lacking = [NAMES[name] for name in ("lpips_alex", "lpips_vgg") if name not in nets]
+    warnings = [
+        "This is the rough page (`--quick`): small images, short trainings, few captures."
+    ] * origin.quick
+    if lacking:
+        warnings.append(f"{' and '.join(lacking)} could not be measured: `cleargs models install lpips`.")
+    values = {
+        "warning": "\n".join(f"**{warning}**" for warning in warnings),
+        "confidence": CONFIDENCE,
+        "losses": losses_table(outcomes),
+        "answers": answers_table(outcomes),
+        "recipe": origin.recipe,
+        "variants": "\n".join(_variant_rows()),
+        "made": origin.made(),
+        "machine": f"{origin.device}, {origin.threads} threads",
+        "sections": "\n\n".join(_section(found, origin) for found in outcomes),
+    }
+    return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
+
+
+def losses(outcomes: Sequence[Outcome]) -> list[Loss]:
+    """All cells in which the whole method is behind, those that are sure first."""
+    found = []
+    for outcome, cells, views, column in _columns(outcomes):
+        for variant in cells.variants():
+            for metric in COMPARED:
+                difference = cells.difference(views, column, WHOLE, variant, metric)
+                if variant != WHOLE and difference is not None and _behind(difference, metric):
+                    found.append(Loss(outcome.section.title, views, column, variant, metric, difference))
+    order = ("sure", "one sample", "none")
+    return sorted(found, key=lambda loss: order.index(loss.verdict))
+
+
+def losses_table(outcomes: Sequence[Outcome]) -> str:
+    """The losses, and of how many comparisons they are."""
+    found, labels = losses(outcomes), _labels()
+    compared = sum(
+        variant != WHOLE and cells.difference(views, column, WHOLE, variant, metric) is not None
+        for _, cells, views, column in _columns(outcomes)
+        for variant in cells.variants()
+        for metric in COMPARED
+    )
+    sure = sum(loss.verdict == "sure" for loss in found)
+    line = f"{len(found)} of {compared} comparisons, {sure} of them sure."
+    rows = [
+        [
+            loss.section,
+            loss.column,
+            TITLES[loss.views].split(",")[0],
+            labels[loss.against],
+            NAMES[loss.metric],
+            difference_text(loss.difference, None, loss.metric),
+            loss.verdict,
+        ]
+        for loss in found
+    ]
+    head = ["section", "column", "views", "behind", "metric", "difference", "verdict"]
+    return f"{line}\n\n{table(head, rows)}" if rows else line
+
+
+def answers_table(outcomes: Sequence[Outcome]) -> str:
+    """For each question and metric, in how many columns the answer is better, worse or none."""
+    rows = []
+    for question, variant, against in QUESTIONS:
+        row = [question]
+        for metric in COMPARED:
+            found = [
+                difference
+                for _, cells, views, column in _columns(outcomes)
+                if (difference := cells.difference(views, column, variant, against, metric)) is not None
+            ]
+            worse = sum(one.is_sure and _behind(one, metric) for one in found)
+            better = sum(one.is_sure for one in found) - worse
+            row.append(f"{better} / {worse} / {len(found) - better - worse}" if found else "not made")
+        rows.append(row)
+    return table(["better / worse / none", *(NAMES[metric] for metric in COMPARED)], rows)
+
+
+def questions_table(cells: Cells, views: ViewSet) -> str:
+    """The differences that answer the questions, a row a question and metric; empty without any."""
+    columns = cells.columns(views)
+    rows = []
+    for question, variant, against in QUESTIONS:
+        for metric in COMPARED:
+            found = [cells.difference(views, column, variant, against, metric) for column in columns]
+            if any(found):
+                bases = [cells.spread(views, column, against, metric) for column in columns]
+                texts = [difference_text(*pair, metric) for pair in zip(found, bases, strict=True)]
+                rows.append([question, NAMES[metric], *texts])
+    return table(["", "", *columns], rows) if rows else ""
+
+
+def values_table(cells: Cells, views: ViewSet) -> str:
+    """Means of all variants, a row a metric and variant; the best of a column and metric in bold."""
+    labels, columns, rows = _labels(), cells.columns(views), []
+    for metric in cells.metrics():
+        for variant in cells.variants():
+            texts = value_texts(cells, views, variant, metric)
+            rows.append([metric_title(metric), labels[variant], *texts])
+    return table(["", "", *columns], rows)
+
+
+def _columns(outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Cells, ViewSet, str]]:
+    """Every column of every set of views of every section."""
+    return [
+        (outcome, cells, views, column)
+        for outcome in outcomes
+        if outcome.compared is not None
+        for cells in [outcome.compared.results.cells]
+        for views in cells.view_sets()
+        for column in cells.columns(views)
+    ]
+
+
+def _behind(difference: Spread, metric: str) -> bool:
+    return difference.mean > 0 if metric in LOWER_IS_BETTER else difference.mean < 0
+
+
+def _labels() -> dict[str, str]:
+    return {variant.name: variant.label for variant in VARIANTS}
+
+
+def _variant_rows() -> list[str]:
+    rows = []
+    for variant in VARIANTS:
+        recipe = f"recipe `{variant.workflow}`" if variant.workflow else ""
+        changes = [recipe] * bool(recipe) + [f"`{line}`" for line in variant.overrides]
+        scene = f"the scene of `{variant.stage}`"
+        rows.append(f"| {variant.label} | {', '.join(changes) or 'nothing'}; {scene} |")
+    return rows
+
+
+def _section(found: Outcome, origin: Origin) -> str:
+    """Tables and pictures of a section, and what of it is missing."""
+    section, made = found.section, origin.made(found.section)
+    parts = [f"## {section.title}", _setting(section)]
+    if found.missing:
+        parts.append("Not made:\n\n" + "\n".join(f"* {line}" for line in found.missing))
+    if found.compared is None:
+        return "\n\n".join([*parts, f"Nothing of this section could be made ({made})."])
+    results, labels = found.compared.results, _labels()
+    cells = results.cells
+    for views in cells.view_sets():
+        parts += [f"### {TITLES[views]}", values_table(cells, views), made]
+        if questions := questions_table(cells, views):
+            parts += ["Differences:", questions, made]
+    parts += ["### Work", work_table(cells, labels), made]
+    parts += ["### Roles of the frames", roles_table(results.roles, labels), made]
+    if results.choices:
+        parts += ["### The choice against the truth", choices_table(results.choices, labels), made]
+    elif section.kind == "video":
+        parts.append("Whether RIVR chose well cannot be said here: the repaired frames have no truth.")
+    parts += [
+        f"![Differences, {section.title}](results/{section.name}.png)",
+        f"![Truth, input and scenes, {section.title}](results/{section.name}-sheet.jpg)",
+        made,
+    ]
+    return "\n\n".join(parts)
+
+
+def _setting(section: Section) -> str:
+    width, height = section.size
+    size = f"long side at most {max(section.size)} px" if section.kind == "video" else f"{width}x{height}"
+    steps = ", ".join(str(section.steps * factor) for factor in section.factors)
+    parts = [
+        f"{section.frames} frames, {size}",
+        f"seeds {', '.join(map(str, section.seeds))}",
+        f"{steps} steps",
+    ]
+    if section.settings:
+        parts.append(f"settings {', '.join(f'`{line}`' for line in section.settings)}")
+    return "; ".join(parts) + "."
