@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,8 +107,9 @@ def evidence(
         if dry_run:
             return 0
         for section, _ in plan:
-            reporter.info(f"section {section.name}")
+            started = time.monotonic()
             found.append(make_section(section, shop))
+            reporter.info(f"section {section.name}: {(time.monotonic() - started) / 60:.1f} min")
             _write_pictures(found[-1], shop, page.parent / "results")
             if found[-1].compared is not None:
                 write_json(out / f"{section.name}.json", found[-1].compared.document())

@@ -178,7 +178,7 @@ def minutes(section: Section, shop: Workshop) -> float:
     """Rough time of a section on two quiet cores, everything still to be made."""
     megapixels = section.size[0] * section.size[1] / 1e6
     samples = len(section.seeds) * max(1, len(section.protocols)) * max(1, len(section.captures))
-    seconds = 0.0
+    seconds = _SAMPLE_S
     for factor in section.factors:
         shared: set[tuple[str | None, tuple[str, ...]]] = set()
         for variant in find_variants(section.variants):
@@ -199,10 +199,13 @@ def minutes(section: Section, shop: Workshop) -> float:
     return samples * seconds / 60
 
 
-# Measured with `cleargs compare` on 12 frames at 240x136 and 16 at 480x270; wall seconds, two threads.
-_STEP_S, _STEP_S_PER_MP = 0.012, 0.25
-_JUDGE_S, _JUDGE_S_PER_MP = 0.05, 4.0
-_REPAIR_S, _REPAIR_S_PER_MP = 0.1, 6.0
+# Wall seconds on two quiet cores: a part a unit and a part a megapixel. A step: docs/speed.md (0.027 s at
+# 0.125 MP). A judged frame, views off the path included: nearly all of it LPIPS with VGG. A repair: as RIVR
+# estimates. A sample: its capture, poses and cues.
+_STEP_S, _STEP_S_PER_MP = 0.008, 0.16
+_JUDGE_S, _JUDGE_S_PER_MP = 0.05, 10.0
+_REPAIR_S, _REPAIR_S_PER_MP = 0.3, 5.0
+_SAMPLE_S = 8.0
 
 
 def _settings(section: Section) -> tuple[str, ...]:
