@@ -105,7 +105,8 @@ def work_table(cells: Cells, labels: Mapping[str, str]) -> str:
     rows = []
     for variant in cells.variants():
         # One cell a scene: the sets of views share all of this.
-        chosen = list({cell.sample: cell for cell in cells.cells if cell.variant == variant}.values())
+        own = [cell for cell in cells.cells if cell.variant == variant]
+        chosen = list({(cell.column, cell.sample): cell for cell in own}.values())
         rows.append(
             [
                 labels[variant],

@@ -1,0 +1,205 @@
+"""`cleargs evidence`: the frozen list, the page, and a tiny page made twice."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from cleargs.cli.main import invoke
+from cleargs.errors import ConfigError
+from cleargs.evaluate.cells import Cell
+from cleargs.evaluate.compared import Compared
+from cleargs.evaluate.evidence import Outcome, read_evidence
+from cleargs.evaluate.variants import QUESTIONS, VARIANTS, find_variants
+from cleargs.report.origin import version_of_source
+from cleargs.report.results_page import Origin, losses, results_page
+
+TINY = """
+[test]
+rooms = [100, 101]
+protocols = ["mixed", "flood"]
+worlds = []
+videos = ["kitchen"]
+
+[tuning]
+rooms_below = 100
+
+[[quick]]
+name = "rooms"
+title = "Rooms, by fault"
+kind = "rooms"
+protocols = ["mixed", "flood"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+factors = [1, 2]
+variants = ["all-view", "full"]
+settings = ["g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "rivr.rounds=1"]
+
+[[quick]]
+name = "videos"
+title = "Real videos"
+kind = "video"
+captures = ["kitchen"]
+seeds = [0]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view", "full"]
+
+[[full]]
+name = "rooms"
+title = "Rooms"
+kind = "rooms"
+protocols = ["mixed"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view"]
+"""
+ORIGIN = Origin("0.1.0, abc", "cleargs evidence -o OUT", "default", False, 2, "cpu")
+
+
+def test_the_test_set_is_no_tuning_set() -> None:
+    evidence = read_evidence()
+    assert min(evidence.test.rooms) >= evidence.tuning.rooms_below == 100
+    for section in (*evidence.quick, *evidence.full):
+        find_variants(section.variants)
+        if section.kind != "video":
+            assert set(section.seeds) <= set(evidence.test.rooms)
+    for sections in (evidence.quick, evidence.full):
+        assert len({section.name for section in sections}) == len(sections)
+        claiming = [
+            section for section in sections if "no-repairs" in section.variants and section.name == "rooms"
+        ]
+        assert all(len(section.seeds) >= 5 for section in claiming) and claiming
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "cause"),
+    [
+        ("rooms = [100, 101]", "rooms = [99, 100]", "tuning set"),
+        ("seeds = [100]", "seeds = [7]", "7 is not in the test set"),
+        ('captures = ["kitchen"]', 'captures = ["garden"]', "garden is not in the test set"),
+        ("frames = 6", "pictures = 6", "quick.0"),
+    ],
+)
+def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: str, tmp_path: Path) -> None:
+    path = tmp_path / "list.toml"
+    path.write_text(TINY.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=cause):
+        read_evidence(path)
+
+
+def test_prose_states_no_number() -> None:
+    template = (files("cleargs.report") / "results.md").read_text(encoding="utf-8")
+    # Digits within names (G0, 3DGS, gs2e-medium) are no numbers.
+    assert re.findall(r"(?<![\w.-])\d[\d.,]*(?![\w-])", template) == []
+
+
+def test_questions_ask_for_variants() -> None:
+    names = {variant.name for variant in VARIANTS}
+    assert {name for _, *asked in QUESTIONS for name in asked} <= names
+
+
+def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
+    return Cell(
+        column="mixed",
+        sample=sample,
+        variant=variant,
+        views="observed",
+        means={"psnr": psnr, "lpips_vgg": lpips},
+        images=4,
+        seconds=2.0,
+        shared_seconds=1.0,
+        gaussians=10,
+        steps=100,
+        sh_degree=1,
+        cpu_seconds=4.0,
+        peak_memory_gb=0.5,
+        evaluation="evaluations/x",
+    )
+
+
+def outcome(*gains: float) -> Outcome:
+    """The whole method gains so much PSNR in each sample, and always 0.1 of LPIPS."""
+    cells = []
+    for number, gain in enumerate(gains):
+        cells.append(cell("all-view", f"s{number}", 20.0 + number, 0.4))
+        cells.append(cell("full", f"s{number}", 20.0 + number + gain, 0.3 + 0.001 * number))
+    (section, *_) = read_evidence().quick
+    return Outcome(section, Compared(cells=cells), ("phone: no protocol is called 'phone'",))
+
+
+def test_losses_come_first_and_say_how_sure_they_are() -> None:
+    (sure,) = losses([outcome(-1.0, -1.1, -0.9)])
+    assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
+    (chance,) = losses([outcome(-1.0, 0.5, -0.2)])
+    assert chance.verdict == "none"
+    (single,) = losses([outcome(-1.0)])
+    assert single.verdict == "one sample"
+    assert losses([outcome(1.0, 1.1, 0.9)]) == []
+    ordered = [
+        loss.verdict for loss in losses([outcome(-1.0, 0.5), outcome(-1.0), outcome(-1.0, -1.1, -0.9)])
+    ]
+    assert ordered == ["sure", "one sample", "none"]
+
+
+def test_the_page_of_a_few_cells() -> None:
+    page = results_page([outcome(-1.0, -1.1, -0.9)], ORIGIN)
+    assert "1 of 2 comparisons, 1 of them sure." in page
+    row = "| Rooms, by fault | mixed | At the input's true poses | all-view G0 | PSNR | -1.00 ± 0.25 | sure |"
+    assert row in page
+    assert page.index(row) < page.index("## In short") < page.index("## Rooms, by fault")
+    assert (
+        "| the whole method, against all-view training | 0 / 1 / 0 | not made | not made | 1 / 0 / 0 |"
+        in page
+    )
+    assert "* phone: no protocol is called 'phone'" in page
+    assert "`cleargs evidence -o OUT --section rooms`, version 0.1.0, abc" in page
+    assert "LPIPS (AlexNet) could not be measured" in page
+    assert "@" not in page, "every place of the template is filled"
+
+
+def test_a_section_that_could_not_be_made_stands_on_the_page() -> None:
+    whole = outcome(1.0)
+    page = results_page([Outcome(whole.section, None, ("kitchen: it is not there",))], ORIGIN)
+    assert "* kitchen: it is not there" in page and "Nothing of this section could be made" in page
+
+
+def test_the_version_names_the_source() -> None:
+    assert re.search(r"source [0-9a-f]{12}$", version_of_source())
+    assert version_of_source() == version_of_source()
+
+
+def make(out: Path, spec: Path, *more: str) -> int:
+    return invoke(["evidence", "-o", str(out), "--quick", "--list", str(spec), "--quiet", *more])
+
+
+def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, out = tmp_path / "list.toml", tmp_path / "out"
+    spec.write_text(TINY)
+    assert make(out, spec, "--dry-run") == 0
+    assert "min  on two quiet cores" in capsys.readouterr().out and not (out / "captures").exists()
+    # A maker that was killed leaves a capture under another name, which is not taken for done.
+    (out / "captures" / ".1-mixed-6x96x54-100" / "images").mkdir(parents=True)
+    assert make(out, spec) == 3, "done in part: a protocol and a video are missing"
+    page = (out / "results.md").read_bytes()
+    text = page.decode()
+    assert "* flood: no protocol is called 'flood'" in text
+    assert "* kitchen: it is a real capture, and --captures was not given" in text
+    assert "| mixed 1x | mixed 2x |" in text
+    assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
+    for name in ("results/rooms.png", "results/rooms-sheet.jpg", "rooms.json"):
+        assert (out / name).stat().st_size > 0
+    stored = {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
+    assert make(out, spec) == 3
+    assert stored == {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
+    assert (out / "results.md").read_bytes() == page
