@@ -97,7 +97,16 @@ def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, ba
                 difference = cells.difference(views, column, variant, baseline, metric)
                 row.append(difference_text(difference, cells.spread(views, column, baseline, metric), metric))
             rows.append(row)
-    return table(["", "", *columns], rows)
+    return table(["", "", *counted(cells, views)], rows)
+
+
+def counted(cells: Cells, views: ViewSet) -> list[str]:
+    """The columns with their numbers of samples, over which differences are taken."""
+    found = []
+    for column in cells.columns(views):
+        samples = {cell.sample for cell in cells.cells if (cell.views, cell.column) == (views, column)}
+        found.append(f"{column} (n = {len(samples)})")
+    return found
 
 
 def work_table(cells: Cells, labels: Mapping[str, str]) -> str:

@@ -15,6 +15,7 @@ from cleargs.evaluate.tables import (
     NAMES,
     TITLES,
     choices_table,
+    counted,
     difference_text,
     metric_title,
     roles_table,
@@ -116,20 +117,14 @@ def losses_table(outcomes: Sequence[Outcome]) -> str:
     )
     sure = sum(loss.verdict == "sure" for loss in found)
     line = f"{len(found)} of {compared} comparisons, {sure} of them sure."
-    rows = [
-        [
-            loss.section,
-            loss.column,
-            TITLES[loss.views].split(",")[0],
-            labels[loss.against],
-            NAMES[loss.metric],
-            difference_text(loss.difference, None, loss.metric),
-            loss.verdict,
-        ]
-        for loss in found
-    ]
-    head = ["section", "column", "views", "behind", "metric", "difference", "verdict"]
-    return f"{line}\n\n{table(head, rows)}" if rows else line
+    rows: dict[tuple[str, str, str, str], list[str]] = {}
+    for loss in found:
+        place = (loss.section, loss.column, TITLES[loss.views].split(",")[0], labels[loss.against])
+        text = difference_text(loss.difference, None, loss.metric)
+        cells = rows.setdefault(place, [""] * len(COMPARED))
+        cells[COMPARED.index(loss.metric)] = f"**{text}**" if loss.verdict == "sure" else text
+    head = ["section", "column", "views", "behind", *(NAMES[metric] for metric in COMPARED)]
+    return f"{line}\n\n{table(head, [[*place, *cells] for place, cells in rows.items()])}" if rows else line
 
 
 def answers_table(outcomes: Sequence[Outcome]) -> str:
@@ -161,7 +156,7 @@ def questions_table(cells: Cells, views: ViewSet) -> str:
                 bases = [cells.spread(views, column, against, metric) for column in columns]
                 texts = [difference_text(*pair, metric) for pair in zip(found, bases, strict=True)]
                 rows.append([question, NAMES[metric], *texts])
-    return table(["", "", *columns], rows) if rows else ""
+    return table(["", "", *counted(cells, views)], rows) if rows else ""
 
 
 def values_table(cells: Cells, views: ViewSet) -> str:

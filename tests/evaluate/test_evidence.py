@@ -153,7 +153,7 @@ def test_losses_come_first_and_say_how_sure_they_are() -> None:
 def test_the_page_of_a_few_cells() -> None:
     page = results_page([outcome(-1.0, -1.1, -0.9)], ORIGIN)
     assert "1 of 2 comparisons, 1 of them sure." in page
-    row = "| Rooms, by fault | mixed | At the input's true poses | all-view G0 | PSNR | -1.00 ± 0.25 | sure |"
+    row = "| Rooms, by fault | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
     assert row in page
     assert page.index(row) < page.index("## In short") < page.index("## Rooms, by fault")
     assert (
@@ -163,6 +163,7 @@ def test_the_page_of_a_few_cells() -> None:
     assert "* phone: no protocol is called 'phone'" in page
     assert "`cleargs evidence -o OUT --section rooms`, version 0.1.0, abc" in page
     assert "LPIPS (AlexNet) could not be measured" in page
+    assert "| mixed (n = 3) |" in page
     assert "@" not in page, "every place of the template is filled"
 
 
