@@ -149,7 +149,8 @@ def read_evidence(path: Path | None = None) -> Evidence:
 
 def make_section(section: Section, shop: Workshop) -> Outcome:
     """Make the captures of a section, all of its scenes, and judge them."""
-    missing, samples = [], []
+    missing: list[str] = []
+    samples: list[Sample] = []
     for capture in _captures(section, shop):
         if capture.missing:
             shop.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
