@@ -362,7 +362,9 @@ class RoomWorld:
         """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
         return self._expose(shutter, lens, aperture, self.room.primitives, _AT_REST)[0]
 
-    def film(self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture) -> tuple[Array, Array]:
+    def film(
+        self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
+    ) -> tuple[Array, Array]:
         """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
         [H, W] of the exposure in which a pixel sees it."""
         times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
