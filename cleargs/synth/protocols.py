@@ -70,7 +70,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "phone": Protocol(
         "a phone's video: its processing, auto exposure, H.264, something that moves, blurred stretches",
         shutter=1 / 6,
-        skew=8,
+        skew=4,
         stretched=True,
         phone=True,
     ),
