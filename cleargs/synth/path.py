@@ -28,7 +28,7 @@ SWING_RADIANS = (0.035, 0.085)
 FRAMES_A_STRETCH = 32
 STRETCH_SHARE = 0.375
 """Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaken."""
-SHAKING = 8.0
+SHAKING = 12.0
 """How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
 STRETCH_EDGE = 1 / FPS
 """Seconds over which the shaking comes and goes."""

@@ -61,7 +61,7 @@ class Look:
         red, blue = LUMA["bt709"]
         luma = image @ np.array([red, 1 - red - blue, blue])
         detail = luma - cv2.GaussianBlur(luma, (0, 0), SHARPENING_SIGMA)
-        return np.clip(image + self.sharpening * detail[..., None], 0, 1)
+        return np.asarray(np.clip(image + self.sharpening * detail[..., None], 0, 1), np.float64)
 
 
 PLAIN = Look()
@@ -88,7 +88,7 @@ def auto_exposure(luminances: Array, step: float) -> Array:  # [F] of `metered`,
     gains = asked.copy()
     for number in range(1, len(asked)):
         gains[number] = asked[number] + (gains[number - 1] - asked[number]) * math.exp(-step / LAG)
-    return gains - gains.mean()
+    return np.asarray(gains - gains.mean(), np.float64)
 
 
 def coded(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> list[NDArray[np.uint8]]:

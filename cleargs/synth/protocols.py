@@ -60,7 +60,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "gs2e-medium": Protocol("motion blur of 12 px on average", blur=12),
     "gs2e-severe": Protocol("motion blur of 20 px on average", blur=20),
     "gs2e-stretches": Protocol(
-        "motion blur of 10 px on average, most of it in stretches in one piece", blur=10, stretched=True
+        "motion blur of 14 px on average, most of it in stretches in one piece", blur=14, stretched=True
     ),
     "gsotm-mb": Protocol("motion blur of 8 px on average", blur=8),
     "gsotm-rs": Protocol("rolling shutter, 12 px of skew on average", skew=12),
