@@ -18,6 +18,9 @@ from cleargs.media.colour import LUMA
 _BT709, _LIMITED = 1, 1
 _CRF = "12"
 """x264's constant rate factor: no visible loss."""
+_AS_IT_COMES = "threads=1:mbtree=0:rc-lookahead=0:bframes=0"
+"""Each frame is coded as it comes, as a phone does. With look-ahead at a held rate x264 gave other bytes from
+call to call, one thread or not."""
 
 
 def require_even(width: int, height: int) -> None:
@@ -50,7 +53,7 @@ def write_video(
             options["crf"] = _CRF
         else:
             bits = str(round(bits_per_pixel * width * height * fps))
-            options |= {"b": bits, "maxrate": bits, "bufsize": bits, "threads": "1"}
+            options |= {"b": bits, "maxrate": bits, "bufsize": bits, "x264-params": _AS_IT_COMES}
         stream = container.add_stream("libx264", rate=rate, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
