@@ -12,7 +12,8 @@ from cleargs.cli.common import json_option, print_json
 from cleargs.cli.progress import make_reporter
 
 PROTOCOL_HELP = (
-    "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gsotm-mb, gsotm-rs, gsotm-mb-rs, gsotm-pn."
+    "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
+    "gsotm-mb-rs, gsotm-pn, phone."
 )
 
 

@@ -18,6 +18,9 @@ from cleargs.media.colour import LUMA
 _BT709, _LIMITED = 1, 1
 _CRF = "12"
 """x264's constant rate factor: no visible loss."""
+_AS_IT_COMES = "threads=1:mbtree=0:rc-lookahead=0:bframes=0"
+"""Each frame is coded as it comes, as a phone does. With look-ahead at a held rate x264 gave other bytes from
+call to call, one thread or not."""
 
 
 def require_even(width: int, height: int) -> None:
@@ -28,8 +31,16 @@ def require_even(width: int, height: int) -> None:
         )
 
 
-def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:  # [H, W, 3] sRGB each
+def write_video(
+    path: Path,
+    frames: Sequence[NDArray[np.uint8]],  # [H, W, 3] sRGB each
+    fps: float,
+    bits_per_pixel: float | None = None,
+) -> None:
     """Write ``frames`` as an MP4: H.264, 4:2:0, BT.709, limited range, ``fps`` frames a second.
+
+    Without visible loss, or at ``bits_per_pixel`` bits a pixel of each frame, held over a second, by one
+    thread, so that equal frames give equal bytes.
 
     Raises InputError like `require_even`, StoreError when the disk is full or not writable.
     """
@@ -37,7 +48,13 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> 
     require_even(width, height)
     rate = Fraction(fps).limit_denominator(1001)
     with atomic_path(path) as temporary, av.open(temporary, "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": _CRF, "preset": "medium"})
+        options = {"preset": "medium"}
+        if bits_per_pixel is None:
+            options["crf"] = _CRF
+        else:
+            bits = str(round(bits_per_pixel * width * height * fps))
+            options |= {"b": bits, "maxrate": bits, "bufsize": bits, "x264-params": _AS_IT_COMES}
+        stream = container.add_stream("libx264", rate=rate, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = _BT709

@@ -62,7 +62,7 @@ class FrameMotion:
         index = row[None] + stride * np.arange(samples)[:, None]
         ticks, place = np.unique(index, return_inverse=True)
         times = self.time + (ticks - stride * (samples - 1) / 2) * tick
-        return Shutter(self.path.poses(times), place.reshape(index.shape))
+        return Shutter(self.path.poses(times), place.reshape(index.shape), times)
 
     def _lengths(self, exposure: float) -> Array:
         times = self.time + exposure * np.linspace(-0.5, 0.5, INSTANTS)

@@ -25,6 +25,13 @@ TREMOR_RADIANS = 0.005
 FRAMES_A_SWING = 4.0
 SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
+FRAMES_A_STRETCH = 32
+STRETCH_SHARE = 0.375
+"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaken."""
+SHAKING = 12.0
+"""How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
+STRETCH_EDGE = 1 / FPS
+"""Seconds over which the shaking comes and goes."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,7 @@ class Hand:
     amplitudes: Array  # [harmonics, 3] radians
     swing_times: Array  # [swings] seconds
     swing_turns: Array  # [swings, 3] radians
+    stretches: Array  # [stretches, 2] seconds from and to which the hand shakes
 
     def turns(self, times: Array) -> Array:  # [T]
         """Rotation vectors [T, 3]."""
@@ -45,11 +53,24 @@ class Hand:
         # Out to one side, through the middle at full speed, back from the other: 1 at the extremes.
         share = (times[:, None] - self.swing_times) / SWING_SECONDS
         swings = share * np.exp((1 - share**2) / 2)
+        if len(self.stretches):
+            shaken = self.shaken(times)[:, None]
+            tremor, swings = tremor * (1 + (SHAKING - 1) * shaken), swings * shaken
         return np.asarray(tremor + swings @ self.swing_turns, np.float64)
 
+    def shaken(self, times: Array) -> Array:  # [T] seconds
+        """1 [T] within a stretch, 0 outside."""
+        start, end = self.stretches.T
+        inside = np.minimum(times[:, None] - start, end - times[:, None])
+        share = np.clip(inside / STRETCH_EDGE + 0.5, 0, 1)
+        return np.asarray((share**2 * (3 - 2 * share)).sum(1))
 
-def make_hand(duration: float, seed: int) -> Hand:
-    """A hand whose tremor has the same speed in each band from 1 to 12 Hz, and swings every few frames."""
+
+def make_hand(duration: float, seed: int, *, stretched: bool = False) -> Hand:
+    """A hand whose tremor has the same speed in each band from 1 to 12 Hz, and swings every few frames.
+
+    ``stretched``: and that shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
+    """
     rng = np.random.default_rng([seed, 12])
     frequencies = np.geomspace(*TREMOR_HZ, 12)[:, None] * rng.uniform(0.92, 1.0, (12, 3))
     amplitudes = 1 / frequencies
@@ -59,7 +80,15 @@ def make_hand(duration: float, seed: int) -> Hand:
     direction = rng.uniform(0, 2 * np.pi, count)
     axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
     turns = rng.uniform(*SWING_RADIANS, (count, 1)) * axes
-    return Hand(frequencies, rng.uniform(0, 2 * np.pi, (12, 3)), amplitudes, times, turns)
+    stretches = _stretches(duration, seed) if stretched else np.empty((0, 2))
+    return Hand(frequencies, rng.uniform(0, 2 * np.pi, (12, 3)), amplitudes, times, turns, stretches)
+
+
+def _stretches(duration: float, seed: int) -> Array:
+    count = max(1, round(duration * FPS / FRAMES_A_STRETCH))
+    free = np.random.default_rng([seed, 19]).uniform(0, 1 - STRETCH_SHARE, count)
+    starts = np.arange(count) + free
+    return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
 
 
 @dataclass(frozen=True)
@@ -87,11 +116,12 @@ class HandheldPath:
         return np.asarray(share + PAUSE / turn * wave, np.float64)
 
 
-def make_path(course: Course, frames: int, seed: int) -> HandheldPath:
-    """The walk of ``seed`` along ``course`` that takes ``frames`` frames at `FPS`."""
+def make_path(course: Course, frames: int, seed: int, *, stretched: bool = False) -> HandheldPath:
+    """The walk of ``seed`` along ``course`` that takes ``frames`` frames at `FPS`; see `make_hand`."""
     rng = np.random.default_rng([seed, 16])
     duration, pauses = frames / FPS, max(1, round(frames / FRAMES_A_PAUSE))
-    return HandheldPath(course, make_hand(duration, seed), duration, pauses, rng.uniform(0, 2 * np.pi))
+    hand = make_hand(duration, seed, stretched=stretched)
+    return HandheldPath(course, hand, duration, pauses, rng.uniform(0, 2 * np.pi))
 
 
 def frame_times(frames: int) -> Array:

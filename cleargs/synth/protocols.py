@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.synth import phone
 from cleargs.synth.motion import FrameMotion, duration_for
+from cleargs.synth.path import FPS
+from cleargs.synth.phone import auto_exposure
 
 REFERENCE_WIDTH = 640
 """Lengths in pixels are stated at this image width."""
@@ -24,12 +27,14 @@ class Protocol:
     """One way to spoil a capture. Lengths in pixels at `REFERENCE_WIDTH`.
 
     One exposure and one readout time serve the whole capture, chosen so that the means over its frames are
-    as stated; how they vary from frame to frame is the walk's doing.
+    as stated; how they vary from frame to frame is the walk's doing. ``shutter`` states the exposure itself.
     """
 
     summary: str
     blur: float = 0.0
     """Mean over the frames of the mean length of the motion path in the image; 0 for instants."""
+    shutter: float = 0.0
+    """Share of the time from frame to frame that the shutter is open for a row, in place of ``blur``."""
     skew: float = 0.0
     """Mean over the frames of the mean displacement between first and last row's pose; 0: global shutter."""
     rotation_noise: float = 0.0
@@ -40,6 +45,10 @@ class Protocol:
     """Faults by frame instead: see `_mixed`."""
     jpeg: int | None = None
     """JPEG quality; None for lossless PNG."""
+    stretched: bool = False
+    """Whether the hand shakes for stretches in one piece: see `cleargs.synth.path`."""
+    phone: bool = False
+    """Whether a phone processes the frames and something moves in the room: see `cleargs.synth.phone`."""
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -50,10 +59,21 @@ PROTOCOLS: dict[str, Protocol] = {
     "gs2e-slight": Protocol("motion blur of 6 px on average", blur=6),
     "gs2e-medium": Protocol("motion blur of 12 px on average", blur=12),
     "gs2e-severe": Protocol("motion blur of 20 px on average", blur=20),
+    "gs2e-stretches": Protocol(
+        "motion blur of 14 px on average, most of it in stretches in one piece", blur=14, stretched=True
+    ),
     "gsotm-mb": Protocol("motion blur of 8 px on average", blur=8),
     "gsotm-rs": Protocol("rolling shutter, 12 px of skew on average", skew=12),
     "gsotm-mb-rs": Protocol("motion blur of 8 px and rolling shutter of 12 px", blur=8, skew=12),
     "gsotm-pn": Protocol("sharp, with noise on the given poses", rotation_noise=0.4, translation_noise=0.005),
+    # Every fifth frame of a video of 30 a second whose shutter is open for 5/6 of the time.
+    "phone": Protocol(
+        "a phone's video: its processing, auto exposure, H.264, something that moves, blurred stretches",
+        shutter=1 / 6,
+        skew=4,
+        stretched=True,
+        phone=True,
+    ),
 }
 
 
@@ -80,18 +100,23 @@ class Fault:
     """Deviation of the sensor noise at mid grey, sRGB units."""
 
 
-def plan(protocol: Protocol, motions: Sequence[FrameMotion], seed: int) -> list[Fault]:
-    """The fault of each frame of a walk."""
+def plan(
+    protocol: Protocol, motions: Sequence[FrameMotion], luminances: Sequence[float], seed: int
+) -> list[Fault]:
+    """The fault of each frame of a walk; ``luminances`` is what each frame's meter sees, in linear light."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
     if protocol.mixed:
         return _mixed(motions, scale, np.random.default_rng([seed, 13]))
-    exposure = duration_for(
+    exposure = protocol.shutter / FPS or duration_for(
         protocol.blur * scale, lambda time: float(np.mean([motion.blur(time) for motion in motions]))
     )
     readout = duration_for(
         protocol.skew * scale, lambda time: float(np.mean([motion.skew(time) for motion in motions]))
     )
-    return [Fault(exposure, readout)] * len(motions)
+    if not protocol.phone:
+        return [Fault(exposure, readout)] * len(motions)
+    gains = auto_exposure(np.array(luminances), 1 / FPS)
+    return [Fault(exposure, readout, stops=float(stops), noise=phone.NOISE) for stops in gains]
 
 
 def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generator) -> list[Fault]:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from cleargs.synth.room import BOX, SPHERE, Room
+from cleargs.synth.room import BOX, SPHERE, Balloon, Room
 from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
 from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
 
@@ -24,6 +24,7 @@ LAMP = 1.9
 PENUMBRA, CONTACT = 0.1, 0.015
 """Half width of a shadow's soft rim: a share of the distance to what casts it, and metres."""
 OCCLUSION = 0.8
+_AT_REST = np.empty((0, 0, 3))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -240,8 +241,8 @@ def _trace(
     light: Array,
     colour: Array,
     scratch: Array,  # [10, 3], so that a ray allocates nothing
-) -> float:
-    """Radiance along one ray into ``colour``; returns the distance."""
+) -> tuple[float, int]:
+    """Radiance along one ray into ``colour``; returns the distance and the number of what it hits."""
     best, hit = MISS, 0
     normal, best_normal, local_point, local_ray = scratch[0], scratch[1], scratch[2], scratch[3]
     for number in range(primitives.shape[0]):
@@ -293,7 +294,7 @@ def _trace(
         highlight = 0.6 * item["gloss"] * lit * max(facing_half / math.sqrt(norm), 0.0) ** 40
     for channel in range(3):
         colour[channel] = colour[channel] * (AMBIENT * ambient + diffuse) + highlight
-    return best
+    return best, hit
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -311,11 +312,15 @@ def _render(
     offsets: NDArray[np.int64],
     stride: int,
     light: Array,
+    track: Array,  # [S, H, 3] where the last primitive is; [0, 0, 3]: where it says itself
     image: Array,
     depth: Array,
+    share: Array,  # of the samples that see the last primitive
 ) -> None:
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
+    last = primitives.shape[0] - 1
     for row in prange(height):
+        items = primitives.copy() if track.shape[0] else primitives
         origin, ray, colour, start, scratch = (
             np.zeros(3),
             np.zeros(3),
@@ -326,6 +331,9 @@ def _render(
         for column in range(width):
             for number in range(passes):
                 pose = poses[number, row]
+                if track.shape[0]:
+                    for axis in range(3):
+                        items[last]["centre"][axis] = track[number, row, axis]
                 start[0] = ((column + jitter[number, 0] - cx) / fx) * focus - lens[number, 0]
                 start[1] = ((row + jitter[number, 1] - cy) / fy) * focus - lens[number, 1]
                 start[2] = focus
@@ -334,9 +342,11 @@ def _render(
                     ray[axis] = _dot(pose[axis], start) / norm
                     on_lens = pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
                     origin[axis] = pose[axis, 3] + on_lens
-                distance = _trace(
-                    origin, ray, 1 / fx, primitives, texels, offsets, stride, light, colour, scratch
+                distance, hit = _trace(
+                    origin, ray, 1 / fx, items, texels, offsets, stride, light, colour, scratch
                 )
+                if hit == last:
+                    share[row, column] += 1 / passes
                 depth[row, column] += distance * focus / norm / passes
                 for channel in range(3):
                     image[row, column, channel] += colour[channel] / passes
@@ -350,24 +360,54 @@ class RoomWorld:
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
         """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
-        points = np.broadcast_to(aperture.points, (shutter.samples, 2))
-        return self._cast(
-            shutter.poses[shutter.index], low_discrepancy(shutter.samples), points, aperture.focus, lens
-        )[0]
+        return self._expose(shutter, lens, aperture, self.room.primitives, _AT_REST)[0]
+
+    def film(
+        self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
+    ) -> tuple[Array, Array]:
+        """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
+        [H, W] of the exposure in which a pixel sees it."""
+        times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
+        primitives = np.append(self.room.primitives, balloon.item)
+        image, _, share = self._expose(shutter, lens, aperture, primitives, balloon.centres(times))
+        return image, share
 
     def depth(self, pose: Array, lens: Lens) -> Array:
         """Exact depth through the pixel centres."""
         poses = np.broadcast_to(pose, (1, lens.height, 3, 4))
-        return self._cast(poses, np.full((1, 2), 0.5), np.zeros((1, 2)), 1.0, lens)[1]
+        middle, centre = np.full((1, 2), 0.5), np.zeros((1, 2))
+        return self._cast(poses, middle, centre, 1.0, lens, self.room.primitives, _AT_REST)[1]
+
+    def _expose(
+        self,
+        shutter: Shutter,
+        lens: Lens,
+        aperture: Aperture,
+        primitives: NDArray[np.void],
+        track: Array,
+    ) -> tuple[Array, Array, Array]:
+        points = np.broadcast_to(aperture.points, (shutter.samples, 2))
+        jitter, poses = low_discrepancy(shutter.samples), shutter.poses[shutter.index]
+        return self._cast(poses, jitter, points, aperture.focus, lens, primitives, track)
 
     def _cast(
-        self, poses: Array, jitter: Array, points: Array, focus: float, lens: Lens
-    ) -> tuple[Array, Array]:
-        image, depth = np.zeros((lens.height, lens.width, 3)), np.zeros((lens.height, lens.width))
+        self,
+        poses: Array,
+        jitter: Array,
+        points: Array,
+        focus: float,
+        lens: Lens,
+        primitives: NDArray[np.void],
+        track: Array,
+    ) -> tuple[Array, Array, Array]:
+        """Image, depth, and share of the samples that see the last of ``primitives``; see `_render`."""
+        size = lens.height, lens.width
+        image, depth, share = np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
         textures = self.room.textures
         _render(
             np.ascontiguousarray(poses), jitter, np.ascontiguousarray(points), focus,
-            lens.fx, lens.fy, lens.cx, lens.cy, self.room.primitives,
-            textures.texels, textures.level_offsets, textures.stride, self.room.light, image, depth,
+            lens.fx, lens.fy, lens.cx, lens.cy, primitives,
+            textures.texels, textures.level_offsets, textures.stride, self.room.light, track,
+            image, depth, share,
         )  # fmt: skip
-        return image, depth
+        return image, depth, share

@@ -14,6 +14,7 @@ from OpenImageIO import FLOAT, ImageOutput, ImageSpec
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path, write_bytes, write_json
 from cleargs.media.colour import srgb_from_linear
+from cleargs.synth.phone import PLAIN, Look
 from cleargs.synth.world import Array, Lens
 from cleargs.tables import column
 
@@ -31,15 +32,27 @@ FRAMES = pa.schema(
         ),
         column("exposure_s", pa.float64(), "time that the shutter is open for a row, seconds; 0: an instant"),
         column("readout_s", pa.float64(), "time from first to last row, seconds; 0: global shutter"),
+        column("shutter_share", pa.float64(), "exposure_s over the time from frame to frame"),
+        column("tone_contrast", pa.float64(), "contrast of the tone curve, as in phone.Look; 0: none"),
+        column("tone_pivot", pa.float64(), "its pivot, sRGB in [0, 1]"),
+        column("sharpening", pa.float64(), "share of the fine detail that is added; 0: none"),
+        column("codec_bits_per_pixel", pa.float64(), "stated rate of the H.264 coding; 0: not coded"),
+        column("moving_share", pa.float64(), "share of the pixels that see what moves; 0: nothing does"),
     ]
 )
 """``truth/frames.parquet``; pixels are those of the capture's own images."""
 
 
 def develop(
-    image: Array, *, stops: float = 0.0, noise: float = 0.0, rng: np.random.Generator | None = None
+    image: Array,
+    *,
+    stops: float = 0.0,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+    look: Look = PLAIN,
 ) -> NDArray[np.uint8]:
-    """Exposure error, sensor noise, clipping, sRGB encoding, 8 bits: RGB [H, W, 3] from linear light.
+    """Exposure error, sensor noise, clipping, sRGB encoding, the camera's look, 8 bits: RGB [H, W, 3] from
+    linear light.
 
     The noise is signal-dependent: ``noise`` is its deviation in sRGB units at mid grey of a frame exposed
     by ``stops``, of whose square 70 % is shot noise and the rest is read noise.
@@ -49,7 +62,7 @@ def develop(
         mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: carries the stated deviation into linear light
         shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
         image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
-    return np.asarray(np.rint(srgb_from_linear(np.clip(image, 0, 1)) * 255), np.uint8)
+    return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
 
 
 def write_image(path: Path, image: NDArray[np.uint8], jpeg: int | None = None) -> None:

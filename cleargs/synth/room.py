@@ -1,4 +1,6 @@
-"""A procedural room: textured walls and floor, posters, boxes for furniture, spheres and thin rods."""
+"""A procedural room: textured walls and floor, posters, boxes for furniture, spheres and thin rods; and a
+balloon that may drift through it.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +38,21 @@ class Room:
     textures: TextureSet
     light: NDArray[np.float64]  # [3] position of the lamp
     focus: NDArray[np.float64]  # [3] what a visitor looks at
+
+
+@dataclass(frozen=True)
+class Balloon:
+    """A ball that drifts to and fro above the table: it touches nothing."""
+
+    item: NDArray[np.void]  # of PRIMITIVE, at rest
+    sway: NDArray[np.float64]  # [3] metres
+    rates: NDArray[np.float64]  # [3] radians a second
+    phases: NDArray[np.float64]  # [3]
+
+    def centres(self, times: NDArray[np.float64]) -> NDArray[np.float64]:  # [...] seconds
+        """Metres [..., 3]."""
+        waves = np.sin(self.rates * times[..., None] + self.phases)
+        return np.asarray(self.item["centre"] + self.sway * waves, np.float64)
 
 
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
@@ -118,3 +135,12 @@ def make_room(seed: int) -> Room:
 
     light = np.array([rng.uniform(-1.2, 1.2), HEIGHT - 0.3, rng.uniform(0.2, 1.2)])
     return Room(np.array(items, PRIMITIVE), textures, light, np.array([table[0], 0.95, table[2] - 0.3]))
+
+
+def make_balloon(room: Room, seed: int) -> Balloon:
+    """The balloon of ``seed``: it crosses the view from side to side in two or three seconds."""
+    rng = np.random.default_rng([seed, 20])
+    centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
+    item = _primitive(SPHERE, centre, (0.11, 0, 0), SURFACES + int(rng.integers(PRINTS)), gloss=0.5)
+    rates = 2 * np.pi / rng.uniform(4, 6, 3)
+    return Balloon(item, np.array([0.75, 0.08, 0.2]), rates, rng.uniform(0, 2 * np.pi, 3))

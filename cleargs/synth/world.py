@@ -54,6 +54,7 @@ class Shutter:
 
     poses: Array  # [T, 3, 4] in the order of time
     index: NDArray[np.intp]  # [S, H] into poses
+    times: Array = field(default_factory=lambda: np.zeros(1))  # [T or 1] seconds: for what moves by itself
 
     @property
     def samples(self) -> int:

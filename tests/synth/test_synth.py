@@ -106,7 +106,10 @@ def test_the_true_means_are_those_of_the_protocol(captures: dict[str, Path], nam
         assert sum(abs(row["exposure_ev"]) > 1.1 for row in rows) == 1
         return
     # The solver stops at 1e-7 s, at walking speed far below a thousandth of a pixel.
-    assert np.mean(blur) == pytest.approx(protocol.blur * scale, abs=1e-3)
+    if protocol.shutter:
+        assert {row["shutter_share"] for row in rows} == {pytest.approx(protocol.shutter)}
+    else:
+        assert np.mean(blur) == pytest.approx(protocol.blur * scale, abs=1e-3)
     assert np.mean(skew) == pytest.approx(protocol.skew * scale, abs=1e-3)
     if protocol.blur:  # one exposure for all: the walk alone makes frames differ
         assert len({row["exposure_s"] for row in rows}) == 1
