@@ -27,8 +27,8 @@ def information(image: Image) -> float:
 
     Each block of 16 px counts by its values that are not clipped, in full from one half on, and by its
     contrast, in full from 3/4 of an 8-bit step of standard deviation on. All limits are ramps, so the
-    share changes continuously with the image. It is 1 for nearly every ordinary frame (see
-    ``weights/README.md``).
+    share changes continuously with the image. It is close to 1 for
+    ordinary frames (``weights/README.md`` has figures).
     """
     blocks = _blocks(image)
     to_the_end = np.minimum(blocks, 1.0 - blocks) * (_STEPS / _CLIPPED)

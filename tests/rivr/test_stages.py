@@ -186,7 +186,7 @@ def keeping(**changes: Any) -> Any:
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sharp frames of the capture are kept, and supervise as raw frames alone; blurred ones get repairs."""
+    """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     context = capture.context("rivr", keeping())
     result = rivr.run(context)
