@@ -75,7 +75,13 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
     from cleargs.rivr.supervision import load_supervision
-    from cleargs.rivr.tables import latest_accepted, read_selection, write_repairs
+    from cleargs.rivr.tables import (
+        kept_raw,
+        latest_accepted,
+        read_selection,
+        repaired_share,
+        write_repairs,
+    )
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
@@ -83,13 +89,14 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
-    repairs = latest_accepted(read_selection(rivr / "selection.parquet"))
+    rows = read_selection(rivr / "selection.parquet")
+    repairs, kept = latest_accepted(rows), kept_raw(rows)
     write_repairs(context.out / "repairs.parquet", repairs)
 
     g0 = Snapshot(context.inputs["g0"], context.device)
-    start = Snapshot(rivr, context.device) if repairs else g0
+    start = Snapshot(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
-    if repairs:
+    if repairs or kept:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
         consolidated = start.trained(
             [*supervision.real, *pseudo],
@@ -98,6 +105,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             seed=(context.seed, _STREAM),
             label="consolidating",
             round=0,
+            repaired=repaired_share(rows),
             reporter=reporter,
         )
         trainings.append(consolidated)
@@ -125,4 +133,4 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         {row.frame_id: row for row in repairs},
         rivr,
     )
-    return StageResult(summary=consolidation_summary(repairs, scorer.name, verdict))
+    return StageResult(summary=consolidation_summary(repairs, len(kept), scorer.name, verdict))

@@ -84,7 +84,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.rounds import Rules, pseudo_view, run_round
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision
-    from cleargs.rivr.tables import write_selection
+    from cleargs.rivr.tables import Selection, kept_raw, repaired_share, write_selection
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
@@ -100,6 +100,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         gate=config.gate,
         fuse_sigma=config.fuse_sigma,
         use_fused=config.use_fused,
+        keep_raw=config.keep_raw,
         threads=threads,
     )
 
@@ -111,7 +112,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     )
 
     g0 = current = Snapshot(context.inputs["g0"], context.device)
-    rows, repairs, trainings = [], [], []
+    rows: list[Selection] = []
+    trainings = []
     for number in range(1, config.rounds + 1):
         found = run_round(
             number,
@@ -123,10 +125,13 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
             reporter,
         )
         rows += found
-        repairs += [
-            pseudo_view(supervision.views[row.frame_id], row, context.out) for row in found if row.accepted
+        kept = kept_raw(rows)
+        repairs = [
+            pseudo_view(supervision.views[row.frame_id], row, context.out)
+            for row in rows
+            if row.accepted and row.frame_id not in kept
         ]
-        if repairs:  # without any there is nothing to distil, and the scene stays as it is
+        if repairs or kept:  # without any there is nothing to distil, and the scene stays as it is
             current = current.trained(
                 [*supervision.real, *repairs],
                 config.distil,
@@ -134,6 +139,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
                 seed=(context.seed, _STREAM, number),
                 label=f"round {number}: distilling",
                 round=number,
+                repaired=repaired_share(rows),
                 reporter=reporter,
             )
             trainings.append(current)

@@ -8,12 +8,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.models.information import information
 from cleargs.models.lpips import LpipsNetwork
-from cleargs.models.naturalness import Quadratic, StatisticsScorer, features, terms
-from cleargs.models.scorer import CLARITY, NATURALNESS, LearnedScorer, Scorer, load_scorer
+from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected, features, terms
+from cleargs.models.scorer import CLARITY, NATURALNESS, InformedScorer, LearnedScorer, Scorer, load_scorer
 from cleargs.models.tile_mean import mean_over_tiles
 from cleargs.models.training import artefacts
 from cleargs.models.training.degrade import disc_kernel, motion_kernel
@@ -95,15 +98,102 @@ def test_small_and_odd_sizes(scorer: Scorer, leaves: Image, height: int, width: 
     assert np.isfinite(scorer.score(leaves[:height, :width]))
 
 
-@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_flat_images_have_a_score(scorer: Scorer, value: float) -> None:
-    assert np.isfinite(scorer.score(np.full((64, 64, 3), value, np.float32)))
+@pytest.mark.parametrize("value", [0.0, 0.2, 0.5, 1.0])
+def test_flat_images_score_at_the_bottom(scorer: Scorer, value: float) -> None:
+    """Black was 96.5 to clarity-net and 103 to the statistics."""
+    assert scorer.score(np.full((64, 96, 3), value, np.float32)) == 0.0
+    rounded = np.round(value * 255 + np.random.default_rng(0).uniform(-0.49, 0.49, (64, 96, 3))) / 255
+    assert scorer.score(np.clip(rounded, 0, 1).astype(np.float32)) < 5.0
+
+
+def test_a_frame_half_black_has_half_its_score(scorer: Scorer, leaves: Image) -> None:
+    half = leaves[:192].copy()
+    half[:, :160] = 0.0
+    # Blocks of 16 px divide the frame; the scorer's own opinion of the black half is all that differs.
+    assert scorer.score(half) == pytest.approx(0.5 * scorer.score(leaves[:192]), abs=5.0)
+
+
+@pytest.mark.parametrize("gain", [1.5, 2.0, 3.0, 8.0])
+def test_clipping_costs_points(scorer: Scorer, leaves: Image, gain: float) -> None:
+    """The statistics gave a frame of the real captures up to 11 points more when it was overexposed."""
+    clipped = np.clip(leaves * np.float32(gain), 0, 1)
+    assert scorer.score(clipped) < scorer.score(leaves)
+
+
+def test_the_share_of_information_is_one_for_a_frame_and_changes_gradually(leaves: Image) -> None:
+    assert information(leaves) == 1.0
+    faded = [
+        information((leaves * np.float32(w)) + np.float32(0.5 * (1 - w))) for w in np.linspace(0, 0.1, 41)
+    ]
+    assert faded[0] == 0.0 and faded[-1] > 0.5
+    assert np.diff(faded).min() >= 0.0 and np.diff(faded).max() < 0.25
+    exposed = [information(np.clip(leaves * np.float32(g), 0, 1)) for g in np.linspace(1, 3, 201)]
+    assert exposed[-1] < 0.6
+    assert np.abs(np.diff(exposed)).max() < 0.1  # gains of 1 %; many discs have the same colour
+
+
+def images() -> st.SearchStrategy[Image]:
+    """Noise of any mean and strength, fine or coarse, clipped to the range."""
+
+    def make(seed: int, mean: float, strength: float, cell: int) -> Image:
+        noise = np.random.default_rng(seed).standard_normal((64, 96, 3), np.float32)[::cell, ::cell]
+        drawn = cv2.resize(mean + strength * noise, (96, 64), interpolation=cv2.INTER_CUBIC)
+        return np.clip(drawn, 0, 1).astype(np.float32)
+
+    unit = st.floats(0, 1)
+    return st.builds(make, st.integers(0, 99), unit, unit, st.sampled_from([1, 2, 4, 16]))
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(image=images())
+def test_scores_keep_to_their_range(scorer: Scorer, image: Image) -> None:
+    assert 0.0 <= scorer.score(image) <= 100.0
+
+
+@given(a=st.floats(-3, 3), b=st.floats(-3, 3))
+def test_the_expected_figure_is_in_its_range_and_keeps_the_order(a: float, b: float) -> None:
+    low, high = expected(min(a, b)), expected(max(a, b))
+    assert -1e-12 <= low <= high <= 1.0 + 1e-12
+    if -0.2 <= min(a, b) < max(a, b) - 1e-3 and max(a, b) <= 1.2:
+        assert low < high  # no saturation where predictions lie
+
+
+def test_any_scorer_is_cut_to_the_range(leaves: Image) -> None:
+    class Fixed:
+        name, digest = "fixed", "none"
+
+        def __init__(self, value: float) -> None:
+            self.value = value
+
+        def score(self, image: Image, *, threads: int = 1) -> float:
+            return self.value
+
+    assert [InformedScorer(Fixed(value)).score(leaves) for value in (-3.0, 40.0, 107.0)] == [0.0, 40.0, 100.0]
+    with pytest.raises(InputError, match="fixed gave nan"):
+        InformedScorer(Fixed(np.nan)).score(leaves)
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (31, 64, 3), (64, 64, 4)])
 def test_refuses_other_shapes(scorer: Scorer, shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match="cannot be scored"):
         scorer.score(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("image", "cause"),
+    [
+        (np.full((64, 64, 3), 128, np.uint8), "uint8 values"),  # had a score, a wrong one
+        (np.full((64, 64, 3), 0.5), "float64 values"),
+        (np.full((64, 64, 3), 128, np.float32), "from 128 to 128"),
+        (np.full((64, 64, 3), -0.5, np.float32), "from -0.5 to -0.5"),
+        (np.full((64, 64, 3), np.nan, np.float32), "from nan to nan"),
+        (np.full((64, 64, 3), np.inf, np.float32), "from inf to inf"),
+    ],
+)
+def test_refuses_other_values(scorer: Scorer, image: np.ndarray, cause: str) -> None:
+    with pytest.raises(InputError, match=cause) as caught:
+        scorer.score(image)
+    assert "[0, 1]" in caught.value.hint
 
 
 def test_unknown_scorers(tmp_path: Path) -> None:

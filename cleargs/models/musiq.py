@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from cleargs.errors import InputError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.tile_mean import MIN_SIDE, Image
+from cleargs.models.tile_mean import Image, require_scorable
 
 PATCH = 32
 """Side of a patch in pixels."""
@@ -47,11 +47,7 @@ class MusiqScorer:
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """The predicted mean opinion score, about 0 to 100. See Scorer."""
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
-            raise InputError(
-                f"an image of shape {image.shape} cannot be scored",
-                hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
-            )
+        require_scorable(image)
         return float(self._model.run(*patches(image))[0].item())
 
 

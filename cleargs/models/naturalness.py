@@ -28,6 +28,7 @@ _SCALES = 2
 _WINDOW_SIGMA = 7.0 / 6.0  # as in BRISQUE
 _LEAST_CONTRAST = 1.0 / 255.0
 _LIMIT = 4.0  # features beyond so many deviations are cut: a quadratic must not extrapolate
+_ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README.md``
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -46,7 +47,7 @@ class Quadratic(BaseModel):
 
 
 class StatisticsScorer:
-    """100 - 100 x predicted LPIPS, from the statistics of 128-pixel tiles."""
+    """100 - 100 x expected LPIPS, from the statistics of 128-pixel tiles."""
 
     def __init__(self, name: str = "naturalness-stats") -> None:
         self.name = name
@@ -59,10 +60,22 @@ class StatisticsScorer:
         return hashlib.sha256(self._source).hexdigest()
 
     def score(self, image: Image, *, threads: int = 1) -> float:
-        """See Scorer."""
-        return mean_over_tiles(
-            lambda tile: 100.0 - 100.0 * self._predict(features(tile)), image, (_TILE, _TILE), threads
+        """Between 0 and 100; the order is that of the predictions. See Scorer."""
+        predicted = mean_over_tiles(
+            lambda tile: self._predict(features(tile)), image, (_TILE, _TILE), threads
         )
+        return 100.0 * expected(1.0 - predicted)
+
+
+def expected(estimate: float) -> float:
+    """The mean of a figure that lies in [0, 1], whose unbounded estimate has a logistic error.
+
+    E[clip(estimate + error, 0, 1)]: a rising curve between 0 and 1, close to ``estimate`` except near the
+    ends. A quadratic knows no bounds and predicts less than no distance for images that are crisper than
+    those it was fitted on; a plain cut would call all of them equal.
+    """
+    below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR)
+    return float(_ERROR * (below - above))
 
 
 def features(image: Image) -> NDArray[np.float64]:

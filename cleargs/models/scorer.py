@@ -4,11 +4,13 @@ RIVR asks two of them: the primary one decides between candidates, the other bre
 MUSIQ and CLIP-IQA). The two that ship with ClearGS were trained for it and bear their own names.
 
 Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a
-frame with 4-12 px of blur lies near 87, and the paper's margin of 1.0 stands for an LPIPS difference of 0.01.
+frame with 4-12 px of blur lies near 87. Every score of `load_scorer` lies in 0-100 and is multiplied by the
+share of the image that carries information (`cleargs.models.information`).
 """
 
 from __future__ import annotations
 
+import math
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +19,7 @@ import numpy as np
 
 from cleargs.errors import InputError
 from cleargs.models.batches import in_batches
+from cleargs.models.information import information
 from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
@@ -43,14 +46,47 @@ class Scorer(Protocol):
         """Identifies the weights; part of the store key."""
 
     def score(self, image: Image, *, threads: int = 1) -> float:
-        """Higher is better, on a scale that ends at 100; bitwise equal for any ``threads``.
+        """0-100, higher is better; bitwise equal for any ``threads``.
 
-        image: [H, W, 3] float32 sRGB in [0, 1], at least 32 pixels on each side.
+        image: [H, W, 3] float32 sRGB in [0, 1], at least 32 pixels on each side. Raises InputError for any
+        other.
         """
 
 
+class InformedScorer:
+    """What another scorer says, cut to 0-100, times the share of the image that carries information.
+
+    A black, white or flat image gets 0, and a frame loses as much of its score as is clipped away. What
+    MUSIQ says in opinion scores and a file of the user's in any unit is cut as well.
+    """
+
+    def __init__(self, scorer: Scorer) -> None:
+        self._scorer = scorer
+
+    @property
+    def name(self) -> str:
+        """Of the other scorer."""
+        return self._scorer.name
+
+    @property
+    def digest(self) -> str:
+        """Of the other scorer's weights."""
+        return self._scorer.digest
+
+    def score(self, image: Image, *, threads: int = 1) -> float:
+        """See Scorer. Raises InputError, too, when the other scorer gives no number."""
+        said = self._scorer.score(image, threads=threads)
+        if not math.isfinite(said):
+            raise InputError(
+                f"the scorer {self.name} gave {said} instead of a score",
+                hint="use another scorer, or export its model again",
+            )
+        return min(max(said, 0.0), 100.0) * information(image)
+
+
 class LearnedScorer:
-    """A scoring network in an ONNX file: [N, 3, H, W] float32 sRGB in [0, 1] in, one score an image out.
+    """A scoring network in an ONNX file: [N, 3, H, W] float32 sRGB in [0, 1] in, one score an image out, of
+    whatever scale the network has.
 
     With ``tile``, or where the model fixes its input size, the score is the mean over tiles of that side:
     LPIPS is a mean over pixels too, so the score of an image then hardly depends on its size. Otherwise the
@@ -122,6 +158,10 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
 
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
+    return InformedScorer(_load(spec, device))
+
+
+def _load(spec: str, device: Device) -> Scorer:
     path = scorer_path(spec)
     if spec == NATURALNESS:
         return StatisticsScorer(NATURALNESS)

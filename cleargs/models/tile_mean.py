@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,32 @@ from cleargs.errors import InputError
 Image: TypeAlias = NDArray[np.float32]
 
 MIN_SIDE = 32
+
+_OUTSIDE = 1e-3
+"""How far values may lie outside [0, 1], by rounding: half floats near 1 are so far apart."""
+
+
+def require_scorable(image: NDArray[Any]) -> None:
+    """Raise InputError for anything but [H, W, 3] float32 in [0, 1] of at least 32 pixels on each side.
+
+    A scorer would give other types and ranges a score too, a wrong one.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
+        raise InputError(
+            f"an image of shape {image.shape} cannot be scored",
+            hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
+        )
+    if image.dtype != np.float32:
+        raise InputError(
+            f"an image of {image.dtype} values cannot be scored",
+            hint="scorers take float32 sRGB in [0, 1]; divide 8-bit values by 255",
+        )
+    low, high = float(image.min()), float(image.max())
+    if not (low >= -_OUTSIDE and high <= 1.0 + _OUTSIDE):  # NaN fails both
+        raise InputError(
+            f"an image with values from {low:g} to {high:g} cannot be scored",
+            hint="scorers take finite sRGB values in [0, 1]",
+        )
 
 
 def mean_over_tiles(
@@ -40,13 +66,9 @@ def mean_over_tiles(
 def cover(image: Image, sides: tuple[int | None, int | None]) -> list[Image]:
     """The tiles, all of one size.
 
-    Raises InputError for anything but a colour image of at least 32 pixels on each side.
+    Raises InputError as `require_scorable` does.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
-        raise InputError(
-            f"an image of shape {image.shape} cannot be scored",
-            hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
-        )
+    require_scorable(image)
     return [
         image[row, column]
         for row in _windows(image.shape[0], sides[0])

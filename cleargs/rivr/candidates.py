@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 Image: TypeAlias = NDArray[np.float32]
 CandidateName: TypeAlias = Literal["render", "restored", "fused"]
+Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
+"""A candidate, or the raw frame O_t, which needs none."""
 
 Source: TypeAlias = Literal["observation", "deblurred", "render"]
 """What D_t was restored from: O_t, O_t without the camera's motion, or R_t."""

@@ -77,6 +77,11 @@ class RivrConfig(BaseModel):
     margin: float = Field(
         1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
     )
+    keep_raw: bool = Field(
+        True,
+        description="a raw frame that needs no repair gets none and goes on supervising by itself; false: "
+        "the paper's, where every target gets a pseudo observation",
+    )
     fuse_sigma: float = Field(
         2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
     )

@@ -95,10 +95,13 @@ class Snapshot:
         seed: Sequence[int],
         label: str,
         round: int,
+        repaired: float = 1.0,
         reporter: Reporter,
     ) -> Snapshot:
         """This scene after training with fresh Adam moments on raw and repaired views, kept in ``folder``.
 
+        repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
+        go to the raw frames: drawn as often as all of them, a few repairs would drown these.
         A training that is done already is read back; one that was cut off goes on from its checkpoint.
         """
         folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +112,7 @@ class Snapshot:
                 config,
                 seed=seed,
                 exposure=self.exposure,
-                pseudo_share=config.pseudo_share,
+                pseudo_share=config.pseudo_share * repaired,
                 pseudo_weight=config.pseudo_weight,
                 checkpoint=folder / "checkpoint.safetensors",
                 reporter=reporter,

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
-from cleargs.rivr.candidates import CANDIDATES
+from cleargs.rivr.candidates import CANDIDATES, Chosen
 from cleargs.rivr.gates import REFUSED
 from cleargs.rivr.harm import Verdict
 from cleargs.rivr.tables import Selection
+
+CHOICES: tuple[Chosen, ...] = (*CANDIDATES, "observed")
+"""What a row may name as chosen."""
 
 
 def summary(rows: Sequence[Selection], expert: str, verdict: Verdict) -> dict[str, Any]:
@@ -24,31 +27,33 @@ def summary(rows: Sequence[Selection], expert: str, verdict: Verdict) -> dict[st
     }
 
 
-def consolidation_summary(repairs: Sequence[Selection], scorer: str, verdict: Verdict) -> dict[str, Any]:
-    """What was consolidated, and what came of it."""
+def consolidation_summary(
+    repairs: Sequence[Selection], kept: int, scorer: str, verdict: Verdict
+) -> dict[str, Any]:
+    """What was consolidated, beside how many frames that kept their raw image, and what came of it."""
     better = "consolidated scene" if verdict.harm is None else "RIVR's scene"
     return {
         "repairs": len(repairs),
-        "chosen": _counts(repairs),
+        "chosen": chosen_counts(repairs) | {"observed": kept},
         "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
         "scorer": scorer,
         "held_back": verdict.summary(),
-        "published": better if repairs else "G0",
+        "published": better if repairs or kept else "G0",
     }
 
 
 def _round(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
-    refused = [row for row in rows if not row.accepted]
+    refused = [row for row in rows if not row.accepted and row.chosen != "observed"]
     means = {
         f"{role}_{name}": fmean(scores)
         for role in ("primary", "tiebreak")
-        for name in CANDIDATES
+        for name in CHOICES
         if (scores := [score for row in rows if (score := getattr(row, f"{role}_{name}")) is not None])
     }
     return {
         "round": number,
-        "chosen": _counts(rows),
-        "accepted": len(rows) - len(refused),
+        "chosen": chosen_counts(rows),
+        "accepted": sum(row.accepted for row in rows),
         "refused": dict(Counter(row.reason for row in refused)),
         "repairs_refused": refused_repairs(rows),
         "tie_breaks": sum(row.reason.startswith("tie-break") for row in rows),
@@ -62,5 +67,6 @@ def refused_repairs(rows: Sequence[Selection]) -> int:
     return sum(row.reason.startswith(REFUSED) for row in rows)
 
 
-def _counts(rows: Sequence[Selection]) -> dict[str, int]:
-    return {name: sum(row.chosen == name for row in rows) for name in CANDIDATES}
+def chosen_counts(rows: Sequence[Selection]) -> dict[Chosen, int]:
+    """How often each was chosen."""
+    return {name: sum(row.chosen == name for row in rows) for name in CHOICES}

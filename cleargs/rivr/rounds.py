@@ -17,16 +17,19 @@ from cleargs.errors import StoreError
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image, fuse
+from cleargs.rivr.candidates import CANDIDATES, Image, fuse
 from cleargs.rivr.config import GateConfig
 from cleargs.rivr.gates import REFUSED, all_masked, objection
 from cleargs.rivr.restoring import Restoration, observation
-from cleargs.rivr.selection import Choice, choose, hide_masked
-from cleargs.rivr.tables import Selection
+from cleargs.rivr.results import chosen_counts
+from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
+from cleargs.rivr.tables import SELECTION, Selection
 from cleargs.splat.views import Mask, View
 
 PREFIX = "cleargs:"
 """Of the attributes in the EXR."""
+
+_NULLABLE = tuple(field.name for field in SELECTION if field.nullable)
 
 Renderer = Callable[[View], Image]
 """The current scene at a view, through the frame's exposure: R_t."""
@@ -44,6 +47,7 @@ class Rules:
     gate: GateConfig
     fuse_sigma: float
     use_fused: bool
+    keep_raw: bool
     threads: int
 
 
@@ -93,6 +97,19 @@ def repair(
         {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
         for scorer in (rules.primary, rules.tiebreak)
     )
+    raw_scores: tuple[float, float] | tuple[None, None] = (None, None)
+    kept = False
+    if rules.keep_raw:
+        raw_scores = (
+            _score(rules.primary, observed, rules.threads),
+            _score(rules.tiebreak, observed, rules.threads),
+        )
+        kept = (
+            view.weight > 0.0  # without its repair a frame of no weight would be lost
+            and unbeaten(raw_scores[0], primary, rules.margin)
+            and unbeaten(raw_scores[1], tiebreak, rules.margin)
+            and hardly_changes(observed, shown["restored"], shown["render"])
+        )
     refused = objection(shown["restored"], observed, shown["render"], rules.gate)
     choice = (
         choose(primary, tiebreak, rules.margin)
@@ -109,16 +126,18 @@ def repair(
         primary_render=primary["render"],
         primary_restored=primary["restored"],
         primary_fused=primary.get("fused"),
+        primary_observed=raw_scores[0],
         tiebreak_metric=rules.tiebreak.name,
         tiebreak_render=tiebreak["render"],
         tiebreak_restored=tiebreak["restored"],
         tiebreak_fused=tiebreak.get("fused"),
+        tiebreak_observed=raw_scores[1],
         restored_from=restoration.source,
         blur_px=None if deblurred is None else float(np.float32(deblurred.blur_px)),
         skew_px=None if deblurred is None else float(np.float32(deblurred.skew_px)),
-        chosen=choice.chosen,
-        accepted=masked is None,
-        reason=masked or choice.reason,
+        chosen="observed" if kept else choice.chosen,
+        accepted=masked is None and not kept,
+        reason=masked or (KEPT if kept else choice.reason),
     )
     layers["observed"] = to_layer(observed)
     if deblurred is not None:
@@ -134,7 +153,7 @@ def recorded_row(out: Path, exr: str) -> Selection | None:
         attributes: dict[str, Any] = dict(read_exr(out / exr, PREFIX).attributes)
         values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
         frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
-        absent: dict[str, Any] = dict.fromkeys(("primary_fused", "tiebreak_fused", "blur_px", "skew_px"))
+        absent: dict[str, Any] = dict.fromkeys(_NULLABLE)
         return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
     except (StoreError, KeyError, TypeError):
         return None
@@ -162,5 +181,4 @@ def _score(scorer: Scorer, image: Image, threads: int) -> float:
 
 
 def _tally(rows: Sequence[Selection]) -> str:
-    counts: dict[CandidateName, int] = {name: sum(row.chosen == name for row in rows) for name in CANDIDATES}
-    return ", ".join(f"{count} {name}" for name, count in counts.items())
+    return ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())

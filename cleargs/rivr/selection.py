@@ -13,6 +13,13 @@ import numpy as np
 
 from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image
 
+NEGLIGIBLE = 0.15
+"""Change by the repair, as a share of what the render leaves unexplained, below which there is nothing to
+repair. docs/rivr.md has the measurement."""
+
+KEPT = "needs no repair"
+"""The reason of a row whose raw frame is kept."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -40,6 +47,27 @@ def choose(
         return Choice(close[0], "primary score")
     chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
     return Choice(chosen, "tie-break among " + ", ".join(close))
+
+
+def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:
+    """Whether no candidate's score is above that of the raw frame by more than ``margin``."""
+    return max(candidates.values()) - raw <= margin
+
+
+def hardly_changes(observed: Image, restored: Image, render: Image) -> bool:
+    """Whether the repair hardly changes the raw frame: |D - O|^2 < 0.15 |R - O|^2.
+
+    A frame that is blurred or skewed differs from a good scene's render by just that, and its repair undoes
+    much of it. In a sharp frame what the render leaves unexplained is the scene's own error, and a repair
+    that follows it only carries it into the frame. Scores alone do not tell: sharpening raises them either
+    way.
+
+    observed, restored, render: O_t, D_t and R_t [H, W, 3], equal where the frame is masked.
+    """
+    changed, unexplained = (
+        float(np.square(image - observed, dtype=np.float64).sum()) for image in (restored, render)
+    )
+    return changed < NEGLIGIBLE * unexplained
 
 
 def hide_masked(image: Image, observed: Image, mask: np.ndarray | None) -> Image:

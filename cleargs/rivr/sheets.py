@@ -19,7 +19,7 @@ SHEET_FRAMES = 6
 
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
-    """One line a row: the observation, the same without its motion, and its candidates with both scores, the
+    """One line a row: the observation, the same without its motion, and its candidates, with both scores, the
     chosen one marked."""
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
@@ -50,7 +50,10 @@ def write_before_after_sheet(
 
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:
     layers = read_exr(rivr / row.exr).layers
-    tiles = [Tile(from_layer(layers["observed"]), f"frame {row.frame_id}, round {row.round}: observed")]
+    head = f"frame {row.frame_id}, round {row.round}: observed"
+    if row.primary_observed is not None:
+        head += f" {row.primary_observed:.1f} / {row.tiebreak_observed:.1f}"
+    tiles = [Tile(from_layer(layers["observed"]), head, marked=row.chosen == "observed")]
     if "deblurred" in layers:
         motion = f"undone: blur {row.blur_px:.1f} px, skew {row.skew_px:.1f} px"
         tiles.append(Tile(from_layer(layers["deblurred"]), motion))

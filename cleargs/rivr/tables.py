@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pyarrow as pa
 
-from cleargs.rivr.candidates import CandidateName, Source
+from cleargs.rivr.candidates import Chosen, Source
 from cleargs.tables import column, read_table, write_table
 
 
@@ -18,6 +19,12 @@ def _scores(role: str, use: str) -> list[pa.Field]:
         column(f"{role}_render", pa.float32(), f"{meaning} the render R_t"),
         column(f"{role}_restored", pa.float32(), f"{meaning} the restored observation D_t"),
         column(f"{role}_fused", pa.float32(), f"{meaning} the fusion F_t; null without it", nullable=True),
+        column(
+            f"{role}_observed",
+            pa.float32(),
+            f"{meaning} the raw frame O_t; null with rivr.keep_raw=false",
+            nullable=True,
+        ),
     ]
 
 
@@ -37,9 +44,9 @@ SELECTION = pa.schema(
         ),
         column("blur_px", pa.float32(), "mean way of the pixels while exposed, as undone", nullable=True),
         column("skew_px", pa.float32(), "their mean way from the first to the last row", nullable=True),
-        column("chosen", pa.string(), "render, restored or fused"),
+        column("chosen", pa.string(), "render, restored or fused; observed: the raw frame needs no repair"),
         column("accepted", pa.bool_(), "whether the chosen candidate became a pseudo observation"),
-        column("reason", pa.string(), "why it was chosen, or why a gate refused it"),
+        column("reason", pa.string(), "why it was chosen, or why there is no pseudo observation"),
     ]
 )
 
@@ -64,14 +71,16 @@ class Selection:
     primary_render: float
     primary_restored: float
     primary_fused: float | None
+    primary_observed: float | None
     tiebreak_metric: str
     tiebreak_render: float
     tiebreak_restored: float
     tiebreak_fused: float | None
+    tiebreak_observed: float | None
     restored_from: Source
     blur_px: float | None
     skew_px: float | None
-    chosen: CandidateName
+    chosen: Chosen
     accepted: bool
     reason: str
 
@@ -86,10 +95,26 @@ def read_selection(path: Path) -> list[Selection]:
     return [Selection(**row) for row in read_table(path, SELECTION).to_pylist()]
 
 
-def latest_accepted(rows: list[Selection]) -> list[Selection]:
-    """The accepted row of the latest round of every frame that has one, by frame_id."""
+def latest_accepted(rows: Sequence[Selection]) -> list[Selection]:
+    """The accepted row of the latest round of every frame that has one and is not kept raw, by frame_id."""
+    kept = kept_raw(rows)
     latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round) if row.accepted}
-    return [latest[frame_id] for frame_id in sorted(latest)]
+    return [latest[frame_id] for frame_id in sorted(latest.keys() - kept)]
+
+
+def kept_raw(rows: Sequence[Selection]) -> set[int]:
+    """The frames whose latest row says that they need no repair.
+
+    The latest scene is the best judge, so this takes back an earlier repair, as a later repair does.
+    """
+    latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round)}
+    return {frame_id for frame_id, row in latest.items() if row.chosen == "observed"}
+
+
+def repaired_share(rows: Sequence[Selection]) -> float:
+    """Of the frames that have a repair or are kept raw, the share of the former; 0 without either."""
+    repaired, kept = len(latest_accepted(rows)), len(kept_raw(rows))
+    return repaired / max(repaired + kept, 1)
 
 
 def write_repairs(path: Path, repairs: list[Selection]) -> None:

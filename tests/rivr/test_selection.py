@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cleargs.rivr.candidates import CANDIDATES, CandidateName
-from cleargs.rivr.selection import choose, hide_masked
+from cleargs.rivr.selection import choose, hardly_changes, hide_masked, unbeaten
 
 three_scores = st.tuples(*[st.floats(0, 100)] * 3)
 
@@ -64,6 +64,20 @@ def test_the_choice_is_never_further_than_the_margin(
 def test_scores_must_be_finite() -> None:
     with pytest.raises(ValueError, match="finite"):
         choose(scores(1, math.nan, 2), scores(1, 2, 3), margin=1.0)
+
+
+def test_a_raw_frame_is_unbeaten_up_to_the_margin() -> None:
+    assert unbeaten(59.0, scores(50, 60, 40), margin=1.0)
+    assert not unbeaten(58.9, scores(50, 60, 40), margin=1.0)
+
+
+def test_a_repair_that_changes_little_beside_what_is_unexplained() -> None:
+    """Powers of 0.1^2 and 1: a tenth of the change that would count; 0.5^2 is a quarter."""
+    observed = np.zeros((8, 8, 3), np.float32)
+    render = observed + np.float32(1.0)
+    assert hardly_changes(observed, observed + np.float32(0.1), render)
+    assert not hardly_changes(observed, observed + np.float32(0.5), render)
+    assert not hardly_changes(observed, observed, observed)  # nothing to go by
 
 
 def test_masked_pixels_are_the_observation_in_every_candidate() -> None:

@@ -26,7 +26,16 @@ from tiny_capture import (
 
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.rivr.candidates import fuse
-from cleargs.rivr.tables import REPAIRS, SELECTION, Selection, read_selection, write_selection
+from cleargs.rivr.tables import (
+    REPAIRS,
+    SELECTION,
+    Selection,
+    kept_raw,
+    latest_accepted,
+    read_selection,
+    repaired_share,
+    write_selection,
+)
 from cleargs.stages import consolidate, rivr
 
 HELD_BACK = 3
@@ -157,6 +166,89 @@ def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
     assert {row.chosen for row in rows} <= {"render", "restored"}
     assert {(row.primary_fused, row.tiebreak_fused) for row in rows} == {(None, None)}
     assert set(read_exr(context.out / rows[0].exr).layers) == {"render", "restored", "observed"}
+
+
+class Faithful:
+    """An expert that leaves images as they are, but for a little grain."""
+
+    name = "faithful"
+    digest = "none"
+
+    def restore(self, image: np.ndarray, **_: Any) -> np.ndarray:
+        grain = np.random.default_rng(0).normal(0, 1e-3, image.shape).astype(np.float32)
+        return np.clip(image + grain, 0, 1)
+
+
+def keeping(**changes: Any) -> Any:
+    """The default: motion undone, no fusion, raw frames kept. The stand-in scorers have no calibrated scale,
+    so that the margin leaves the choice to them only where they differ grossly."""
+    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
+
+
+def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
+    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
+    context = capture.context("rivr", keeping())
+    result = rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    kept = {(row.round, row.frame_id) for row in rows if row.chosen == "observed"}
+    sharp = {k for k in TARGETS if ROLES[k] == "strong"}
+    assert kept == {(n, k) for n in (1, 2) for k in sharp}
+    for row in rows:
+        assert row.accepted == ((row.round, row.frame_id) not in kept)
+        assert (row.reason == "needs no repair") == (row.chosen == "observed")
+        assert row.primary_observed is not None and row.tiebreak_observed is not None
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    drawn = set(zip(log["frame_id"], log["kind"], strict=True))
+    assert not {(k, "pseudo") for k in sharp} & drawn
+    assert result.summary["rounds"][0]["chosen"]["observed"] == len(sharp)
+    assert result.summary["rounds"][0]["refused"] == {}
+
+    second = capture.context("consolidate", tiny_consolidate())
+    summary = consolidate.run(second).summary
+    assert summary["repairs"] == len(TARGETS) - len(sharp)
+    assert summary["chosen"]["observed"] == len(sharp)
+
+
+def test_where_every_frame_is_kept_the_scene_trains_on_raw_frames(capture: Capture) -> None:
+    first = capture.context("rivr", tiny_rivr(rounds=1))
+    rivr.run(first)
+    rows = read_selection(first.out / "selection.parquet")
+    rows = [dataclasses.replace(row, accepted=False, chosen="observed") for row in rows]
+    write_selection(first.out / "selection.parquet", rows)
+    context = capture.context("consolidate", tiny_consolidate())
+    summary = consolidate.run(context).summary
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    assert len(log["kind"]) == 12 and set(log["kind"]) == {"real"}
+    assert (summary["repairs"], summary["chosen"]["observed"]) == (0, len(TARGETS))
+
+
+def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) -> None:
+    """Kept raw after a repair: the repair is taken back; repaired after being kept: the repair counts."""
+    context = capture.context("rivr", tiny_rivr())
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    raw = {(2, 1), (1, 4)}
+    rows = [
+        dataclasses.replace(row, accepted=False, chosen="observed")
+        if (row.round, row.frame_id) in raw
+        else row
+        for row in rows
+    ]
+    assert kept_raw(rows) == {1}
+    assert {row.frame_id: row.round for row in latest_accepted(rows)} == dict.fromkeys(
+        (k for k in TARGETS if k != 1), 2
+    )
+    assert repaired_share(rows) == (len(TARGETS) - 1) / len(TARGETS)
+
+
+def test_the_papers_rule_scores_no_raw_frame(capture: Capture) -> None:
+    context = capture.context("rivr", tiny_rivr(rounds=1))
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    assert {(row.primary_observed, row.tiebreak_observed) for row in rows} == {(None, None)}
+    assert "observed" not in {row.chosen for row in rows}
+    assert all(row.accepted for row in rows)
 
 
 def test_masked_pixels_do_not_reach_the_scores(
