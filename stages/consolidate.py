@@ -81,7 +81,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     rivr = context.inputs["rivr"]
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     repairs = latest_accepted(read_selection(rivr / "selection.parquet"))
     write_repairs(context.out / "repairs.parquet", repairs)
@@ -100,7 +100,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             round=0,
             reporter=reporter,
         )
-        trainings.append(consolidated)
+        trainings.append(consolidated.folder)
 
     verdict = judge_harm(
         supervision.held_back,
