@@ -53,6 +53,13 @@ def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
     return {} if path is None else {"scorer": path}
 
 
+def preflight(config: ConsolidateConfig) -> None:
+    """The scorer: raises InputError for one that is not installed, damaged or of another form."""
+    from cleargs.models.scorer import load_scorer
+
+    load_scorer(config.scorer)
+
+
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """A training step takes about 0.3 s a megapixel on two cores."""
     from cleargs.rivr.cost import capture_size

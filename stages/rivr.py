@@ -61,6 +61,17 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
     return {role: path for role, path in files.items() if path is not None}
 
 
+def preflight(config: RivrConfig) -> None:
+    """The expert and the scorers: raises InputError for one that is not installed, damaged or of another
+    form."""
+    from cleargs.models.expert import load_expert
+    from cleargs.models.scorer import load_scorer
+
+    load_expert(config.expert)
+    for name in (config.primary_scorer, config.tiebreak_scorer):
+        load_scorer(name)
+
+
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s, making and scoring candidates 2 s, a
     training step 0.3 s (two cores, the embedded models)."""
