@@ -4,7 +4,7 @@ difference to PyTorch. And what each model that can be had costs to run.
   .venv-convert/bin/python tests/models/full_size.py restormer nafnet musiq clip-iqa    # converted here
   .venv/bin/python tests/models/full_size.py maxim-gopro embedded clarity-net ...      # as installed
 
-Each is measured in a process of its own on one thread. docs/models.md holds the figures.
+Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md holds the figures.
 """
 
 from __future__ import annotations
@@ -92,11 +92,11 @@ def convert(name: str, path: Path) -> dict[str, Any]:
     from cleargs.models.musiq import MusiqScorer
     from cleargs.models.scorer import LearnedScorer
 
-    network, start = published(name), time.perf_counter()
+    network, start = published(name), time.process_time()
     tile = image(256, 256)
     if name in ("restormer", "nafnet"):
         restorer.convert(checkpoint(network), path)
-        took, held = time.perf_counter() - start, peak_gb()
+        took, held = time.process_time() - start, peak_gb()
         with torch.no_grad():
             expected = network(torch.from_numpy(tile).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy()
         found: Any = OnnxExpert(path).restore(tile)
@@ -111,7 +111,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
             clipiqa_arch.load = lambda backbone, device: network  # else it would download CLIP
             scorers.convert("clip-iqa", b"", path)
             reference, scorer, factor = clipiqa_arch.CLIPIQA().eval(), LearnedScorer(path), 100.0
-        took, held = time.perf_counter() - start, peak_gb()
+        took, held = time.process_time() - start, peak_gb()
         sizes = [(270, 480), (200, 90), (64, 300), (256, 256)]
         with torch.no_grad():
             expected = np.array(
@@ -154,9 +154,9 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
         work = load_expert(name).restore if name == "embedded" or "maxim" in name else load_scorer(name).score
     first = image(256, 256)
     work(first)
-    start = time.perf_counter()
+    start = time.process_time()
     work(shown)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     return {"seconds_a_megapixel": seconds / (SIZE[0] * SIZE[1] / 1e6), "memory_gb": peak_gb() - before}
 
 
