@@ -73,22 +73,26 @@ def preflight(config: RivrConfig) -> None:
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Undoing motion takes about 3 s a megapixel, restoring 1 s, making and scoring candidates 2 s, a
-    training step 0.3 s (two cores, the embedded models)."""
+    """Undoing motion takes about 3 s a megapixel, restoring 1 s (20 s where the expert is not the embedded
+    one), making and scoring candidates 2 s, a training step 0.3 s (two cores). Every group leaves a scene."""
     from cleargs.rivr.cost import capture_size
 
     config = context.config
     frames, megapixels = capture_size(context.inputs.get("ingest"))
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
+    restoring = 1.0 if config.expert == "embedded" else 20.0
     seconds = megapixels * (
-        frames * (1.0 * restorings + (5.0 if deblurs else 2.0) * config.rounds)
+        frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
         + 0.3 * config.rounds * config.distil.steps
     )
+    scene = context.inputs.get("g0", Path()) / "scene.ply"
+    groups = 1 if config.group is None else -(-frames // config.group)
+    scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
         minutes=seconds / 60.0,
         memory_gb=1.0 + config.distil.cache_mb / 1024.0,
-        disk_gb=0.02 * megapixels * frames * (config.rounds + 1),
+        disk_gb=0.02 * megapixels * frames * (config.rounds + 1) + scenes,
     )
 
 

@@ -1,4 +1,4 @@
-"""Along the trajectory: a round's target frames in groups, and the steps of its distillation shared among them.
+"""Along the trajectory: a round's target frames in groups, which share the steps of its distillation.
 
 The paper repairs along the trajectory: what is accepted early is distilled before later frames are rendered,
 and may fade while theirs are. That is what the consolidation is for.

@@ -1,10 +1,11 @@
-"""The conversions at the published architectures' full size, with random weights: time, memory, and the largest
-difference to PyTorch. And what each model that can be had costs to run.
+"""The conversions at the published architectures' full size, with random weights: time, memory, and the
+largest difference to PyTorch. And what each model that can be had costs to run.
 
   .venv-convert/bin/python tests/models/full_size.py restormer nafnet musiq clip-iqa    # converted here
   .venv/bin/python tests/models/full_size.py maxim-gopro embedded clarity-net ...      # as installed
 
-Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md holds the figures.
+Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md has the
+figures.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def published(name: str) -> nn.Module:
         return MUSIQ(pretrained=False).eval()
     from pyiqa.archs import clip_model
 
-    # CLIP's RN50: image side 224, layers 3 4 6 3 of width 64; text of 77 tokens, width 512, 8 heads, 12 layers
+    # CLIP's RN50: images of 224 px, layers 3 4 6 3 of width 64; 77 tokens of text, width 512, 12 layers
     clip = clip_model.CLIP(1024, 224, (3, 4, 6, 3), 64, 0, 77, 49408, 512, 8, 12).eval()
     for weights in clip.visual.parameters():
         if not weights.any():
@@ -135,6 +136,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
 def cost(name: str, path: Path | None) -> dict[str, Any]:
     """Seconds a megapixel and memory of the model on one thread; ``path``: of a network converted here."""
     from cleargs.models.expert import OnnxExpert, load_expert
+    from cleargs.models.lpips import Lpips
     from cleargs.models.musiq import MusiqScorer
     from cleargs.models.scorer import LearnedScorer, load_scorer
 
@@ -146,10 +148,11 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
         assert path is not None
         work = (MusiqScorer(path) if name == "musiq" else LearnedScorer(path)).score
     elif name.startswith("lpips"):
-        from cleargs.models.lpips import load_lpips
+        metric = Lpips("vgg" if name == "lpips-vgg" else "alex")
 
-        metric = load_lpips(name.removeprefix("lpips-"))
-        work = lambda one: metric(one, one[::-1].copy())  # noqa: E731
+        def work(one: Any) -> Any:
+            return metric.distance(one, one[::-1].copy())
+
     else:
         work = load_expert(name).restore if name == "embedded" or "maxim" in name else load_scorer(name).score
     first = image(256, 256)
