@@ -206,9 +206,7 @@ def _repair_and_distil(
                 if row.accepted
             ]
             steps += group.steps
-            if (
-                not repairs or not steps
-            ):  # nothing to distil yet: the scene stays, the next group gets the steps
+            if not repairs or not steps:  # the scene stays as it is, and the next group gets the steps
                 continue
             current = current.trained(
                 [*supervision.real, *repairs],

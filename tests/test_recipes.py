@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import nullcontext
 from functools import reduce
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 
 from cleargs.cli.main import invoke
-from cleargs.errors import InputError
+from cleargs.errors import ConfigError, InputError
 from cleargs.media.image import write_rgb
 from cleargs.models.install import install
 from cleargs.models.registry import find_model
 from cleargs.pipeline.config import Config, load_config
 from cleargs.pipeline.dag import installed
+from cleargs.rva.config import RvaConfig
+from cleargs.rva.evaluator import check_evaluator
 from cleargs.splat.strategy import budget_from_pixels
 
 METHOD: dict[str, Any] = {
@@ -189,7 +195,54 @@ def test_a_damaged_model_is_said_before_any_work(bare: Path, capsys: pytest.Capt
     assert not (bare / "run" / "ingest").exists()
 
 
+@pytest.mark.parametrize("share", ["2", "odd"])
+def test_a_share_is_a_number_or_even(share: str) -> None:
+    with pytest.raises(ConfigError, match=r"^rivr\.distil\.pseudo_share = .* cannot be used"):
+        load_config(installed(), "default", [f"rivr.distil.pseudo_share={share}"])
+
+
 def test_the_papers_models_need_their_licences_accepted(tmp_path: Path) -> None:
     for name in ("restormer-motion", "musiq", "clip-iqa"):
         with pytest.raises(InputError, match="not for commercial use"):
             install(find_model(name), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "cause"),
+    [
+        (200, {"data": [{"id": "Qwen/Qwen3-VL-8B-Instruct"}]}, None),
+        (200, {"data": [{"id": "llama"}]}, "has no model Qwen/Qwen3-VL-8B-Instruct; it has llama"),
+        (200, {"data": []}, None),  # it lists none: the first frame will tell
+        (200, "models", None),
+        (404, {}, None),
+        (401, {}, "refuses the key"),
+    ],
+)
+def test_the_server_must_have_the_model(status: int, body: Any, cause: str | None) -> None:
+    class Models(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            assert self.path == "/v1/models"
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(json.dumps(body).encode())
+
+        def log_message(self, *_: object) -> None: ...
+
+    with HTTPServer(("127.0.0.1", 0), Models) as server:
+        thread = Thread(target=server.handle_request, daemon=True)
+        thread.start()
+        address = f"http://127.0.0.1:{server.server_port}/v1"
+        config = load_config(installed(), "paper", [f"rva.qwen.base_url={address}"]).sections["rva"]
+        assert isinstance(config, RvaConfig)
+        with pytest.raises(InputError, match=cause) if cause else nullcontext():
+            check_evaluator(config)
+        thread.join()
+
+
+def test_a_folder_without_a_model_is_said_before_any_work(tmp_path: Path) -> None:
+    pytest.importorskip("transformers", reason="the extra vlm is not installed")
+    settings = ["rva.qwen.model=", f"rva.qwen.model_dir={tmp_path}"]
+    config = load_config(installed(), "paper", settings).sections["rva"]
+    assert isinstance(config, RvaConfig)
+    with pytest.raises(InputError, match="holds no Qwen3-VL model"):
+        check_evaluator(config)

@@ -111,7 +111,7 @@ class Snapshot:
                 config,
                 seed=seed,
                 exposure=self.exposure,
-                pseudo_share=_pseudo_share(views) if config.pseudo_share == "even" else config.pseudo_share,
+                pseudo_share=_pseudo_share(config, views),
                 pseudo_weight=config.pseudo_weight,
                 checkpoint=folder / CHECKPOINT,
                 reporter=reporter,
@@ -147,8 +147,10 @@ def superseded(training: Path) -> None:
     (training / STATE).unlink(missing_ok=True)
 
 
-def _pseudo_share(views: Sequence[View]) -> float:
-    return sum(view.kind == "pseudo" for view in views) / len(views)
+def _pseudo_share(config: DistilConfig, views: Sequence[View]) -> float:
+    if isinstance(config.pseudo_share, str):  # even
+        return sum(view.kind == "pseudo" for view in views) / len(views)
+    return config.pseudo_share
 
 
 def _copy(source: Path, target: Path) -> None:
