@@ -73,7 +73,7 @@ def preflight(config: RivrConfig) -> None:
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Undoing motion takes about 3 s a megapixel, restoring 1 s (20 s where the expert is not the embedded
+    """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
     one), making and scoring candidates 2 s, a training step 0.3 s (two cores). Every group leaves a scene."""
     from cleargs.rivr.cost import capture_size
 
@@ -81,7 +81,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     frames, megapixels = capture_size(context.inputs.get("ingest"))
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
-    restoring = 1.0 if config.expert == "embedded" else 20.0
+    restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * (
         frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
         + 0.3 * config.rounds * config.distil.steps
