@@ -53,6 +53,13 @@ def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
     return {} if path is None else {"scorer": path}
 
 
+def preflight(config: ConsolidateConfig) -> None:
+    """The scorer: raises InputError for one that is not installed, damaged or of another form."""
+    from cleargs.models.scorer import load_scorer
+
+    load_scorer(config.scorer)
+
+
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """A training step takes about 0.3 s a megapixel on two cores."""
     from cleargs.rivr.cost import capture_size
@@ -87,7 +94,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     rivr = context.inputs["rivr"]
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = read_selection(rivr / "selection.parquet")
     repairs, kept = latest_accepted(rows), kept_raw(rows)
@@ -108,7 +115,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             repaired=repaired_share(rows),
             reporter=reporter,
         )
-        trainings.append(consolidated)
+        trainings.append(consolidated.folder)
 
     verdict = judge_harm(
         supervision.held_back,

@@ -33,6 +33,10 @@ def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
     return {}
 
 
+def preflight(config: G0Config) -> None:
+    """It needs no model."""
+
+
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel (two cores); memory is the image cache and the kernels' buffers."""
     config, ingest = context.config, context.inputs.get("ingest", Path())

@@ -21,6 +21,10 @@ def externals(config: IngestConfig, source: Path) -> Mapping[str, Path]:
     return layout.externals(source, config)
 
 
+def preflight(config: IngestConfig) -> None:
+    """It needs no model."""
+
+
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
     """From the number of frames, their size, and the number of pairs to match (measured on two cores)."""
     from cleargs.capture.sources import open_capture

@@ -1,13 +1,22 @@
-"""RIVR: render, restore, fuse, select and distil, round after round."""
+"""RIVR: render, restore, fuse, select and distil, round after round along the trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import RivrConfig
+
+if TYPE_CHECKING:
+    from cleargs.rivr.distillation import Snapshot
+    from cleargs.rivr.restoring import Restorations
+    from cleargs.rivr.rounds import Rules
+    from cleargs.rivr.supervision import Supervision
+    from cleargs.rivr.tables import Selection
+    from cleargs.splat.views import View
 
 VERSION = 7
 CONFIG = RivrConfig
@@ -52,28 +61,44 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
     return {role: path for role, path in files.items() if path is not None}
 
 
+def preflight(config: RivrConfig) -> None:
+    """The expert and the scorers: raises InputError for one that is not installed, damaged or of another
+    form."""
+    from cleargs.models.expert import load_expert
+    from cleargs.models.scorer import load_scorer
+
+    load_expert(config.expert)
+    for name in (config.primary_scorer, config.tiebreak_scorer):
+        load_scorer(name)
+
+
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Undoing motion takes about 3 s a megapixel, restoring 1 s, making and scoring candidates 2 s, a
-    training step 0.3 s (two cores, the embedded models)."""
+    """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
+    one), making and scoring candidates 2 s, a training step 0.3 s (two cores). Every group leaves a scene."""
     from cleargs.rivr.cost import capture_size
 
     config = context.config
     frames, megapixels = capture_size(context.inputs.get("ingest"))
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
+    restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * (
-        frames * (1.0 * restorings + (5.0 if deblurs else 2.0) * config.rounds)
+        frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
         + 0.3 * config.rounds * config.distil.steps
     )
+    scene = context.inputs.get("g0", Path()) / "scene.ply"
+    groups = 1 if config.group is None else -(-frames // config.group)
+    scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
         minutes=seconds / 60.0,
         memory_gb=1.0 + config.distil.cache_mb / 1024.0,
-        disk_gb=0.02 * megapixels * frames * (config.rounds + 1),
+        disk_gb=0.02 * megapixels * frames * (config.rounds + 1) + scenes,
     )
 
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
-    """Candidates -> scores -> choice -> distillation, for every round; then the check for harm."""
+    """Candidates -> scores -> choice -> distillation, for every group of every round; then the check for
+    harm."""
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
@@ -81,15 +106,15 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.restoring import Restorations
     from cleargs.rivr.results import refused_repairs, summary
-    from cleargs.rivr.rounds import Rules, pseudo_view, run_round
+    from cleargs.rivr.rounds import Rules
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision
-    from cleargs.rivr.tables import Selection, kept_raw, repaired_share, write_selection
+    from cleargs.rivr.tables import write_selection
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"])
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     targets = supervision.targets(config.targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
@@ -111,38 +136,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         undo_motion=config.undo_motion,
     )
 
-    g0 = current = Snapshot(context.inputs["g0"], context.device)
-    rows: list[Selection] = []
-    trainings = []
-    for number in range(1, config.rounds + 1):
-        found = run_round(
-            number,
-            targets,
-            current.render,
-            partial(restored, depth_of=current.depth),
-            rules,
-            context.out,
-            reporter,
-        )
-        rows += found
-        kept = kept_raw(rows)
-        repairs = [
-            pseudo_view(supervision.views[row.frame_id], row, context.out)
-            for row in rows
-            if row.accepted and row.frame_id not in kept
-        ]
-        if repairs or kept:  # without any there is nothing to distil, and the scene stays as it is
-            current = current.trained(
-                [*supervision.real, *repairs],
-                config.distil,
-                context.checkpoints / f"round_{number:02d}",
-                seed=(context.seed, _STREAM, number),
-                label=f"round {number}: distilling",
-                round=number,
-                repaired=repaired_share(rows),
-                reporter=reporter,
-            )
-            trainings.append(current)
+    g0 = Snapshot(context.inputs["g0"], context.device)
+    rows, trainings, current = _repair_and_distil(context, supervision, targets, restored, rules, g0)
     write_selection(context.out / "selection.parquet", rows)
     if 2 * (refused := refused_repairs(rows)) > len(rows):
         reporter.warn(
@@ -172,3 +167,65 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     shown = [last[view.frame_id] for view in worst]
     write_candidates_sheet(context.out / "candidates.png", shown, context.out)
     return StageResult(summary=summary(rows, expert.name, verdict))
+
+
+def _repair_and_distil(
+    context: StageContext[RivrConfig],
+    supervision: Supervision,
+    targets: Sequence[View],
+    restored: Restorations,
+    rules: Rules,
+    g0: Snapshot,
+) -> tuple[list[Selection], list[Path], Snapshot]:
+    """Every round along the trajectory, group by group: what each frame got, the folders of the trainings,
+    and the last scene."""
+    from cleargs.rivr.distillation import superseded
+    from cleargs.rivr.groups import trajectory_groups
+    from cleargs.rivr.rounds import pseudo_view, run_round
+    from cleargs.rivr.tables import kept_raw, repaired_share
+
+    config, reporter = context.config, context.reporter
+    groups = trajectory_groups(targets, config.group, config.distil.steps)
+    rows: list[Selection] = []
+    trainings: list[Path] = []
+    current = g0
+    for number in range(1, config.rounds + 1):
+        steps = 0
+        for place, group in enumerate(groups):
+            label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
+            found = run_round(
+                number,
+                group.targets,
+                current.render,
+                partial(restored, depth_of=current.depth),
+                rules,
+                context.out,
+                reporter,
+                label=f"{label}: candidates",
+            )
+            rows += found
+            kept = kept_raw(rows)
+            repairs = [
+                pseudo_view(supervision.views[row.frame_id], row, context.out)
+                for row in rows
+                if row.accepted and row.frame_id not in kept
+            ]
+            steps += group.steps
+            # Without either the scene stays as it is, and the next group gets the steps.
+            if not (repairs or kept) or not steps:
+                continue
+            current = current.trained(
+                [*supervision.real, *repairs],
+                config.distil.model_copy(update={"steps": steps}),
+                context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
+                seed=(context.seed, _STREAM, number, *([place] if place else [])),
+                label=f"{label}: distilling",
+                round=number,
+                repaired=repaired_share(rows),
+                reporter=reporter,
+            )
+            steps = 0
+            if trainings:
+                superseded(trainings[-1])
+            trainings.append(current.folder)
+    return rows, trainings, current

@@ -27,6 +27,14 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
     return {}
 
 
+def preflight(config: RvaConfig) -> None:
+    """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
+    holds none that can be loaded."""
+    from cleargs.rva.evaluator import check_evaluator
+
+    check_evaluator(config)
+
+
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
     """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
     config = context.config

@@ -54,7 +54,7 @@ Examples:
     default="default",
     show_default=True,
     metavar="NAME|FILE.toml",
-    help="The recipe: default, smoke, paper, or a TOML file of your own.",
+    help="The recipe: default, smoke, paper, paper-open, or a TOML file of your own.",
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all randomness.  [default: 0]")

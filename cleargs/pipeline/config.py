@@ -167,8 +167,10 @@ def _setting_error(
     """The first complaint of pydantic as one line of cause and one of remedy."""
     first = error.errors(include_url=False)[0]
     parts = [str(part) for part in first["loc"]]
-    name = ".".join([section, *parts])
     owner, field = _locate(model, parts)
+    if owner is None and not parts[-1].isdigit():
+        parts.pop()  # which member of a union pydantic tried
+    name = ".".join([section, *parts])
     if first["type"] == "extra_forbidden":
         siblings = owner.model_fields if owner is not None else {}
         return _unknown(parts[-1], ".".join([section, *parts[:-1]]) + ".", siblings, models)

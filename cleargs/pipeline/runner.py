@@ -55,10 +55,14 @@ class Runner:
         """Bring every stage up to ``until`` to a finished folder; link each into the run.
 
         Stops after a stage that is done only in part unless ``allow_partial``: the last outcome then says
-        what is missing. Raises CleargsError where a stage fails; what was finished before it stays.
+        what is missing. Raises InputError before any work where a model that one of them needs is not
+        there, CleargsError where a stage fails; what was finished before it stays.
         """
         forced = tuple(self.dag.check(name) for name in force)
         plans = self.planner.plan(until, forced)
+        for plan in plans:
+            if plan.state != "hit":
+                self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
         line = cost_line(plans)
         if line:

@@ -75,6 +75,12 @@ class Stage(Protocol):
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
         """Role -> file or folder outside the store whose content enters the key (capture, model weights)."""
 
+    def preflight(self, config: Any) -> None:
+        """Raise InputError when a model or a server that the settings name cannot be had.
+
+        Asked before the first stage of a run starts: hours of work are not to end in a missing file.
+        """
+
     def estimate(self, context: StageContext[Any]) -> Estimate:
         """Rough cost, from the settings and the inputs that already exist."""
 

@@ -22,6 +22,14 @@ class HarmConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    held_back: float = Field(
+        0.125,
+        ge=0.0,
+        le=1.0,
+        description="share of the reliable frames (at least one) that get no repair and judge the result; "
+        "0: every frame may be repaired and nothing is rejected, the paper's way. "
+        "To be set alike in [rivr.harm] and [consolidate.harm]",
+    )
     psnr_margin: float = Field(0.5, ge=0.0, le=100.0, description="mean PSNR may fall by this much, dB")
     score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
 
@@ -73,6 +81,13 @@ class RivrConfig(BaseModel):
         "naturalness-stats",
         description="decides near-ties: the name of a scorer, or an ONNX file",
         json_schema_extra={"key": False},
+    )
+    group: int | None = Field(
+        None,
+        ge=1,
+        description="most target frames that are repaired from one scene: a round goes along the trajectory "
+        "in groups, and what is accepted in one is distilled before the next is rendered (the paper's way); "
+        "unset = the whole round at once. The groups share the round's distil.steps",
     )
     margin: float = Field(
         1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"

@@ -32,6 +32,7 @@ from cleargs.tables import read_table, write_table
 
 SCENE, EXPOSURE, STATE, LOG = "scene.ply", "exposure.parquet", "state.safetensors", "train.parquet"
 REJECTED = "rejected.ply"
+CHECKPOINT = "checkpoint.safetensors"
 
 LEAST_COVERED = 0.5
 """Alpha from which a pixel has a depth."""
@@ -102,7 +103,8 @@ class Snapshot:
 
         repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
         go to the raw frames: drawn as often as all of them, a few repairs would drown these.
-        A training that is done already is read back; one that was cut off goes on from its checkpoint.
+        A training that is done already is read back; one that was cut off goes on from its checkpoint, which
+        is deleted in the end.
         """
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SCENE).exists():
@@ -112,9 +114,9 @@ class Snapshot:
                 config,
                 seed=seed,
                 exposure=self.exposure,
-                pseudo_share=config.pseudo_share * repaired,
+                pseudo_share=_pseudo_share(config, views, repaired),
                 pseudo_weight=config.pseudo_weight,
-                checkpoint=folder / "checkpoint.safetensors",
+                checkpoint=folder / CHECKPOINT,
                 reporter=reporter,
                 label=label,
                 round=round,
@@ -124,20 +126,34 @@ class Snapshot:
             save_state(folder / STATE, result.state)
             write_exposure(folder / EXPOSURE, result.exposure or self._written_exposure)
             write_ply(folder / SCENE, result.scene)  # last: it says that the training is done
+        (folder / CHECKPOINT).unlink(missing_ok=True)
         return Snapshot(folder, self._device)
 
 
-def publish(snapshot: Snapshot, trainings: Sequence[Snapshot], out: Path, rejected: Snapshot | None) -> None:
-    """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all ``trainings``.
+def publish(snapshot: Snapshot, trainings: Sequence[Path], out: Path, rejected: Snapshot | None) -> None:
+    """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all ``trainings`` (the
+    folders they are kept in).
 
     A rejected scene lies beside it as ``rejected.ply``.
     """
-    logs = [read_table(training.folder / LOG, TRAIN) for training in trainings]
+    logs = [read_table(training / LOG, TRAIN) for training in trainings]
     write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
     for name in (EXPOSURE, STATE, SCENE):
         _copy(snapshot.folder / name, out / name)
     if rejected is not None:
         _copy(rejected.folder / SCENE, out / REJECTED)
+
+
+def superseded(training: Path) -> None:
+    """Drop from the folder of a finished training what only the last one is asked for: its state, which is
+    three times as large as the scene."""
+    (training / STATE).unlink(missing_ok=True)
+
+
+def _pseudo_share(config: DistilConfig, views: Sequence[View], repaired: float) -> float:
+    if isinstance(config.pseudo_share, str):  # even
+        return sum(view.kind == "pseudo" for view in views) / len(views)
+    return config.pseudo_share * repaired
 
 
 def _copy(source: Path, target: Path) -> None:

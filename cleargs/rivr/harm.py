@@ -31,10 +31,11 @@ class Verdict:
     """Whether a distilled scene may be published, with the figures that decided."""
 
     frames: tuple[int, ...]
-    psnr_before: float
-    psnr_after: float
-    score_before: float
-    score_after: float
+    """Those held back; without any nothing is judged."""
+    psnr_before: float | None
+    psnr_after: float | None
+    score_before: float | None
+    score_after: float | None
     harm: str | None
     """What became worse by more than its margin; None: the distilled scene is published."""
 
@@ -50,7 +51,10 @@ def judge_harm(
 
     Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
     ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.
+    Without frames there is no harm.
     """
+    if not frames:
+        return Verdict((), None, None, None, None, harm=None)
     worse = []
     if after.mean_psnr < before.mean_psnr - psnr_margin:
         worse.append(f"PSNR fell by {before.mean_psnr - after.mean_psnr:.2f} dB")

@@ -59,12 +59,13 @@ def run_round(
     rules: Rules,
     out: Path,
     reporter: Reporter,
+    label: str = "candidates",
 ) -> list[Selection]:
     """Repair every target frame; EXRs go to ``out/round_NN/``. Frames that have theirs are left alone."""
     folder = f"round_{number:02d}"
     (out / folder).mkdir(exist_ok=True)
     rows = []
-    with reporter.task(f"round {number}: candidates", total=len(targets)) as task:
+    with reporter.task(label, total=len(targets)) as task:
         for view in targets:
             exr = f"{folder}/{view.frame_id:06d}.exr"
             row = recorded_row(out, exr)

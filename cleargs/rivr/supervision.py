@@ -26,7 +26,8 @@ class Supervision:
     views: dict[int, View]
     appraisals: list[Appraisal]
     held_back: list[int]
-    """Frames that get no repairs, to measure whether those of the others do harm."""
+    """Frames that get no repairs, to measure whether those of the others do harm; none where the settings
+    hold none back."""
 
     @property
     def real(self) -> list[View]:
@@ -49,9 +50,11 @@ class Supervision:
         return [self.views[frame.frame_id] for frame in ranked if frame.frame_id in wanted][:count]
 
 
-def load_supervision(ingest: Path, rva: Path) -> Supervision:
+def load_supervision(ingest: Path, rva: Path, held_back: float) -> Supervision:
     """Read the finished folders of ingest and rva; frames that RVA could not score stay out. Decodes no
     image.
+
+    held_back: share of the reliable frames that judge the result.
 
     Raises StoreError when a table is damaged, StageError when no frame can judge the result.
     """
@@ -61,7 +64,7 @@ def load_supervision(ingest: Path, rva: Path) -> Supervision:
     weights = {row["frame_id"]: row.pop("weight") for row in rows}
     appraisals = sorted((Appraisal(**row) for row in rows), key=lambda frame: frame.frame_id)
     views = {a.frame_id: view_of(frames[a.frame_id], ingest, weights[a.frame_id]) for a in appraisals}
-    held_back = held_back_frames(appraisals)
-    if not held_back:
+    judges = held_back_frames(appraisals, held_back)
+    if held_back > 0.0 and not judges:
         raise StageError("no frame is reliable and none stands in", hint="run rva again with --force rva")
-    return Supervision(views, appraisals, held_back)
+    return Supervision(views, appraisals, judges)

@@ -37,9 +37,9 @@ def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collec
     ]
 
 
-def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
-    """A fixed eighth (at least one) of the reliable frames: the best by R - B of each of as many equal parts
-    of the trajectory (ties: the one nearest to the part's middle); in order.
+def held_back_frames(frames: Sequence[Appraisal], share: float = 0.125) -> list[int]:
+    """A share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many equal
+    parts of the trajectory (ties: the one nearest to the part's middle); in order.
 
     Where no frame is reliable, the stand-in set takes their place. These frames get no repairs, and judge
     the scene distilled from those of the others: a frame that is itself a little soft would call every gain
@@ -48,9 +48,9 @@ def held_back_frames(frames: Sequence[Appraisal]) -> list[int]:
     references = [frame for frame in frames if frame.reliable] or [
         frame for frame in frames if frame.stand_in
     ]
-    if not references:
+    if not references or share == 0.0:
         return []
-    count = max(1, len(references) // 8)
+    count = max(1, int(len(references) * share))
     borders = [k * len(references) // count for k in range(count + 1)]
     return [_best(references[start:end]).frame_id for start, end in pairwise(borders)]
 

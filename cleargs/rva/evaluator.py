@@ -50,6 +50,21 @@ def label(evaluator: Evaluator) -> str:
     return f"{evaluator.name}-{evaluator.version}"
 
 
+def check_evaluator(config: RvaConfig) -> None:
+    """Raise InputError when the model of the evaluator that the settings name cannot be had: nobody answers
+    at the server's address, the server has no such model, or the folder holds none that can be loaded."""
+    if config.evaluator == "statistics":
+        return
+    if config.qwen.model_dir:
+        from cleargs.rva.vlm.local import check_folder
+
+        check_folder(Path(config.qwen.model_dir).expanduser().absolute())
+        return
+    from cleargs.rva.vlm.chat import ChatClient
+
+    ChatClient(config.qwen).check_model()
+
+
 def make_evaluator(
     config: RvaConfig,
     *,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -125,5 +125,9 @@ class DistilConfig(TrainConfig):
         ge=0,
         description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
     )
-    pseudo_share: float = Field(0.7, ge=0, le=1, description="share of the steps that draw a repaired view")
+    pseudo_share: Annotated[float, Field(ge=0, le=1)] | Literal["even"] = Field(
+        0.7,
+        description="share of the steps that draw a repaired view; even: the repaired views' share of all "
+        "views, so that each is drawn as often as any raw one",
+    )
     pseudo_weight: float = Field(1.0, ge=0, description="factor on the loss of a repaired view")

@@ -116,7 +116,7 @@ def test_bad_recipes(dag: Dag, tmp_path: Path) -> None:
         read_recipe(str(wrong))
 
 
-@pytest.mark.parametrize("recipe", ["default", "smoke", "paper"])
+@pytest.mark.parametrize("recipe", ["default", "smoke", "paper", "paper-open"])
 def test_installed_recipes_fit_the_installed_stages(recipe: str) -> None:
     assert recipe in recipe_names()
     load_config(installed(), recipe)

@@ -72,6 +72,8 @@ class Count:
         weights = {"weights": Path(config.weights)} if config.weights else {}
         return {"capture": source, **weights}
 
+    def preflight(self, config: Any) -> None: ...
+
     def estimate(self, context: StageContext[Any]) -> Estimate:
         return Estimate(minutes=0.1, memory_gb=0.1, disk_gb=0.001)
 
@@ -111,6 +113,8 @@ class Square:
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
         return {}
+
+    def preflight(self, config: Any) -> None: ...
 
     def estimate(self, context: StageContext[Any]) -> Estimate:
         return Estimate(minutes=0.2, memory_gb=0.1, disk_gb=0.001)
@@ -159,6 +163,8 @@ class Total:
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
         return {}
+
+    def preflight(self, config: Any) -> None: ...
 
     def estimate(self, context: StageContext[Any]) -> Estimate:
         return Estimate(minutes=0.3, memory_gb=0.1, disk_gb=0.001)

@@ -202,6 +202,8 @@ class PreparedIngest:
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
         return {}
 
+    def preflight(self, config: Any) -> None: ...
+
     def estimate(self, context: StageContext[Any]) -> Estimate:
         return Estimate(minutes=0.1, memory_gb=0.1, disk_gb=0.001)
 

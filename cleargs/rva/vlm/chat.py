@@ -31,6 +31,7 @@ DEFAULT_URL = "http://127.0.0.1:8000/v1"
 _BUSY = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
 _LONGEST_PAUSE = 120.0  # s; also what a server may ask for with Retry-After
 _LARGEST_REPLY = 4 << 20  # bytes
+_LONGEST_CHECK = 10.0  # s to wait for the list of models
 _SHOWN = 200  # characters of a server's own words
 
 
@@ -83,6 +84,35 @@ class ChatClient:
         """End pauses between tries, and start no further ones."""
         self._stopped.set()
 
+    def check_model(self) -> None:
+        """Raise InputError when nobody answers, the server refuses the key, or it lists its models and the
+        one of the settings is not among them. A server that lists none passes."""
+        request = Request(f"{self.base_url}/models", headers=self._headers())
+        serve = f"start one (vllm serve {self._config.model}), or set rva.qwen.base_url or {URL_VARIABLE}"
+        try:
+            with self._opener.open(request, timeout=min(self._config.timeout_s, _LONGEST_CHECK)) as response:
+                served = [entry["id"] for entry in json.loads(response.read(_LARGEST_REPLY))["data"]]
+        except HTTPError as error:
+            with error:
+                if error.code in (401, 403):
+                    raise InputError(
+                        f"the server at {self.base_url} refuses the key",
+                        hint=f"put the server's key into {KEY_VARIABLE} of the environment",
+                    ) from None
+            return  # it answers; whether it has the model, the first frame will tell
+        except (OSError, http.client.HTTPException):
+            raise InputError(
+                f"no server for {self._config.model} answers at {self.base_url}", hint=serve
+            ) from None
+        except (ValueError, LookupError, TypeError, RecursionError):
+            return
+        if served and self._config.model not in served:
+            raise InputError(
+                f"the server at {self.base_url} has no model {self._config.model}; "
+                f"it has {', '.join(map(str, served))[:_SHOWN]}",
+                hint="name one with --set rva.qwen.model=NAME, or serve the other",
+            )
+
     def complete(self, body: Mapping[str, Any]) -> str:
         """The text of the reply to the chat ``body``.
 
@@ -103,9 +133,7 @@ class ChatClient:
         raise AssertionError("attempts is at least 1")
 
     def _once(self, data: bytes) -> str:
-        headers = {"Content-Type": "application/json", "Accept": "application/json"}
-        if self._key:
-            headers["Authorization"] = f"Bearer {self._key}"
+        headers = {"Content-Type": "application/json"} | self._headers()
         request = Request(f"{self.base_url}/chat/completions", data=data, headers=headers, method="POST")
         deadline = time.monotonic() + self._config.timeout_s
         try:
@@ -121,6 +149,10 @@ class ChatClient:
         except (ValueError, LookupError, TypeError, RecursionError):
             raise _TransientError("the server's answer is no chat completion, or breaks off") from None
         return text if isinstance(text, str) else ""
+
+    def _headers(self) -> dict[str, str]:
+        key = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        return {"Accept": "application/json"} | key
 
     def _refusal(self, error: HTTPError) -> Exception:
         """What an HTTP status other than 2xx means for us."""

@@ -78,31 +78,47 @@ class LocalJudge:
             raise UnscoredError(f"the reply cannot be used: {fault}") from None
 
 
-def _load(folder: Path, device: Literal["cpu", "cuda"]) -> _Loaded:
-    """Raises InputError when the extra is not installed or the folder holds no such model."""
+def check_folder(folder: Path) -> None:
+    """Raise InputError when the extra is not installed or the folder is not that of a Qwen3-VL model. Reads
+    no weights."""
     try:
-        import llguidance
-        import llguidance.hf
-        from transformers import AutoConfig, AutoModelForImageTextToText, AutoTokenizer
-        from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-        from transformers.utils.logging import disable_progress_bar
+        import llguidance.hf  # noqa: F401
+        from transformers import AutoConfig
     except ImportError as error:
         raise InputError(
             f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
         ) from error
-    disable_progress_bar()
     try:
         kind = AutoConfig.from_pretrained(folder, local_files_only=True).model_type
         if kind not in _ARCHITECTURES:
             raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
+    except (OSError, ValueError, KeyError) as error:
+        raise _unusable(folder, error) from error
+
+
+def _unusable(folder: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
+        hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
+    )
+
+
+def _load(folder: Path, device: Literal["cpu", "cuda"]) -> _Loaded:
+    """Raises InputError as `check_folder`, and when the weights cannot be loaded."""
+    check_folder(folder)
+    import llguidance
+    import llguidance.hf
+    from transformers import AutoModelForImageTextToText, AutoTokenizer
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+    from transformers.utils.logging import disable_progress_bar
+
+    disable_progress_bar()
+    try:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         images = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
         model = AutoModelForImageTextToText.from_pretrained(folder, local_files_only=True, dtype="auto")
     except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"{folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
-            hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
-        ) from error
+        raise _unusable(folder, error) from error
     vocabulary = llguidance.hf.from_tokenizer(tokenizer, n_vocab=model.config.get_text_config().vocab_size)
     grammar = llguidance.LLMatcher.grammar_from_json_schema(
         reply_schema(), defaults={"whitespace_flexible": False}

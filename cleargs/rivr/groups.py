@@ -1,0 +1,40 @@
+"""Along the trajectory: a round's target frames in groups, which share the steps of its distillation.
+
+The paper repairs along the trajectory: what is accepted early is distilled before later frames are rendered,
+and may fade while theirs are. That is what the consolidation is for.
+
+Each group's distillation is a training of its own, with fresh Adam moments and the whole decay of the means'
+rate. One decay over the round would leave the last groups a hundredth of the first one's rate, and so the end
+of the trajectory hardly any geometry of its own. As each group runs through the same decay, the rates of a
+round add up to the same whatever the number of groups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from cleargs.splat.views import View
+
+
+@dataclass(frozen=True)
+class Group:
+    """Target frames that are rendered from one scene."""
+
+    targets: Sequence[View]
+    steps: int
+    """That distil what was accepted so far, after its frames."""
+
+
+def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> list[Group]:
+    """``targets`` in their order, in as few groups of at most ``size`` frames as hold them, all in one for
+    None; sizes differ by one at most. ``steps`` is shared in proportion to the frames and adds up exactly.
+    """
+    frames = len(targets)
+    count = 1 if size is None else max(1, -(-frames // size))
+    borders = [k * frames // count for k in range(count + 1)]
+    return [
+        Group(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
+        for start, end in pairwise(borders)
+    ]
