@@ -14,13 +14,14 @@ CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
-    "g0": ("scene.ply", "exposure.parquet", "state.safetensors"),
+    "g0": ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors"),
 }
 OUTPUTS = (
     "selection.parquet",
     "scene.ply",
     "train.parquet",
     "exposure.parquet",
+    "formation.parquet",
     "state.safetensors",
     "candidates.png",
 )
@@ -117,7 +118,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
             number,
             targets,
             current.render,
-            partial(restored, depth_of=current.depth),
+            partial(restored, deblur=current.deblur),
             rules,
             context.out,
             reporter,
