@@ -13,10 +13,11 @@ CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
-    "g0": ("scene.ply", "exposure.parquet", "state.safetensors"),
+    "g0": ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors"),
     "rivr": (
         "scene.ply",
         "exposure.parquet",
+        "formation.parquet",
         "state.safetensors",
         "selection.parquet",
         *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1)),
@@ -27,6 +28,7 @@ OUTPUTS = (
     "repairs.parquet",
     "train.parquet",
     "exposure.parquet",
+    "formation.parquet",
     "state.safetensors",
     "before_after.png",
 )

@@ -10,7 +10,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.splat.config import G0Config
 
 if TYPE_CHECKING:
-    from cleargs.splat.compensation import Exposure
+    from cleargs.formation.colour import Exposure
     from cleargs.splat.gaussians import Gaussians
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
@@ -21,7 +21,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
 }
-OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "state.safetensors")
+OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet", "state.safetensors")
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 _SECONDS_PER_STEP = 0.02
@@ -56,15 +56,18 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 def run(context: StageContext[G0Config]) -> StageResult:
     """Sparse points -> Gaussians -> trained on the active frames, each with its RVA weight."""
     from cleargs.capture.tables import load_frames
+    from cleargs.formation.capture import CaptureFormation
+    from cleargs.formation.colour import Exposure, write_exposure
+    from cleargs.formation.photograph import evaluate_views
+    from cleargs.formation.table import write_formation
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
-    from cleargs.splat.compensation import Exposure, write_exposure
     from cleargs.splat.initialise import sh_degree_from_views
     from cleargs.splat.kernels.runtime import set_threads
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
-    from cleargs.splat.trainer import evaluate_views, train
+    from cleargs.splat.trainer import train
     from cleargs.splat.views import real_views, require_views
     from cleargs.tables import read_table, write_table
 
@@ -78,12 +81,13 @@ def run(context: StageContext[G0Config]) -> StageResult:
     sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree
     gaussians = _start(context, views, sparse, sh_degree)
     exposure, spread = _exposure(config, views, sparse)
+    formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
     trained = train(
         Scene(gaussians, config.antialias, config.background),
         views,
         config,
         seed=(context.seed,),
-        exposure=exposure,
+        formation=formation,
         checkpoint=context.checkpoints / "g0.safetensors",
         reporter=context.reporter,
         label="G0",
@@ -91,13 +95,19 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
-    learned = trained.exposure or Exposure.identity([view.frame_id for view in views])
+    learned = formation.exposure or Exposure.identity([view.frame_id for view in views])
     write_exposure(context.out / "exposure.parquet", learned)
+    weights = {view.frame_id: view.weight for view in views}
+    write_formation(context.out / "formation.parquet", formation, weights)
     save_state(context.out / "state.safetensors", trained.state)
 
     on_device = trained.scene.to(context.device)
     psnr = dict(
-        zip((view.frame_id for view in views), evaluate_views(on_device, views, learned), strict=True)
+        zip(
+            (view.frame_id for view in views),
+            evaluate_views(on_device, views, learned, formation.frames),
+            strict=True,
+        )
     )
     strong = [row["frame_id"] for row in allocation if row["role"] == "strong"]
     return StageResult(
@@ -149,7 +159,7 @@ def _exposure(
     config: G0Config, views: list[View], sparse: SparsePoints
 ) -> tuple[Exposure | None, float | None]:
     """Affines to learn, or None; and the measured spread of the frames' gains."""
-    from cleargs.splat.compensation import Exposure, frame_gains, gain_spread
+    from cleargs.formation.colour import Exposure, frame_gains, gain_spread
 
     if config.exposure == "off":
         return None, None

@@ -23,13 +23,14 @@ CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
-    "g0": ("scene.ply", "exposure.parquet", "state.safetensors"),
+    "g0": ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors"),
 }
 OUTPUTS = (
     "selection.parquet",
     "scene.ply",
     "train.parquet",
     "exposure.parquet",
+    "formation.parquet",
     "state.safetensors",
     "candidates.png",
 )
@@ -197,7 +198,8 @@ def _repair_and_distil(
                 number,
                 group.targets,
                 current.render,
-                partial(restored, depth_of=current.depth),
+                partial(restored, deblur=current.deblur),
+                current.explained,
                 rules,
                 context.out,
                 reporter,

@@ -9,35 +9,34 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import torch
-from numpy.typing import NDArray
 
 from cleargs.files import atomic_path
+from cleargs.formation.capture import CaptureFormation, FormedView, FrameFormation, explain
+from cleargs.formation.colour import Exposure, apply_affine, read_exposure, write_exposure
+from cleargs.formation.photograph import photograph
+from cleargs.formation.table import read_formation, write_formation
+from cleargs.formation.undo import undo
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
 from cleargs.rivr.harm import Fidelity
-from cleargs.rivr.motion.undo import as_photographed
-from cleargs.rivr.restoring import observation
+from cleargs.rivr.restoring import Deblurred, Explained, observation
 from cleargs.rivr.selection import hide_masked
-from cleargs.splat.compensation import Exposure, read_exposure, write_exposure
-from cleargs.splat.config import DistilConfig
-from cleargs.splat.engine import Engine
+from cleargs.splat.camera import Camera
+from cleargs.splat.config import DistilConfig, FormationConfig
+from cleargs.splat.engine import Engine, Render
 from cleargs.splat.losses import psnr
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import render_view, train
+from cleargs.splat.trainer import train
 from cleargs.splat.views import View
 from cleargs.tables import read_table, write_table
 
-SCENE, EXPOSURE, STATE, LOG = "scene.ply", "exposure.parquet", "state.safetensors", "train.parquet"
+SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
+EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"
 REJECTED = "rejected.ply"
 CHECKPOINT = "checkpoint.safetensors"
-
-LEAST_COVERED = 0.5
-"""Alpha from which a pixel has a depth."""
-NEAREST = 0.05
-"""Of the median depth: floaters before the lens lie nearer."""
 
 
 class Snapshot:
@@ -48,6 +47,7 @@ class Snapshot:
         self._device = device
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
+        self.formations, self._weights = read_formation(folder / FORMATION)
         self._engine = Engine(device)
 
     @property
@@ -57,20 +57,60 @@ class Snapshot:
 
     def render(self, view: View) -> Image:
         """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
-        image: Image = render_view(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
+        image: Image = photograph(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
-    def depth(self, view: View) -> NDArray[np.float32]:
-        """Mean depth along the optical axis, [H, W]; the median where the scene is empty or all too near."""
-        rendered = self._engine.forward(
-            self.scene.gaussians, view.camera, antialias=self.scene.antialias, depth=True
+    def photograph(self, view: View) -> Image:
+        """The scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
+        formation = self.formations.get(view.frame_id)
+        image: Image = (
+            photograph(self.scene, view, self.exposure, formation, engine=self._engine).cpu().numpy()
         )
-        assert rendered.depth is not None
-        covered, depth = rendered.alpha.cpu().numpy(), rendered.depth.cpu().numpy()
-        mean = depth / np.maximum(covered, LEAST_COVERED)
-        median = np.median(mean[covered > LEAST_COVERED]) if (covered > LEAST_COVERED).any() else 1.0
-        usable = (covered > LEAST_COVERED) & (mean > NEAREST * median)
-        return np.where(usable, mean, median).astype(np.float32)
+        return image
+
+    def explained(self, view: View) -> Explained | None:
+        """What the training found of a raw frame's camera; None where that is nothing."""
+        formation = self.formations.get(view.frame_id)
+        if formation is None or formation.model == "none":
+            return None
+        return Explained(self.photograph(view), formation, self._weights[view.frame_id])
+
+    def deblur(self, view: View) -> Deblurred | None:
+        """The raw frame without what the camera did to it, found by comparing it with the scene; None where
+        nothing explains the frame better than the render as it is."""
+        observed, mask = observation(view)
+        affine = (
+            None
+            if self.exposure is None
+            else torch.from_numpy(self.exposure.of(view.frame_id).astype(np.float32))
+        )
+        found = explain(
+            self.formations.get(view.frame_id, FrameFormation(view.frame_id)),
+            FormationConfig(),
+            view.camera,
+            affine,
+            torch.from_numpy(observed),
+            None if mask is None else torch.from_numpy(mask),
+            self._with_depth,
+        )
+        if found.model == "none":
+            return None
+        formed = FormedView(view.camera, 1.0, affine=affine, formation=found)
+        render = self._with_depth(formed.camera)
+        warp = formed.warp(render)
+        shown = render.image if affine is None else apply_affine(render.image, affine)
+        weight = np.ones(observed.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+        image = undo(shown.clamp(0.0, 1.0).cpu().numpy(), observed, weight, warp)
+        return Deblurred(image, found)
+
+    def _with_depth(self, camera: Camera) -> Render:
+        return self._engine.forward(
+            self.scene.gaussians,
+            camera,
+            background=self.scene.background,
+            antialias=self.scene.antialias,
+            depth=True,
+        )
 
     def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity:
         """How well the scene explains the held-back frames.
@@ -81,7 +121,7 @@ class Snapshot:
         values, scores = [], []
         for view in judges:
             render, (observed, mask) = self.render(view), observation(view)
-            photographed = as_photographed(render, observed, mask, view.camera, self.depth(view))
+            photographed = self.photograph(view)
             counted = None if mask is None else torch.from_numpy(mask)
             values.append(psnr(torch.from_numpy(photographed), torch.from_numpy(observed), counted))
             scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
@@ -108,12 +148,19 @@ class Snapshot:
         """
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SCENE).exists():
+            formation = CaptureFormation(
+                views,
+                config.formation,
+                exposure=self.exposure,
+                lr_exposure=config.lr_exposure,
+                known=self.formations,
+            )
             result = train(
                 self.scene,
                 views,
                 config,
                 seed=seed,
-                exposure=self.exposure,
+                formation=formation,
                 pseudo_share=_pseudo_share(config, views, repaired),
                 pseudo_weight=config.pseudo_weight,
                 checkpoint=folder / CHECKPOINT,
@@ -124,7 +171,9 @@ class Snapshot:
             )
             write_table(folder / LOG, result.rows, TRAIN)
             save_state(folder / STATE, result.state)
-            write_exposure(folder / EXPOSURE, result.exposure or self._written_exposure)
+            write_exposure(folder / EXPOSURE, formation.exposure or self._written_exposure)
+            weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
+            write_formation(folder / FORMATION, formation, weights)
             write_ply(folder / SCENE, result.scene)  # last: it says that the training is done
         (folder / CHECKPOINT).unlink(missing_ok=True)
         return Snapshot(folder, self._device)
@@ -138,7 +187,7 @@ def publish(snapshot: Snapshot, trainings: Sequence[Path], out: Path, rejected: 
     """
     logs = [read_table(training / LOG, TRAIN) for training in trainings]
     write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
-    for name in (EXPOSURE, STATE, SCENE):
+    for name in (EXPOSURE, FORMATION, STATE, SCENE):
         _copy(snapshot.folder / name, out / name)
     if rejected is not None:
         _copy(rejected.folder / SCENE, out / REJECTED)

@@ -8,13 +8,33 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import StoreError
+from cleargs.formation.capture import FrameFormation
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.rivr.candidates import Image, Source
-from cleargs.rivr.motion.undo import Deblurred, deblur
 from cleargs.splat.views import Mask, View
+
+
+@dataclass(frozen=True, eq=False)
+class Deblurred:
+    """A raw frame without what its camera did to it."""
+
+    image: Image
+    """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
+    formation: FrameFormation
+    """What was undone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A raw frame as the training explains it."""
+
+    image: Image
+    """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
+    formation: FrameFormation
+    weight: float
+    """With which the frame taught at the end: RVA's, or what it has earned by being explained."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +58,13 @@ class Restorations:
         self._use_observation = use_observation
         self._undo_motion = undo_motion
 
-    def __call__(
-        self, view: View, render: Image, depth_of: Callable[[View], NDArray[np.float32]]
-    ) -> Restoration:
-        """D_t in the light of the render R_t and of the scene's depth."""
+    def __call__(self, view: View, render: Image, deblur: Callable[[View], Deblurred | None]) -> Restoration:
+        """D_t in the light of the render R_t; ``deblur`` undoes what the scene says of the frame's camera."""
         if not self._use_observation:
             return Restoration(self._restore(render), "render")
-        observed, mask = observation(view)
-        if not self._undo_motion:
-            return Restoration(self._restored_observation(view, observed), "observation")
-        deblurred = deblur(render, observed, mask, view.camera, depth_of(view))
+        deblurred = deblur(view) if self._undo_motion else None
+        if deblurred is None:
+            return Restoration(self._restored_observation(view, observation(view)[0]), "observation")
         return Restoration(self._restore(deblurred.image), "deblurred", deblurred)
 
     def _restored_observation(self, view: View, observed: Image) -> Image:

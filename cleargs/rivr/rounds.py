@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from cleargs.errors import StoreError
+from cleargs.formation.capture import described
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, Image, fuse
 from cleargs.rivr.config import GateConfig
 from cleargs.rivr.gates import REFUSED, all_masked, objection
-from cleargs.rivr.restoring import Restoration, observation
+from cleargs.rivr.restoring import Explained, Restoration, observation
 from cleargs.rivr.results import chosen_counts
 from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
 from cleargs.rivr.tables import SELECTION, Selection
@@ -35,6 +36,13 @@ Renderer = Callable[[View], Image]
 """The current scene at a view, through the frame's exposure: R_t."""
 Restorer = Callable[[View, Image], Restoration]
 """D_t, given the view and its render R_t."""
+Explainer = Callable[[View], Explained | None]
+"""What the training found of a raw frame's camera."""
+
+TRUSTED = 0.5
+"""Weight from which a frame that the formation explains goes on teaching by itself instead of by a repair."""
+EXPLAINED = "explained: "
+"""How the reason of such a frame begins."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +64,7 @@ def run_round(
     targets: Sequence[View],
     render: Renderer,
     restore: Restorer,
+    explain: Explainer,
     rules: Rules,
     out: Path,
     reporter: Reporter,
@@ -71,7 +80,8 @@ def run_round(
             row = recorded_row(out, exr)
             if row is None:
                 rendered = render(view)
-                row, image = repair(number, view, exr, rendered, restore(view, rendered), rules)
+                restoration = restore(view, rendered)
+                row, image = repair(number, view, exr, rendered, restoration, explain(view), rules)
                 write_exr(out / exr, image)
             rows.append(row)
             task.update(done=len(rows), note=_tally(rows))
@@ -79,7 +89,13 @@ def run_round(
 
 
 def repair(
-    number: int, view: View, exr: str, rendered: Image, restoration: Restoration, rules: Rules
+    number: int,
+    view: View,
+    exr: str,
+    rendered: Image,
+    restoration: Restoration,
+    explained: Explained | None,
+    rules: Rules,
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -99,18 +115,21 @@ def repair(
         for scorer in (rules.primary, rules.tiebreak)
     )
     raw_scores: tuple[float, float] | tuple[None, None] = (None, None)
-    kept = False
+    kept: str | None = None
     if rules.keep_raw:
         raw_scores = (
             _score(rules.primary, observed, rules.threads),
             _score(rules.tiebreak, observed, rules.threads),
         )
-        kept = (
+        if explained is not None and explained.weight >= TRUSTED:
+            kept = f"{EXPLAINED}{described(explained.formation)}"
+        elif (
             view.weight > 0.0  # without its repair a frame of no weight would be lost
             and unbeaten(raw_scores[0], primary, rules.margin)
             and unbeaten(raw_scores[1], tiebreak, rules.margin)
             and hardly_changes(observed, shown["restored"], shown["render"])
-        )
+        ):
+            kept = KEPT
     refused = objection(shown["restored"], observed, shown["render"], rules.gate)
     choice = (
         choose(primary, tiebreak, rules.margin)
@@ -134,15 +153,17 @@ def repair(
         tiebreak_fused=tiebreak.get("fused"),
         tiebreak_observed=raw_scores[1],
         restored_from=restoration.source,
-        blur_px=None if deblurred is None else float(np.float32(deblurred.blur_px)),
-        skew_px=None if deblurred is None else float(np.float32(deblurred.skew_px)),
+        blur_px=None if deblurred is None else float(np.float32(deblurred.formation.blur_px)),
+        skew_px=None if deblurred is None else float(np.float32(deblurred.formation.skew_px)),
         chosen="observed" if kept else choice.chosen,
-        accepted=masked is None and not kept,
-        reason=masked or (KEPT if kept else choice.reason),
+        accepted=masked is None and kept is None,
+        reason=masked or kept or choice.reason,
     )
     layers["observed"] = to_layer(observed)
     if deblurred is not None:
         layers["deblurred"] = to_layer(deblurred.image)
+    if explained is not None:
+        layers["explained"] = to_layer(explained.image)
     return row, LayeredImage(layers, _attributes(row))
 
 

@@ -7,6 +7,29 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
+class FormationConfig(BaseModel):
+    """What the camera did to each raw frame, found during the training and put into its loss."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    enabled: bool = Field(
+        True,
+        description="compare raw frames with the render as their camera saw it: blurred by its motion, "
+        "skewed by its rolling shutter, out of focus",
+    )
+    start: float = Field(0.25, ge=0, le=1, description="share of the steps before frames are first asked")
+    every: int = Field(10, ge=1, description="a frame is asked again after so many steps on it")
+    accept: float = Field(
+        0.02, ge=0, le=1, description="share of a frame's misfit that a model must explain to be taken"
+    )
+    trust: float = Field(
+        1.0,
+        ge=0,
+        description="how fast an explained frame loses weight with what is left unexplained; 0: never",
+    )
+    pose: bool = Field(False, description="correct the pose of a frame along with its motion")
+
+
 class TrainConfig(BaseModel):
     """How a scene is optimised.
 
@@ -63,6 +86,8 @@ class TrainConfig(BaseModel):
         ge=0,
         description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
     )
+
+    formation: FormationConfig = Field(FormationConfig(), description="what the camera did to each raw frame")
 
     checkpoint_interval: int = Field(
         200,
@@ -124,6 +149,9 @@ class DistilConfig(TrainConfig):
         0,
         ge=0,
         description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
+    )
+    formation: FormationConfig = Field(
+        FormationConfig(start=0.0), description="what the camera did to each raw frame"
     )
     pseudo_share: Annotated[float, Field(ge=0, le=1)] | Literal["even"] = Field(
         0.7,

@@ -12,27 +12,27 @@ import math
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.progress import Reporter, Task
 from cleargs.splat import strategy
-from cleargs.splat.compensation import Exposure
+from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.densification import Densifier
-from cleargs.splat.engine import Engine
-from cleargs.splat.exposure import affine_backward, apply_affine
+from cleargs.splat.engine import Engine, Render
+from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
-from cleargs.splat.optimiser import ExposureOptimiser, Moments, Rates, step_gaussians
+from cleargs.splat.optimiser import Moments, Rates, step_gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog
@@ -56,8 +56,6 @@ class Trained:
     """What a training leaves."""
 
     scene: Scene
-    exposure: Exposure | None
-    """The learned affines; None where exposure was off."""
     rows: pa.Table
     """One row a step, schema `cleargs.splat.tables.TRAIN`."""
     state: dict[str, Tensor]
@@ -70,7 +68,7 @@ def train(
     config: TrainConfig,
     *,
     seed: Sequence[int],
-    exposure: Exposure | None = None,
+    formation: Formation | None = None,
     pseudo_share: float = 0.0,
     pseudo_weight: float = 1.0,
     checkpoint: Path,
@@ -81,9 +79,10 @@ def train(
 ) -> Trained:
     """Train ``scene`` on ``views`` for ``config.steps`` steps with fresh Adam moments.
 
-    ``seed`` is the only source of randomness. ``exposure`` None trains without affines; otherwise those given
-    go on being learned. A share ``pseudo_share`` of the steps draws a pseudo view, whose loss is multiplied
-    by ``pseudo_weight``. Goes on from ``checkpoint`` where there is one, to the same result bit for bit.
+    ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
+    otherwise with what the formation makes of it, which goes on learning in place. A share ``pseudo_share``
+    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Goes on from
+    ``checkpoint`` where there is one, to the same result bit for bit.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
     loss ceases to be finite.
@@ -93,7 +92,7 @@ def train(
         views,
         config,
         seed=seed,
-        exposure=exposure,
+        formation=formation,
         pseudo_share=pseudo_share,
         pseudo_weight=pseudo_weight,
         device=device,
@@ -118,7 +117,7 @@ def train(
         trainer.check_finite()
         progress.show()
     state = {name: tensor.cpu() for name, tensor in trainer.state().items()}
-    return Trained(trainer.scene.to("cpu"), trainer.exposure, trainer.rows(round), state)
+    return Trained(trainer.scene.to("cpu"), trainer.rows(round), state)
 
 
 class Trainer:
@@ -131,7 +130,7 @@ class Trainer:
         config: TrainConfig,
         *,
         seed: Sequence[int],
-        exposure: Exposure | None = None,
+        formation: Formation | None = None,
         pseudo_share: float = 0.0,
         pseudo_weight: float = 1.0,
         device: str = "cpu",
@@ -159,25 +158,24 @@ class Trainer:
             sum(view.camera.width * view.camera.height for view in self._real or self._pseudo)
         )
         self._densifier = Densifier(config, budget, seed)
-        self._exposure = (
-            None if exposure is None else _exposure_optimiser(exposure, weighted, config.lr_exposure)
-        )
+        self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device)
         self._meter = _meter(config, self._device)
         self._log = TrainLog(config.steps)
         self._slopes: dict[tuple[int, int], Tensor] = {}
-        self._fingerprint = _fingerprint(scene, weighted, config, [*self._seed, self._share, pseudo_weight])
+        starts: list[float | str] = [
+            *self._seed,
+            self._share,
+            pseudo_weight,
+            "" if formation is None else formation.digest(),
+        ]
+        self._fingerprint = _fingerprint(scene, weighted, config, starts)
         self.done = 0
 
     @property
     def scene(self) -> Scene:
         """The scene as trained so far (shares memory with the trainer)."""
         return replace(self._scene, gaussians=self._gaussians)
-
-    @property
-    def exposure(self) -> Exposure | None:
-        """The affines learned so far; None where exposure is off."""
-        return None if self._exposure is None else self._exposure.exposure
 
     @property
     def last_psnr(self) -> float:
@@ -190,30 +188,23 @@ class Trainer:
         config, view = self._config, self._view(self.done)
         factor = config.coarse_factor if self.done < config.coarse_share * config.steps else 1.0
         target, mask = self._cache.get(view, factor)
-        weight = view.weight * (self._pseudo_weight if view.kind == "pseudo" else 1.0)
-        sh_degree = self._sh_degree()
-        render = self._engine.forward(
-            self._gaussians,
-            view.camera.scaled(factor),
-            sh_degree=sh_degree,
-            background=self._scene.background,
-            antialias=self._scene.antialias,
+        formed = self._formed(view, factor, target, mask)
+        weight = view.weight if formed is None else formed.weight
+        weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
+        render = self._render(
+            view.camera.scaled(factor) if formed is None else formed.camera,
+            depth=formed is not None and formed.needs_depth,
         )
-        image = render.image
-        if self._exposure is not None:
-            affine = self._exposure.affine(view.frame_id)
-            image = apply_affine(render.image, affine)
-        self._log.seen(self.done, view, weight, target, self._gaussians.num, sh_degree)
+        image = render.image if formed is None else formed.forward(render)
+        self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
-        if self._exposure is not None:
-            slope, affine_slope = affine_backward(render.image, affine, slope)
-        gradients = self._engine.backward(slope)
+        gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
         _regularise(self._gaussians, gradients, config)
         step_gaussians(
             self._gaussians, gradients, self._moments, self._rates.at(self.done), step=self.done + 1
         )
-        if self._exposure is not None:  # last, since it may have to wait for the device
-            self._exposure.step(view.frame_id, affine_slope.cpu().numpy())
+        if formed is not None:  # last, since it may have to wait for the device
+            formed.learn()
         self.done += 1
         if config.densify:
             self._densify()
@@ -222,8 +213,8 @@ class Trainer:
         """Raise StageError, naming the step and the group, when a parameter is NaN or infinite."""
         if fault := _fault(self._gaussians):
             raise self._stopped(fault)
-        if self._exposure is not None and not np.isfinite(self._exposure.affines).all():
-            raise self._stopped("exposure is not finite")
+        if self._formation is not None and (fault := self._formation.fault()):
+            raise self._stopped(fault)
 
     def state(self) -> dict[str, Tensor]:
         """All that a training needs to go on: parameters, moments, affines, step and the log so far."""
@@ -236,10 +227,8 @@ class Trainer:
         groups = (self._gaussians.tensors(), self._moments.first, self._moments.second)
         for prefix, group in zip(("parameter", "first", "second"), groups, strict=True):
             state |= {f"{prefix}.{name}": tensor for name, tensor in group.items()}
-        if self._exposure is not None:
-            state |= {
-                f"exposure.{name}": torch.from_numpy(array) for name, array in self._exposure.arrays().items()
-            }
+        if self._formation is not None:
+            state |= {f"formation.{name}": tensor for name, tensor in self._formation.state().items()}
         return state
 
     def wrote(self, state: dict[str, Tensor]) -> bool:
@@ -258,8 +247,8 @@ class Trainer:
         self._log.restore(state["log"])
         self._gaussians = Gaussians(**group("parameter")).to(self._device)
         self._moments = Moments(*(self._on_device(group(prefix)) for prefix in ("first", "second")))
-        if self._exposure is not None:
-            self._exposure.restore({name: tensor.numpy() for name, tensor in group("exposure").items()})
+        if self._formation is not None:
+            self._formation.restore(group("formation"))
 
     def rows(self, round: int) -> pa.Table:
         """The log so far, one row a step."""
@@ -276,6 +265,22 @@ class Trainer:
         epoch, position = divmod(count, len(views))
         order = self._rng(purpose, epoch).permutation(len(views))
         return views[int(order[position])]
+
+    def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
+        if self._formation is None:
+            return None
+        progress = self.done / self._config.steps
+        return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
+
+    def _render(self, camera: Camera, *, depth: bool) -> Render:
+        return self._engine.forward(
+            self._gaussians,
+            camera,
+            sh_degree=self._sh_degree(),
+            background=self._scene.background,
+            antialias=self._scene.antialias,
+            depth=depth,
+        )
 
     def _sh_degree(self) -> int:
         interval = self._config.sh_interval
@@ -353,37 +358,6 @@ def _all_finite(tensors: Collection[Tensor]) -> bool:
     return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
 
 
-def render_view(
-    scene: Scene, view: View, exposure: Exposure | None = None, *, engine: Engine | None = None
-) -> Tensor:
-    """What ``scene`` shows at a view, through the frame's affine: [H, W, 3] sRGB in [0, 1], own memory."""
-    engine = engine or Engine(str(scene.gaussians.device))
-    image = engine.forward(
-        scene.gaussians, view.camera, background=scene.background, antialias=scene.antialias
-    ).image
-    if exposure is not None:
-        image = apply_affine(image, torch.from_numpy(exposure.of(view.frame_id).astype(np.float32)))
-    return image.clamp(0.0, 1.0)
-
-
-def evaluate_views(
-    scene: Scene,
-    views: Sequence[View],
-    exposure: Exposure | None = None,
-    *,
-    engine: Engine | None = None,
-    cache: ImageCache | None = None,
-) -> list[float]:
-    """PSNR in dB of the scene at every view, in their order, over unmasked pixels, at full size."""
-    engine = engine or Engine(str(scene.gaussians.device))
-    cache = cache or ImageCache(0, scene.gaussians.device)
-    values = []
-    for view in views:
-        target, mask = cache.get(view)
-        values.append(psnr(render_view(scene, view, exposure, engine=engine), target, mask))
-    return values
-
-
 class _Progress:
     """Iterations a second, PSNR and Gaussians, for the progress bar alone (which adds the time left)."""
 
@@ -409,12 +383,12 @@ def _meter(config: TrainConfig, device: torch.device) -> Meter | None:
 
 
 def _fingerprint(
-    scene: Scene, views: Sequence[View], config: TrainConfig, numbers: Sequence[float]
+    scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
     seen = [(view.frame_id, view.kind, view.weight, view.camera.width, view.camera.height) for view in views]
-    digest = hashlib.sha256(json.dumps([settings, seen, list(numbers)], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([settings, seen, list(starts)], sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
@@ -438,14 +412,3 @@ def _regularise(gaussians: Gaussians, gradients: Gaussians, config: TrainConfig)
     if config.scale_reg > 0.0:
         scales = np.exp(gaussians.log_scales.numpy())
         gradients.log_scales.numpy()[:] += np.float32(config.scale_reg / scales.size) * scales
-
-
-def _exposure_optimiser(exposure: Exposure, views: Sequence[View], rate: float) -> ExposureOptimiser:
-    """Affines for every frame given or seen; the mean counts the weights of the real views."""
-    frame_ids = np.union1d(exposure.frame_ids, [view.frame_id for view in views]).astype(np.int32)
-    weights: NDArray[np.float64] = np.zeros(len(frame_ids))
-    for view in views:
-        if view.kind == "real":
-            weights[np.searchsorted(frame_ids, view.frame_id)] = view.weight
-    known = Exposure(frame_ids, np.stack([exposure.of(int(frame_id)) for frame_id in frame_ids]))
-    return ExposureOptimiser(known, weights, rate)

@@ -23,9 +23,9 @@ from typing import Any
 import torch
 
 from cleargs.capture.tables import load_frames
+from cleargs.formation.colour import read_exposure
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
-from cleargs.splat.compensation import read_exposure
 from cleargs.splat.config import G0Config
 from cleargs.splat.ply import read_ply
 from cleargs.splat.trainer import evaluate_views

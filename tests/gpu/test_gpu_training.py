@@ -11,12 +11,12 @@ import splat_toy
 import torch
 
 from cleargs.errors import InputError, StageError
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.colour import Exposure, affine_backward, apply_affine
 from cleargs.progress import SilentReporter
 from cleargs.splat import strategy
 from cleargs.splat.adam import adam_step
-from cleargs.splat.compensation import Exposure
-from cleargs.splat.config import TrainConfig
-from cleargs.splat.exposure import affine_backward, apply_affine
+from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.losses import photometric_loss, psnr, ssim
 from cleargs.splat.state import load_state
@@ -240,13 +240,13 @@ def toy(monkeypatch):
     return splat_toy.views(pictures, weights=[1.0, 0.5, 0.25])
 
 
-def trained_on(device, views, folder, *, config=CONFIG, exposure=None):
+def trained_on(device, views, folder, *, config=CONFIG, formation=None):
     return train(
         splat_toy.start(12, sh_degree=1),
         views,
         config,
         seed=(7,),
-        exposure=exposure,
+        formation=formation,
         checkpoint=folder / "state.safetensors",
         reporter=SilentReporter(),
         device=str(device),
@@ -254,12 +254,17 @@ def trained_on(device, views, folder, *, config=CONFIG, exposure=None):
 
 
 def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_path):
-    exposure = Exposure.identity([view.frame_id for view in toy])
-    whole = trained_on(device, toy, tmp_path, exposure=exposure)
+    def formation():
+        identity = Exposure.identity([view.frame_id for view in toy])
+        config = FormationConfig(start=0.5, every=2)
+        return CaptureFormation(toy, config, exposure=identity, lr_exposure=CONFIG.lr_exposure)
+
+    learned = formation()
+    whole = trained_on(device, toy, tmp_path, formation=learned)
     assert whole.scene.gaussians.num == 14
     assert whole.scene.gaussians.device.type == "cpu"
-    assert whole.exposure is not None
-    assert whole.exposure.enabled
+    assert learned.exposure is not None
+    assert learned.exposure.enabled
     rows = whole.rows.to_pydict()
     assert rows["step"] == [1, 2, 3, 4, 5]
     assert rows["width"] == [10, 10, 20, 20, 20]
@@ -269,7 +274,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
     saved = load_state(tmp_path / "state.safetensors", SilentReporter())
     assert saved is not None
     assert int(saved["step"]) == 3
-    resumed = trained_on(device, toy, tmp_path, exposure=exposure)
+    resumed = trained_on(device, toy, tmp_path, formation=formation())
     assert resumed.rows.equals(whole.rows)
     for name, tensor in whole.state.items():
         assert torch.equal(tensor, resumed.state[name]), name

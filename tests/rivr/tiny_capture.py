@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from cleargs.capture.tables import FRAMES
 from cleargs.files import write_json
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.colour import Exposure, write_exposure
+from cleargs.formation.table import write_formation
 from cleargs.media.image import write_mask, write_rgb
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rivr.config import ConsolidateConfig, RivrConfig
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.splat.camera import Camera
-from cleargs.splat.compensation import Exposure, write_exposure
+from cleargs.splat.config import FormationConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.render import render
@@ -153,6 +156,7 @@ def write_capture(root: Path) -> None:
     disturbed.log_scales += torch.from_numpy(noise.astype(np.float32)) + 0.2
     write_ply(g0 / "scene.ply", Scene(disturbed))
     write_exposure(g0 / "exposure.parquet", Exposure.identity([0, 2, 3, 4, 5, 6]))
+    write_formation(g0 / "formation.parquet", CaptureFormation([], FormationConfig()), {})
     save_state(g0 / "state.safetensors", {"step": torch.tensor(0)})
     write_json(g0 / "manifest.json", {})
 

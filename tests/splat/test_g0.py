@@ -14,10 +14,10 @@ from splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.errors import InputError
+from cleargs.formation.colour import read_exposure
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
-from cleargs.splat.compensation import read_exposure
 from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.ply import read_ply

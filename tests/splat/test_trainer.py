@@ -14,16 +14,18 @@ import torch
 from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
 
 from cleargs.errors import InputError, StageError
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.colour import Exposure, centred
+from cleargs.formation.photograph import evaluate_views, photograph
 from cleargs.progress import SilentReporter
 from cleargs.splat import trainer
-from cleargs.splat.compensation import Exposure, centred
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.losses import PhotometricLoss, photometric_loss
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import Trained, Trainer, evaluate_views, render_view, train
+from cleargs.splat.trainer import Trained, Trainer, train
 from cleargs.splat.views import ImageCache, View
 
 CONFIG = TrainConfig(
@@ -60,6 +62,14 @@ def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **op
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
     scene = arguments.pop("scene")
     return train(scene, made, config, checkpoint=folder / "state.safetensors", **arguments)
+
+
+def affines(weights: list[float] | None = None, rate: float = CONFIG.lr_exposure) -> CaptureFormation:
+    """A colour affine for each of six frames, and no motion."""
+    seen = views([np.empty(0)] * 6, weights=weights)
+    return CaptureFormation(
+        seen, FormationConfig(enabled=False), exposure=Exposure.identity(range(6)), lr_exposure=rate
+    )
 
 
 def assert_same(first: Trained, second: Trained) -> None:
@@ -143,7 +153,7 @@ def test_masked_pixels_contribute_nothing(pictures: list[np.ndarray], tmp_path: 
 def test_resumed_equals_undisturbed(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = run(pictures, tmp_path / "whole", exposure=Exposure.identity(range(6)))
+    whole = run(pictures, tmp_path / "whole", formation=affines())
     step = Trainer.step
 
     def die(trainer: Trainer) -> None:
@@ -153,12 +163,12 @@ def test_resumed_equals_undisturbed(
 
     monkeypatch.setattr(Trainer, "step", die)
     with pytest.raises(KeyboardInterrupt):
-        run(pictures, tmp_path / "cut", exposure=Exposure.identity(range(6)))
+        run(pictures, tmp_path / "cut", formation=affines())
     monkeypatch.undo()
     saved = load_state(tmp_path / "cut" / "state.safetensors", SilentReporter())
     assert saved is not None
     assert int(saved["step"]) == 21  # the last multiple of the interval
-    assert_same(whole, run(pictures, tmp_path / "cut", exposure=Exposure.identity(range(6))))
+    assert_same(whole, run(pictures, tmp_path / "cut", formation=affines()))
 
 
 def test_a_damaged_checkpoint_is_ignored(pictures: list[np.ndarray], tmp_path: Path) -> None:
@@ -182,7 +192,7 @@ def test_threads_change_no_bit(pictures: list[np.ndarray], tmp_path: Path) -> No
     results = []
     for threads in (1, 2):
         set_threads(threads)
-        results.append(run(pictures, tmp_path / str(threads), exposure=Exposure.identity(range(6))))
+        results.append(run(pictures, tmp_path / str(threads), formation=affines()))
     assert_same(*results)
 
 
@@ -285,12 +295,12 @@ def test_an_exposure_that_is_not_finite_reaches_no_checkpoint(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def damage(trainer: Trainer) -> None:
-        assert trainer._exposure is not None
-        trainer._exposure.affines[2, 0, 3] = math.inf
+        formation: Any = trainer._formation
+        formation._affines.affines[2, 0, 3] = math.inf
 
     poison(monkeypatch, 14, damage)
     with pytest.raises(StageError, match="exposure is not finite at step 14"):
-        run(pictures, tmp_path, exposure=Exposure.identity(range(6)))
+        run(pictures, tmp_path, formation=affines())
     saved = load_state(tmp_path / "state.safetensors", SilentReporter())
     assert saved is not None
     assert int(saved["step"]) == 7
@@ -306,20 +316,22 @@ def test_a_scene_that_is_not_finite_is_refused(pictures: list[np.ndarray], tmp_p
 def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: Path) -> None:
     darker = [*pictures[:3], *((picture * 0.8).astype(np.uint8) for picture in pictures[3:])]
     weights = [1.0, 0.9, 0.8, 0.9, 0.5, 0.12]
-    config = CONFIG.model_copy(update={"steps": 300, "lr_exposure": 3e-3, "densify": False, "lr_sh": 1e-3})
+    config = CONFIG.model_copy(update={"steps": 300, "densify": False, "lr_sh": 1e-3})
+    formation = affines(weights, rate=3e-3)
     trained = run(
         views(darker, weights=weights),
         tmp_path,
         config,
         scene=Scene(gaussians()),
-        exposure=Exposure.identity(range(6)),
+        formation=formation,
     )
-    assert trained.exposure is not None
-    assert trained.exposure.enabled
-    settled = centred(trained.exposure.affines, np.array(weights))
-    np.testing.assert_allclose(trained.exposure.affines, settled, atol=1e-12)
-    grey = [float((trained.exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
+    exposure = formation.exposure
+    assert exposure is not None
+    assert exposure.enabled
+    settled = centred(exposure.affines, np.array(weights))
+    np.testing.assert_allclose(exposure.affines, settled, atol=1e-12)
+    grey = [float((exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
     # The truth is a ratio of 0.8 between the halves; half of the way is asserted, noise would be near 1.
     assert np.mean(grey[3:]) / np.mean(grey[:3]) < 0.9
-    bright, dark = (render_view(trained.scene, views(darker)[i], trained.exposure) for i in (0, 3))
+    bright, dark = (photograph(trained.scene, views(darker)[i], exposure) for i in (0, 3))
     assert bright.mean() > dark.mean()

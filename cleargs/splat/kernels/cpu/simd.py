@@ -59,7 +59,6 @@ _F32 = ir.FloatType()
 _VECTOR = ir.VectorType(_F32, LANES)
 _INT_VECTOR = ir.VectorType(_I32, LANES)
 _MASK = ir.VectorType(_I1, LANES)
-_UNDEFINED = ir.Constant(_VECTOR, ir.Undefined)
 
 
 class _VectorType(types.Type):
@@ -74,7 +73,7 @@ lanes = _VectorType(f"f32x{LANES}")
 mask = _MaskType(f"mask{LANES}")
 
 
-def _register_storage(numba_type: type, llvm_type: ir.Type) -> None:
+def _register_type(numba_type: type, llvm_type: ir.Type) -> None:
     class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, front_end_type: Any) -> None:
             _initialise_storage(self, manager, front_end_type, llvm_type)
@@ -82,13 +81,19 @@ def _register_storage(numba_type: type, llvm_type: ir.Type) -> None:
     _register_model(numba_type)(Model)
 
 
-_register_storage(_VectorType, _VECTOR)
-_register_storage(_MaskType, _MASK)
+_register_type(_VectorType, _VECTOR)
+_register_type(_MaskType, _MASK)
+
+
+def _broadcast_to(builder: Any, scalar: Any, vector: Any) -> Any:
+    undefined = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
+    zeros = ir.Constant(ir.VectorType(_I32, vector.count), [0] * vector.count)
+    return builder.shuffle_vector(first, undefined, zeros)
 
 
 def _broadcast(builder: Any, scalar: Any) -> Any:
-    first = builder.insert_element(_UNDEFINED, scalar, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, _UNDEFINED, ir.Constant(_INT_VECTOR, [0] * LANES))
+    return _broadcast_to(builder, scalar, _VECTOR)
 
 
 def _register_operator(
@@ -139,10 +144,16 @@ def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
-def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any) -> Any:
+def _element_address(
+    context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any
+) -> Any:
     offset = context.cast(builder, index, index_type, types.intp)
-    data = _make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
+    return builder.gep(_make_array(array_type)(context, builder, array).data, [offset])
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any) -> Any:
+    address = _element_address(context, builder, array_type, array, index_type, index)
+    return builder.bitcast(address, _VECTOR.as_pointer())
 
 
 @_intrinsic

@@ -10,8 +10,8 @@ import torch
 
 from cleargs.splat.adam import adam_step
 from cleargs.splat.camera import Camera
-from cleargs.splat.exposure import affine_backward, apply_affine
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu import colour
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import photometric_loss, psnr
 
@@ -37,7 +37,8 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     image = torch.zeros(SIZE, SIZE, 3)
     plane = torch.zeros(SIZE, SIZE)
     mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
-    affine = torch.eye(3, 4)
+    affine = np.eye(3, 4, dtype=np.float32)
+    pixels, sums = image.numpy(), np.empty((SIZE, 3, 4))
     row = torch.zeros(1, 3)
 
     def forward(depth: bool) -> object:
@@ -56,6 +57,6 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("PSNR", lambda: psnr(image, image)),
         ("PSNR with mask", lambda: psnr(image, image, mask)),
         ("Adam", lambda: adam_step(row, row.clone(), row.clone(), row.clone(), step=1, lr=0.0)),
-        ("exposure", lambda: apply_affine(image, affine)),
-        ("exposure backward", lambda: affine_backward(image, affine, image)),
+        ("exposure", lambda: colour.apply_affine(pixels, affine, pixels.copy())),
+        ("exposure backward", lambda: colour.affine_backward(pixels, affine, pixels, pixels.copy(), sums)),
     ]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splat_toy import HEIGHT, WIDTH, camera, keep
 
-from cleargs.splat.compensation import (
+from cleargs.formation.colour import (
     IDENTITY,
     Exposure,
     centred,

@@ -1,21 +1,26 @@
 """Exposure compensation: one affine on sRGB per frame, learned beside the scene where a capture needs it.
 
-The pixel operations are `cleargs.splat.exposure`; here are the affines themselves. They start from the gains
-that the sparse points show. Their median, weighted as the frames are, stays the identity: scene and affines
-cannot drift apart together, and a few badly exposed frames do not make the scene darker or brighter.
+The affines start from the gains that the sparse points show. Their median, weighted as the frames are, stays
+the identity: scene and affines cannot drift apart together, and a few badly exposed frames do not make the
+scene darker or brighter.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cleargs.splat.initialise import SparsePoints
+from cleargs.splat.kernels.cuda import support
 from cleargs.splat.tables import EXPOSURE
 from cleargs.splat.views import View
 from cleargs.tables import read_table, write_table
@@ -119,3 +124,84 @@ def read_exposure(path: Path) -> Exposure:
     table = read_table(path, EXPOSURE)
     affines = np.stack([table.column(name).to_numpy() for name in EXPOSURE.names[1:]], axis=1)
     return Exposure(table.column("frame_id").to_numpy(), affines.reshape(-1, 3, 4))
+
+
+class AffineOptimiser:
+    """Learns the affines; only the frame just seen moves, and the weighted median stays the identity."""
+
+    def __init__(self, exposure: Exposure, weights: NDArray[np.float64], rate: float) -> None:
+        self.frame_ids = exposure.frame_ids
+        self.affines = centred(exposure.affines, weights)
+        self.first = np.zeros_like(self.affines)
+        self.second = np.zeros_like(self.affines)
+        self.steps = np.zeros(len(self.frame_ids), np.int64)
+        self._weights = weights
+        self._rate = rate
+        self._index = {int(frame_id): index for index, frame_id in enumerate(self.frame_ids)}
+
+    @property
+    def exposure(self) -> Exposure:
+        """A snapshot of what is learned."""
+        return Exposure(self.frame_ids.copy(), self.affines.copy())
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that changes, by name, for a checkpoint."""
+        return {"affines": self.affines, "first": self.first, "second": self.second, "steps": self.steps}
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Go on from what `arrays` gave."""
+        self.affines, self.first = arrays["affines"], arrays["first"]
+        self.second, self.steps = arrays["second"], arrays["steps"]
+
+    def affine(self, frame_id: int) -> Tensor:
+        """The affine of a frame [3, 4] float32."""
+        return torch.from_numpy(self.affines[self._index[frame_id]].astype(np.float32))
+
+    def step(self, frame_id: int, gradient: NDArray[np.float64]) -> None:
+        """One Adam step of a frame's affine along ``gradient`` [3, 4]."""
+        i = self._index[frame_id]
+        self.steps[i] += 1
+        self.first[i] += 0.1 * (gradient - self.first[i])
+        self.second[i] += 0.001 * (gradient * gradient - self.second[i])
+        first = self.first[i] / (1.0 - 0.9 ** int(self.steps[i]))
+        second = self.second[i] / (1.0 - 0.999 ** int(self.steps[i]))
+        self.affines[i] -= self._rate * first / (np.sqrt(second) + 1e-15)
+        self.affines = centred(self.affines, self._weights)
+
+
+def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
+    """The image [H, W, 3] with every pixel mapped by ``affine`` [3, 4] (matrix and offset), float32."""
+    if support.on_gpu(image.device):
+        from cleargs.splat.kernels.cuda import colour as gpu_colour
+
+        return gpu_colour.apply_affine(image, affine)
+    from cleargs.splat.kernels.cpu import colour, launch
+
+    output = torch.empty(image.shape)
+    with launch.exclusive():
+        colour.apply_affine(
+            image.detach().contiguous().numpy(), affine.detach().float().contiguous().numpy(), output.numpy()
+        )
+    return output
+
+
+def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of ``apply_affine``: with respect to the image [H, W, 3] and to the map [3, 4] (float64)."""
+    if support.on_gpu(image.device):
+        from cleargs.splat.kernels.cuda import colour as gpu_colour
+
+        return gpu_colour.affine_backward(image, affine, grad_output)
+    from cleargs.splat.kernels.cpu import colour, launch
+
+    grad_image = torch.empty(image.shape)
+    row_sums = np.empty((image.shape[0], 3, 4), np.float64)
+    with launch.exclusive():
+        colour.affine_backward(
+            image.detach().contiguous().numpy(),
+            affine.detach().float().contiguous().numpy(),
+            grad_output.detach().contiguous().numpy(),
+            grad_image.numpy(),
+            row_sums,
+        )
+    sums = [math.fsum(column) for column in row_sums.reshape(len(row_sums), 12).T]
+    return grad_image, torch.tensor(sums, dtype=torch.float64).reshape(3, 4)

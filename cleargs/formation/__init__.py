@@ -1,0 +1,8 @@
+"""What a camera does to a sharp image (colour, motion blur, rolling shutter, defocus), and finding its numbers.
+
+A raw frame is compared with the render *as its camera saw it*:
+
+    sharp render -> colour affine -> linear light -> exposure along the motion, through the lens -> sRGB
+
+and the gradient of the comparison goes back through the exact transpose.
+"""

@@ -1,0 +1,102 @@
+"""``formation.parquet``: how each frame was taken, as a training found it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.motion import FrameMotion
+from cleargs.tables import column, read_table, write_table
+
+_AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
+_TWISTS = {
+    "pose": "from the pose as given to that at the middle of the exposure",
+    "blur": "of the camera from the start to the end of a row's exposure",
+    "skew": "of the camera from the first to the last row's exposure",
+}
+
+
+def _twist(name: str) -> list[pa.Field]:
+    return [
+        column(
+            f"{name}_{axis}",
+            pa.float64(),
+            f"{axis} {_TWISTS[name]}, px: t times fx / median depth, r times fx",
+        )
+        for axis in _AXES
+    ]
+
+
+FORMATION = pa.schema(
+    [
+        column("frame_id", pa.int32(), "active frame"),
+        column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
+        column("blur_px", pa.float64(), "mean length of the pixels' ways while they were exposed, px"),
+        column(
+            "skew_px", pa.float64(), "mean length of their ways from the first to the last row's exposure, px"
+        ),
+        column("defocus_px", pa.float64(), "mean radius of the discs of defocus, px"),
+        column("reach_px", pa.float64(), "95 % of the pixels look less far from their place, px"),
+        column("explained", pa.float64(), "share of the frame's misfit that the model takes away"),
+        column("misfit", pa.float64(), "mean difference of high-passed linear luminance that is left"),
+        column("misfit_still", pa.float64(), "the same without the model"),
+        column("weight_before", pa.float64(), "RVA's weight of the frame"),
+        column("weight_after", pa.float64(), "with which it taught at the end"),
+        *_twist("pose"),
+        *_twist("blur"),
+        *_twist("skew"),
+        column(
+            "disc_px", pa.float64(), "radius of the disc of defocus per unit of nearness beyond the focus, px"
+        ),
+        column("focus", pa.float64(), "nearness in focus: median depth over the depth in focus"),
+        column("median_depth", pa.float64(), "median depth of the frame, world units"),
+    ]
+)
+
+
+def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[int, float]) -> None:
+    """Write ``formation.parquet``; ``weights``: of the raw frames, as RVA gave them."""
+    rows = [
+        _row(frame, weights[frame_id], formation.weight(frame_id))
+        for frame_id, frame in formation.frames.items()
+    ]
+    write_table(path, pa.Table.from_pylist(rows, FORMATION), FORMATION)
+
+
+def read_formation(path: Path) -> tuple[dict[int, FrameFormation], dict[int, float]]:
+    """Read ``formation.parquet``: what was found, and the weights at the end, by frame_id.
+
+    Raises StoreError when it is missing or damaged.
+    """
+    rows = read_table(path, FORMATION).to_pylist()
+    return {row["frame_id"]: _frame(row) for row in rows}, {
+        row["frame_id"]: row["weight_after"] for row in rows
+    }
+
+
+def _row(frame: FrameFormation, before: float, after: float) -> dict[str, Any]:
+    motion = frame.motion
+    row = {name: getattr(frame, name) for name in FORMATION.names if hasattr(frame, name)}
+    row |= {name: getattr(motion, name) for name in ("disc_px", "focus", "median_depth")}
+    for name in _TWISTS:
+        row |= {f"{name}_{axis}": float(v) for axis, v in zip(_AXES, getattr(motion, name), strict=True)}
+    return row | {"weight_before": before, "weight_after": after}
+
+
+def _frame(row: dict[str, Any]) -> FrameFormation:
+    twists = np.array([[row[f"{name}_{axis}"] for axis in _AXES] for name in _TWISTS])
+    motion = FrameMotion(disc_px=row["disc_px"], focus=row["focus"], median_depth=row["median_depth"])
+    lengths = {name: row[name] for name in ("blur_px", "skew_px", "defocus_px", "reach_px")}
+    return FrameFormation(
+        row["frame_id"],
+        motion.with_vector(twists.ravel()),
+        row["model"],
+        misfit=row["misfit"],
+        misfit_still=row["misfit_still"],
+        **lengths,
+    )

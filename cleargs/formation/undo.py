@@ -1,0 +1,86 @@
+"""A raw frame without the motion that blurred and skewed it, or the defocus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cleargs.formation.motion import Floats
+from cleargs.formation.warp import Warp, padded
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+
+PRIOR = 0.1
+"""Variance of what the model of the exposure leaves unexplained, relative to that of the render's error. What
+the exposure lets through with more than this share of its power is the raw frame's, the rest the render's."""
+
+OUTLIER = 0.15
+"""Difference in sRGB between raw frame and exposed render from which a pixel counts less: what moved."""
+
+STEPS = 10
+"""Of the solver; fifty more change the image by less than 1/255 on average."""
+
+DARKEST = 0.002
+"""Linear light below which sRGB counts as steep as here."""
+
+
+def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats:
+    """The image that looks like ``observed`` under the frame's formation B, and like ``render`` where that
+    leaves it open.
+
+        argmin_X  |s (B X - O)|^2 + PRIOR |s (X - R)|^2
+
+    s is the slope of sRGB over linear light, so that differences count as they are seen. Solved by conjugate
+    gradients from X = R.
+
+    Args:
+        render: R, [H, W, 3] sRGB in [0, 1], larger than the frame by the warp's margin on every side.
+        observed: O, [H, W, 3] sRGB in [0, 1].
+        weight: [H, W], 0 where a pixel of ``observed`` does not count.
+
+    Returns [H, W, 3] sRGB in [0, 1], of the frame's size.
+    """
+    start, target = padded(linear_from_srgb(render)), padded(linear_from_srgb(observed))
+    exposed = warp.forward(start)
+    left = target - exposed
+    data = _slope(exposed) ** 2 * weight[..., None]
+    differences = np.abs(observed - srgb_from_linear(np.clip(exposed[..., :3], 0.0, 1.0))).max(
+        axis=2, keepdims=True
+    )
+    data /= np.maximum(1.0, differences / OUTLIER)
+    seen = _slope(start)
+
+    def normal(change: Floats) -> Floats:
+        """Of the change as it is seen: dark and bright parts then converge alike."""
+        return warp.transpose(data * warp.forward(change / seen)) / seen + np.float32(PRIOR) * change
+
+    change = _conjugate_gradients(normal, warp.transpose(data * left) / seen)
+    m, (height, width, _) = warp.margin, observed.shape
+    whole = srgb_from_linear(np.clip(start + change / seen, 0.0, 1.0))
+    return np.ascontiguousarray(whole[m : m + height, m : m + width, :3])
+
+
+def _conjugate_gradients(matrix: Callable[[Floats], Floats], side: Floats) -> Floats:
+    solution = np.zeros_like(side)
+    residual, direction = side.copy(), side.copy()
+    power = _power(residual, residual)
+    for _ in range(STEPS):
+        if power <= 0.0:
+            break
+        mapped = matrix(direction)
+        step = np.float32(power / _power(direction, mapped))
+        solution += step * direction
+        residual -= step * mapped
+        before, power = power, _power(residual, residual)
+        direction = residual + np.float32(power / before) * direction
+    return solution
+
+
+def _power(a: Floats, b: Floats) -> float:
+    return float(np.multiply(a, b, dtype=np.float64).sum())
+
+
+def _slope(linear: Floats) -> Floats:
+    """Of sRGB over linear light."""
+    light = np.maximum(linear, DARKEST)
+    return np.asarray(np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * light ** (1 / 2.4 - 1)), np.float32)

@@ -1,0 +1,327 @@
+"""What a camera does to a sharp image while it takes it: blur, rolling shutter and defocus as one warp.
+
+A pixel of the photograph sees the still image at
+
+    x + offset(x) + t sweep(x) + radius(x) (u, v)
+
+for ``samples`` (t, u, v): instants t from -1/2 to 1/2 of its exposure, points (u, v) of the unit disc. Fields
+are in pixels, [2, H, W] with x before y. The image is larger than the photograph by ``margin`` pixels on
+every side; beyond its border the border pixels go on.
+
+A row's arithmetic does not depend on other rows, and the transpose adds up bands of rows of a fixed height in
+their order: results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from cleargs.splat.kernels.cpu.jit import Array, Floats, inlined, kernel
+from cleargs.splat.kernels.cpu.pixel import CHANNELS, black, load_pixel, plus_scaled, scaled, store_pixel
+
+BAND = 32
+"""Rows of the photograph whose light one work item of the transpose sends back."""
+
+CURVE_LAST = 2.0
+CURVE_STEPS = 8192
+"""The curves between sRGB and linear light are tables of so many steps from 0 to `CURVE_LAST`, with straight
+lines between them and beyond: within 2e-5 of the formulas, and their derivative is exact."""
+
+MIN_COVERED = 0.5
+"""Alpha from which a pixel has a depth."""
+MAX_NEARNESS = 4.0
+"""Of a pixel, as a multiple of the median one: what floats before the lens would move by whole images."""
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@inlined
+def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, float32
+    """The first of the two pixels that ``position`` lies between, and the share of the second."""
+    inside = min(max(position, _ZERO), last)
+    first = np.int32(min(inside, max(last - _ONE, _ZERO)))
+    return first, inside - np.float32(first)
+
+
+@inlined
+def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float32 -> float32, float32
+    """The curve at ``value`` and its slope there."""
+    steps = np.float32(CURVE_STEPS / CURVE_LAST)
+    place = value * steps
+    index = np.int32(min(max(place, _ZERO), np.float32(CURVE_STEPS - 1)))
+    rise = curve[index + 1] - curve[index]
+    return curve[index] + (place - np.float32(index)) * rise, rise * steps
+
+
+@kernel
+def displacements(
+    depth: Floats,  # [H + 2 margin, W + 2 margin] accumulated
+    alpha: Floats,  # likewise
+    margin: int,
+    median: float,
+    intrinsics: Floats,  # [4]: fx, fy, cx, cy of the photograph
+    twists: Floats,  # [3, 6]: pose, blur and skew, in pixels
+    disc: Floats,  # [2]: radius in pixels per unit of nearness, nearness in focus
+    offset: Floats,  # [2, H, W] written
+    sweep: Floats,  # [2, H, W] written
+    radius: Floats,  # [H, W] written
+    reach: Array,  # [H] float64, written: farthest that a pixel of the row looks up or down
+) -> None:
+    """The fields of a frame's motion and defocus. Nearness is the median depth over the pixel's own.
+
+    Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
+    """
+    _, height, width = offset.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for row in prange(height):
+        down = np.float32((row + 0.5) / height - 0.5)
+        y = (np.float32(row) + np.float32(0.5) - cy) / fy
+        farthest = 0.0
+        for column in range(width):
+            x = (np.float32(column) + np.float32(0.5) - cx) / fx
+            covered = alpha[row + margin, column + margin]
+            behind = depth[row + margin, column + margin]
+            near = _ONE
+            if covered > np.float32(MIN_COVERED) and behind > _ZERO:  # false for NaN
+                near = min(np.float32(median) * covered / behind, np.float32(MAX_NEARNESS))
+            for part in range(2):
+                # Pose and skew displace, blur sweeps.
+                tx, ty, tz = twists[part, 0], twists[part, 1], twists[part, 2]
+                rx, ry, rz = twists[part, 3], twists[part, 4], twists[part, 5]
+                if part == 0:
+                    tx, ty, tz = tx + down * twists[2, 0], ty + down * twists[2, 1], tz + down * twists[2, 2]
+                    rx, ry, rz = rx + down * twists[2, 3], ry + down * twists[2, 4], rz + down * twists[2, 5]
+                along_x = near * (x * tz - tx) + x * y * rx - (_ONE + x * x) * ry + y * rz
+                along_y = near * (y * tz - ty) + (_ONE + y * y) * rx - x * y * ry - x * rz
+                field = offset if part == 0 else sweep
+                field[0, row, column] = along_x
+                field[1, row, column] = along_y * (fy / fx)
+            radius[row, column] = disc[0] * abs(near - disc[1])
+            vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
+            farthest = max(farthest, np.float64(vertical + radius[row, column]))
+        reach[row] = farthest
+
+
+@kernel
+def apply_curve(image: Floats, curve: Floats, out: Floats, slope: Floats) -> None:
+    """The three colours of every pixel through a curve, and the curve's slope there.
+
+    Images are [H, W, 3] or [H, W, 4]; ``slope`` is [H, W, 3].
+    """
+    height, width, _ = image.shape
+    padded = out.shape[2] > 3
+    for y in prange(height):
+        for x in range(width):
+            for c in range(3):
+                out[y, x, c], slope[y, x, c] = _on_curve(curve, image[y, x, c])
+            if padded:
+                out[y, x, 3] = _ZERO
+
+
+@kernel
+def expose(
+    image: Floats,  # [H + 2 margin, W + 2 margin, 4] linear light
+    margin: int,
+    offset: Floats,
+    sweep: Floats,
+    radius: Floats,
+    samples: Floats,  # [K, 3]
+    out: Floats,  # [H, W, 4] linear light, written
+) -> None:
+    """What the sensor gathers of a still image."""
+    height, width, _ = out.shape
+    rows, columns, _ = image.shape
+    right, bottom = np.float32(columns - 1), np.float32(rows - 1)
+    beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
+    share = _ONE / np.float32(len(samples))
+    for y in prange(height):
+        for x in range(width):
+            x0 = np.float32(x + margin) + offset[0, y, x]
+            y0 = np.float32(y + margin) + offset[1, y, x]
+            along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
+            total = black()
+            for k in range(len(samples)):
+                i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
+                j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                at = CHANNELS * (np.int64(j) * columns + i)
+                total = plus_scaled(total, load_pixel(image, at), (_ONE - b) * (_ONE - a))
+                total = plus_scaled(total, load_pixel(image, at + beside), (_ONE - b) * a)
+                total = plus_scaled(total, load_pixel(image, at + below), b * (_ONE - a))
+                total = plus_scaled(total, load_pixel(image, at + below + beside), b * a)
+            store_pixel(out, CHANNELS * (y * width + x), scaled(total, share))
+
+
+@kernel
+def spread(
+    light: Floats,  # [H, W, 4]
+    margin: int,
+    reach: int,
+    offset: Floats,
+    sweep: Floats,
+    radius: Floats,
+    samples: Floats,  # [K, 3]
+    bands: Floats,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
+    rows: int,
+) -> None:
+    """The transpose of `expose`, before `gather`: what every pixel saw goes back to where it came from.
+
+    ``rows`` are those of the image; no pixel looks up or down by more than ``reach`` - 2 pixels.
+    """
+    height, width, _ = light.shape
+    columns = bands.shape[2]
+    right, bottom = np.float32(columns - 1), np.float32(rows - 1)
+    beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
+    share = _ONE / np.float32(len(samples))
+    for band in prange(len(bands)):
+        part = bands[band]
+        part[:] = _ZERO
+        first = band * BAND + margin - reach
+        for y in range(band * BAND, min((band + 1) * BAND, height)):
+            for x in range(width):
+                seen = scaled(load_pixel(light, CHANNELS * (y * width + x)), share)
+                x0 = np.float32(x + margin) + offset[0, y, x]
+                y0 = np.float32(y + margin) + offset[1, y, x]
+                along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
+                for k in range(len(samples)):
+                    i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
+                    j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                    at = CHANNELS * (np.int64(j - first) * columns + i)
+                    _add(part, at, seen, (_ONE - b) * (_ONE - a))
+                    _add(part, at + beside, seen, (_ONE - b) * a)
+                    _add(part, at + below, seen, b * (_ONE - a))
+                    _add(part, at + below + beside, seen, b * a)
+
+
+@inlined
+def _add(image: Any, offset: Any, light: Any, share: Any) -> None:
+    store_pixel(image, offset, plus_scaled(load_pixel(image, offset), light, share))
+
+
+@kernel
+def gather(bands: Floats, margin: int, reach: int, out: Floats) -> None:
+    """The sum of the bands in their order, [H + 2 margin, W + 2 margin, 4]."""
+    height, width, _ = out.shape
+    for y in prange(height):
+        out[y] = _ZERO
+        for band in range(len(bands)):
+            row = y - (band * BAND + margin - reach)
+            if 0 <= row < bands.shape[1]:
+                for x in range(width):
+                    for c in range(CHANNELS):
+                        out[y, x, c] += bands[band, row, x, c]
+
+
+@kernel
+def multiply(light: Floats, slope: Floats, out: Floats) -> None:
+    """light * slope for three colours: ``slope`` is [H, W, 3], the others have three channels or four."""
+    height, width, _ = slope.shape
+    padded = out.shape[2] > 3
+    for y in prange(height):
+        for x in range(width):
+            for c in range(3):
+                out[y, x, c] = light[y, x, c] * slope[y, x, c]
+            if padded:
+                out[y, x, 3] = _ZERO
+
+
+@kernel
+def misfits(
+    image: Floats,  # [H, W]
+    observed: Floats,  # [H, W]
+    weight: Floats,  # [H, W]
+    offset: Floats,
+    sweep: Floats,
+    radius: Floats,
+    samples: Floats,  # [K, 3]
+    limit: float,
+    rows: Array,  # [H] float64, written
+) -> None:
+    """Each row's sum of weight * min(|observed - photographed image|, limit); images without a margin."""
+    height, width = image.shape
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    share = _ONE / np.float32(len(samples))
+    for y in prange(height):
+        exposed = np.zeros(width, np.float32)
+        for k in range(len(samples)):  # pixels innermost: the loop that can be vectorised
+            for x in range(width):
+                i, a = _between(
+                    np.float32(x)
+                    + offset[0, y, x]
+                    + samples[k, 0] * sweep[0, y, x]
+                    + samples[k, 1] * radius[y, x],
+                    right,
+                )
+                j, b = _between(
+                    np.float32(y)
+                    + offset[1, y, x]
+                    + samples[k, 0] * sweep[1, y, x]
+                    + samples[k, 2] * radius[y, x],
+                    bottom,
+                )
+                above = image[j, i] + a * (image[j, i + 1] - image[j, i])
+                below = image[j + 1, i] + a * (image[j + 1, i + 1] - image[j + 1, i])
+                exposed[x] += above + b * (below - above)
+        total = 0.0
+        for x in range(width):
+            total += weight[y, x] * min(abs(observed[y, x] - exposed[x] * share), limit)
+        rows[y] = total
+
+
+@kernel
+def normal_equations(
+    stack: Floats,  # [H, W, 3]: image, its derivatives by x and y
+    observed: Floats,  # [H, W]
+    weight: Floats,  # [H, W]
+    basis: Floats,  # [6, 2, H, W]: flow by each component of a twist
+    down: Floats,  # [H]: -1/2 at the first row of the photograph, 1/2 at its last
+    offset: Floats,
+    sweep: Floats,
+    times: Floats,  # [K]
+    outlier: float,
+    active: Array,  # [A] int64: which of the 18 numbers of pose, blur and skew are sought
+    matrices: Array,  # [H, A, A] float64, written (lower triangles)
+    sides: Array,  # [H, A] float64, written
+) -> None:
+    """Each row's share of the Gauss-Newton equations of the twists of pose, blur and skew.
+
+    Differences beyond ``outlier`` count linearly (Huber's weights).
+    """
+    height, width = observed.shape
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    share = 1.0 / times.size
+    twist = basis.shape[0]
+    for y in prange(height):
+        matrices[y] = 0.0
+        sides[y] = 0.0
+        jacobian = np.empty(3 * twist)
+        means = np.empty(5, np.float32)
+        for x in range(width):
+            if weight[y, x] == 0.0:
+                continue
+            means[:] = 0.0
+            for t in times:
+                i, a = _between(np.float32(x) + offset[0, y, x] + t * sweep[0, y, x], right)
+                j, b = _between(np.float32(y) + offset[1, y, x] + t * sweep[1, y, x], bottom)
+                for c in range(3):
+                    above = stack[j, i, c] + a * (stack[j, i + 1, c] - stack[j, i, c])
+                    below = stack[j + 1, i, c] + a * (stack[j + 1, i + 1, c] - stack[j + 1, i, c])
+                    value = above + b * (below - above)
+                    means[c] += value
+                    if c > 0:
+                        means[c + 2] += t * value
+            for n in range(twist):
+                u, v = share * basis[n, 0, y, x], share * basis[n, 1, y, x]
+                moved = u * means[1] + v * means[2]
+                jacobian[n] = moved
+                jacobian[twist + n] = u * means[3] + v * means[4]
+                jacobian[2 * twist + n] = down[y] * moved
+            left = observed[y, x] - share * means[0]
+            factor = weight[y, x] / max(1.0, abs(left) / outlier)
+            for n in range(len(active)):
+                scaled = factor * jacobian[active[n]]
+                sides[y, n] += scaled * left
+                for m in range(n + 1):
+                    matrices[y, n, m] += scaled * jacobian[active[m]]

@@ -1,0 +1,185 @@
+"""Formation inside a training: found, earned, resumed; and the bits of plain training where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.colour import Exposure
+from cleargs.formation.motion import FrameMotion
+from cleargs.formation.photograph import photograph
+from cleargs.formation.table import read_formation, write_formation
+from cleargs.progress import SilentReporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.config import FormationConfig, TrainConfig
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+from cleargs.splat.trainer import Trained, Trainer, train
+from cleargs.splat.views import View
+
+WIDTH, HEIGHT, FRAMES = 96, 64, 5
+CONFIG = TrainConfig(steps=60, densify=False, coarse_share=0.0, sh_interval=0, checkpoint_interval=17)
+LOOK = FormationConfig(start=0.0, every=4)
+BLURRED = 2
+BLUR = FrameMotion(blur=np.array([0, 0, 0, 0, 7.0, 0]), median_depth=3.0)
+
+
+def camera(angle: float) -> Camera:
+    pose = np.eye(4)
+    pose[0, 0] = pose[2, 2] = np.cos(angle)
+    pose[0, 2], pose[2, 0] = np.sin(angle), -np.sin(angle)
+    return Camera(WIDTH, HEIGHT, 90.0, 90.0, WIDTH / 2, HEIGHT / 2, pose)
+
+
+def scene() -> Scene:
+    """A wall of coloured squares, small enough that a blur shows."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[-1.1:1.1:40j, -1.8:1.8:64j]
+    count = x.size
+    means = np.stack([x.ravel(), y.ravel(), np.full(count, 3.0)], 1)
+    colours = cv2.resize(rng.uniform(-1.5, 1.5, (14, 22, 3)), (64, 40), interpolation=cv2.INTER_NEAREST)
+    return Scene(
+        Gaussians(
+            means=torch.tensor(means, dtype=torch.float32),
+            log_scales=torch.full((count, 3), -3.5),
+            rotations=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+            logit_opacities=torch.full((count,), 4.0),
+            sh=torch.tensor(colours.reshape(count, 1, 3), dtype=torch.float32),
+        )
+    )
+
+
+def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[View]:
+    made = []
+    for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
+        view = View(index, camera(angle), 1.0, "real", lambda: (None, None))
+        moved = FrameFormation(index, BLUR, "blur", reach_px=4.0) if index == blurred else None
+        seen = photograph(scene(), view, formation=moved).numpy()
+        pixels = np.rint(255 * seen).astype(np.uint8)
+        weight = 1.0 if weights is None else weights[index]
+        made.append(View(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
+    return made
+
+
+def run(folder: Path, seen: list[View], formation: CaptureFormation | None) -> Trained:
+    folder.mkdir(exist_ok=True)
+    return train(
+        scene(),
+        seen,
+        CONFIG,
+        seed=(3,),
+        formation=formation,
+        checkpoint=folder / "state.safetensors",
+        reporter=SilentReporter(),
+    )
+
+
+def test_a_blurred_frame_is_found_and_the_sharp_ones_are_left_alone(tmp_path: Path) -> None:
+    formation = CaptureFormation(views(), LOOK)
+    run(tmp_path, views(), formation)
+    models = {frame_id: frame.model for frame_id, frame in formation.frames.items()}
+    assert models == {k: "blur" if k == BLURRED else "none" for k in range(FRAMES)}
+    found = formation.frames[BLURRED]
+    assert found.blur_px == pytest.approx(7.0, abs=1.0)
+    assert found.explained > 0.5
+
+
+def test_with_it_the_scene_stays_sharp(tmp_path: Path) -> None:
+    """Without, the blurred frame pulls the scene away from what the others show."""
+    errors = {}
+    sharp = views(blurred=None)[BLURRED]
+    truth = torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
+    for name, formation in (("plain", None), ("formed", CaptureFormation(views(), LOOK))):
+        trained = run(tmp_path / name, views(), formation)
+        errors[name] = float((photograph(trained.scene, sharp) - truth).square().mean())
+    assert errors["formed"] < 0.5 * errors["plain"]
+
+
+def test_sharp_frames_train_as_without_it_bit_for_bit(tmp_path: Path) -> None:
+    seen = views(blurred=None)
+    formation = CaptureFormation(seen, LOOK)
+    with_it, without = run(tmp_path / "a", seen, formation), run(tmp_path / "b", seen, None)
+    assert {frame.model for frame in formation.frames.values()} == {"none"}
+    for name, tensor in without.scene.gaussians.tensors().items():
+        assert torch.equal(tensor, with_it.scene.gaussians.tensors()[name]), name
+    assert with_it.rows.equals(without.rows)
+
+
+def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def formation() -> CaptureFormation:
+        return CaptureFormation(views(), LOOK, exposure=Exposure.identity(range(FRAMES)), lr_exposure=1e-3)
+
+    whole = run(tmp_path / "whole", views(), formation())
+    step, steps = Trainer.step, iter(range(40))
+
+    def killed(trainer: Trainer) -> None:
+        if next(steps, None) is None:
+            raise KeyboardInterrupt
+        step(trainer)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "step", killed)
+        run(tmp_path / "cut", views(), formation())
+    resumed = run(tmp_path / "cut", views(), formation())
+    assert whole.state.keys() == resumed.state.keys()
+    for name, tensor in whole.state.items():
+        assert torch.equal(tensor, resumed.state[name]), name
+
+
+def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
+    first = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), LOOK))
+    other = FormationConfig(start=0.0, every=5)
+    second = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), other))
+    assert not second.wrote(first.state())
+
+
+def test_trust_is_earned() -> None:
+    seen = views(weights=[1.0, 1.0, 0.2, 1.0, 0.1])
+    known = {
+        0: FrameFormation(0, misfit=0.010, misfit_still=0.010),
+        1: FrameFormation(1, misfit=0.012, misfit_still=0.012),
+        2: FrameFormation(2, BLUR, "blur", misfit=0.016, misfit_still=0.05),
+        3: FrameFormation(3, misfit=0.008, misfit_still=0.008),
+        4: FrameFormation(4, misfit=0.05, misfit_still=0.05),
+    }
+    formation = CaptureFormation(seen, LOOK, known=known)
+    assert [formation.weight(k) for k in (0, 1, 3)] == [1.0, 1.0, 1.0]
+    # The weights add up to 3.3; half of it lies with the second of .008, .010, .012, .016 and .05.
+    assert formation.weight(2) == pytest.approx(0.010 / 0.016)
+    assert formation.weight(4) == 0.1  # not explained: RVA's
+
+
+def test_the_table_gives_back_what_was_found(tmp_path: Path) -> None:
+    motion = FrameMotion(
+        blur=np.arange(6.0),
+        skew=-np.arange(6.0),
+        pose=np.full(6, 0.5),
+        disc_px=2.0,
+        focus=1.5,
+        median_depth=3.0,
+    )
+    frame = FrameFormation(2, motion, "both", 0.01, 0.02, 6.0, 3.0, 1.0, 5.0)
+    formation = CaptureFormation(views(), LOOK, known={2: frame})
+    write_formation(tmp_path / "formation.parquet", formation, dict.fromkeys(range(FRAMES), 1.0))
+    back, weights = read_formation(tmp_path / "formation.parquet")
+    assert weights == dict.fromkeys(range(FRAMES), 1.0)
+    assert sorted(back) == list(range(FRAMES))
+    assert back[2].model == "both"
+    np.testing.assert_array_equal(back[2].motion.vector, motion.vector)
+    assert (back[2].motion.disc_px, back[2].motion.focus, back[2].reach_px) == (2.0, 1.5, 5.0)
+    assert back[2].explained == 0.5
+
+
+def test_a_frame_is_rendered_with_a_margin() -> None:
+    """What moved in from beyond the border is explained too."""
+    seen = views()
+    moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
+    wide = photograph(scene(), seen[BLURRED], formation=moved)
+    without = photograph(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
+    assert (wide - without)[:, 8:-8].abs().max() < 1e-5
+    assert (wide - without)[:, :2].abs().max() > 0.01

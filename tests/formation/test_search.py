@@ -1,0 +1,138 @@
+"""What happened while a frame was taken: found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from photographs import CAMERA, HEIGHT, MEDIAN, WIDTH, Image, photograph, picture, sight, soft, twist, wall
+
+from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
+from cleargs.formation.search import preferred, refine, search
+from cleargs.formation.warp import fields_of
+from cleargs.splat.kernels.runtime import set_threads
+
+BLUR = FrameMotion(blur=twist(0, 0, 0, 3, 6, 0), median_depth=MEDIAN)
+LONG = FrameMotion(blur=twist(0, 0, 0, -9, 12, 4), median_depth=MEDIAN)
+STEP = FrameMotion(blur=twist(6, -3, 2, 0, 0, 0), median_depth=MEDIAN)
+SKEW = FrameMotion(skew=twist(0, 0, 0, 0, 8, 0), median_depth=MEDIAN)
+BOTH = FrameMotion(blur=twist(0, 0, 0, 1, 4, 0), skew=twist(0, 0, 0, 2, 8, 0), median_depth=MEDIAN)
+FOCUS = FrameMotion(disc_px=9.0, focus=1.6, median_depth=MEDIAN)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Image:
+    return picture()
+
+
+def test_the_flow_is_that_of_a_small_camera_motion() -> None:
+    """Points of the image carried by a twist of a tenth of a pixel's size land where the basis says."""
+    depth = wall()
+    basis = flow_basis(CAMERA, MEDIAN / depth)
+    y, x = np.indices(depth.shape) + 0.5
+    rays = np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones_like(x)], -1)
+    points = rays * depth[..., None]
+    for component in range(TWIST):
+        small = np.zeros(TWIST)
+        small[component] = 0.1 / CAMERA.fx
+        moved = points - small[:3] * MEDIAN - np.cross(small[3:], points)
+        u = CAMERA.fx * moved[..., 0] / moved[..., 2] + CAMERA.cx
+        v = CAMERA.fy * moved[..., 1] / moved[..., 2] + CAMERA.cy
+        # What a linear flow of a tenth of a pixel neglects is of the second order: 1e-4 px here.
+        np.testing.assert_allclose(0.1 * basis[component], np.stack([u - x, v - y]), atol=3e-4)
+
+
+def test_the_flow_of_a_reduced_view_is_reduced() -> None:
+    depth = wall()
+    small = cv2.resize(depth, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA)
+    full, half = flow_basis(CAMERA, MEDIAN / depth), flow_basis(CAMERA, MEDIAN / small)
+    averaged = full.reshape(TWIST, 2, HEIGHT // 2, 2, WIDTH // 2, 2).mean((3, 5))
+    np.testing.assert_allclose(half, averaged / 2, atol=2e-3)  # the mean of 1 / depth is not 1 / mean depth
+
+
+@pytest.mark.parametrize(
+    ("motion", "model"),
+    [(BLUR, "blur"), (LONG, "blur"), (STEP, "blur"), (SKEW, "skew"), (BOTH, "both"), (FOCUS, "defocus")],
+    ids=["turn", "long turn with roll", "step", "rolling shutter", "both", "defocus"],
+)
+def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model) -> None:
+    """By what it does to the image: turns and steps to the side are alike where the depth hardly varies."""
+    found = preferred(search(sight(soft(truth), photograph(truth, motion))))
+    assert found.model == model
+    assert found.explained > 0.3
+    alpha = np.ones((HEIGHT, WIDTH), np.float32)
+    ours, theirs = (fields_of(m, CAMERA, wall(), alpha) for m in (found.motion, motion))
+    assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.5
+    # An exposure is the same from its end to its start. A soft render leaves part of a blur unseen.
+    apart = [np.hypot(*(ours.sweep - sign * theirs.sweep)).mean() for sign in (1, -1)]
+    assert min(apart) < 1.0
+    assert np.abs(ours.radius - theirs.radius).mean() < 0.7
+
+
+def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
+    found = preferred(search(sight(soft(truth), photograph(truth, FrameMotion()))))
+    # A soft render beside a sharp frame: nothing that a camera does makes the render sharper.
+    assert found.explained < 0.01
+
+
+def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
+    nearly = replace(BLUR, blur=0.8 * BLUR.blur)
+    still, found = refine(sight(soft(truth), photograph(truth, BLUR)), "blur", nearly)
+    assert still.model == "none"
+    before = np.linalg.norm(nearly.blur - BLUR.blur)
+    assert np.linalg.norm(found.motion.blur - BLUR.blur) < 0.5 * before
+
+
+def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
+    shifted = replace(BLUR, pose=twist(0, 0, 0, 1.0, -2.0, 0))
+    observed = photograph(truth, shifted)
+    found = preferred(search(sight(soft(truth), observed), pose=True))
+    alpha = np.ones((HEIGHT, WIDTH), np.float32)
+    ours, theirs = (fields_of(m, CAMERA, wall(), alpha) for m in (found.motion, shifted))
+    assert np.hypot(*theirs.offset).mean() > 2.0
+    assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.3
+
+
+def test_masked_pixels_say_nothing(truth: Image) -> None:
+    weight = np.ones((HEIGHT, WIDTH), np.float32)
+    weight[40:90, 60:120] = 0.0
+    observed = photograph(truth, BLUR)
+    ruined = np.where(weight[..., None] > 0, observed, np.float32(1.0))
+    clean, spoilt = (preferred(search(sight(soft(truth), o, weight))) for o in (observed, ruined))
+    np.testing.assert_array_equal(clean.motion.vector, spoilt.motion.vector)
+
+
+@pytest.mark.parametrize("size", [(2, 3), (9, 7), (700, 33)])
+def test_any_size(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
+    ones = np.ones(size, np.float32)
+    camera = replace(CAMERA, width=size[1], height=size[0])
+    frame = sight(picture(), picture())
+    seen = replace(
+        frame,
+        luminance=image[..., 0],
+        depth=ones,
+        alpha=ones,
+        observed=image[..., 0],
+        weight=ones,
+        camera=camera,
+    )
+    assert all(np.isfinite(found.motion.vector).all() for found in search(seen))
+
+
+def test_nothing_to_see_finds_nothing() -> None:
+    flat = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    assert preferred(search(sight(flat, flat))).explained <= 0.0
+    nothing = np.zeros((HEIGHT, WIDTH), np.float32)
+    assert preferred(search(sight(flat, flat, nothing))).explained <= 0.0
+
+
+def test_threads_do_not_change_a_bit(truth: Image) -> None:
+    found = []
+    for threads in (1, 2):
+        set_threads(threads)
+        found.append(preferred(search(sight(soft(truth), photograph(truth, BOTH)))))
+    np.testing.assert_array_equal(found[0].motion.vector, found[1].motion.vector)
+    assert found[0].misfit == found[1].misfit

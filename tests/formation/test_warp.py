@@ -1,0 +1,277 @@
+"""The operator B of a frame and its transpose: against float64, on hard cases, on any number of threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from photographs import CAMERA, MEDIAN, Image, twist, wall
+
+from cleargs.formation.motion import FrameMotion
+from cleargs.formation.warp import (
+    Fields,
+    Warp,
+    fields_of,
+    linear_curve,
+    padded,
+    samples,
+    srgb_curve,
+    through_curve,
+    times_slope,
+)
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.splat.camera import Camera
+from cleargs.splat.kernels.cpu import formation as kernels
+from cleargs.splat.kernels.cpu.pixel import CHANNELS
+from cleargs.splat.kernels.runtime import set_threads
+
+Doubles = npt.NDArray[np.float64]
+
+ALL = FrameMotion(
+    blur=twist(2, 1, -1, 4, 9, 2),
+    skew=twist(1, 0, 2, 3, 5, -2),
+    pose=twist(0, 1, 0, -2, 1, 0),
+    disc_px=3.0,
+    focus=1.4,
+    median_depth=MEDIAN,
+)
+
+
+def oracle(image: Doubles, fields: Fields, margin: int, points: Image) -> torch.Tensor:
+    """What `Warp.forward` should give, in float64 torch with autograd: the mean of bilinear looks-up."""
+    pixels = torch.tensor(image, dtype=torch.float64, requires_grad=True)
+    rows, columns = image.shape[:2]
+    height, width = fields.radius.shape
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    total = torch.zeros(height, width, image.shape[2], dtype=torch.float64)
+    offset, sweep = torch.tensor(fields.offset).double(), torch.tensor(fields.sweep).double()
+    radius = torch.tensor(fields.radius).double()
+    for t, u, v in points.astype(np.float64):
+        at_x = (x + margin + offset[0] + t * sweep[0] + u * radius).clamp(0, columns - 1)
+        at_y = (y + margin + offset[1] + t * sweep[1] + v * radius).clamp(0, rows - 1)
+        i, j = (
+            at_x.floor().clamp(max=max(columns - 2, 0)).long(),
+            at_y.floor().clamp(max=max(rows - 2, 0)).long(),
+        )
+        a, b = (at_x - i)[..., None], (at_y - j)[..., None]
+        i1, j1 = (i + 1).clamp(max=columns - 1), (j + 1).clamp(max=rows - 1)
+        above = (1 - a) * pixels[j, i] + a * pixels[j, i1]
+        below = (1 - a) * pixels[j1, i] + a * pixels[j1, i1]
+        total = total + (1 - b) * above + b * below
+    total = total / len(points)
+    total.image = pixels  # type: ignore[attr-defined]
+    return total
+
+
+def random_image(rows: int, columns: int) -> Image:
+    return padded(np.random.default_rng(1).random((rows, columns, 3)).astype(np.float32))
+
+
+def constant_fields(height: int, width: int, dx: float, dy: float, radius: float = 0.0) -> Fields:
+    sweep = np.empty((2, height, width), np.float32)
+    sweep[0], sweep[1] = dx, dy
+    disc = np.full((height, width), radius, np.float32)
+    return Fields(np.zeros_like(sweep), sweep, disc, abs(dy) / 2 + radius)
+
+
+@pytest.mark.parametrize("margin", [0, 12])
+def test_forward_and_transpose_equal_the_oracle(margin: int) -> None:
+    wide = np.pad(wall(), margin, mode="edge")
+    fields = fields_of(ALL, CAMERA, wide, np.ones_like(wide), margin)
+    warp = Warp.of(fields, margin)
+    image = random_image(*wide.shape)
+    expected = oracle(image[..., :3].astype(np.float64), fields, margin, warp.samples)
+    made = warp.forward(image)[..., :3]
+    assert made.std() > 0.01
+    # Positions of up to 240 px in float32 are good to 1.5e-5 px, and the image changes by at most 1 a pixel.
+    np.testing.assert_allclose(made, expected.detach().numpy(), atol=5e-5)
+    light = random_image(*fields.radius.shape)
+    expected.backward(torch.tensor(light[..., :3]).double())
+    back = warp.transpose(light)[..., :3]
+    gradient = expected.image.grad.numpy()  # type: ignore[attr-defined]
+    np.testing.assert_allclose(back, gradient, atol=2e-4)
+    assert np.abs(gradient).max() > 0.5
+
+
+def test_transpose_is_the_transpose() -> None:
+    rng = np.random.default_rng(0)
+    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    warp = Warp.of(fields)
+    a, b = (padded(rng.standard_normal((*wall().shape, 3)).astype(np.float32)) for _ in range(2))
+    forth, back = warp.forward(a), warp.transpose(b)
+    # Sums of 1e5 products of float32: relative to their norms some 1e-7 are lost.
+    norms = np.linalg.norm(forth) * np.linalg.norm(b)
+    assert abs(np.vdot(forth.astype(float), b) - np.vdot(a.astype(float), back)) < 1e-5 * norms
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "dx", "dy", "radius"),
+    [
+        (20, 30, 90.0, 0.0, 0.0),
+        (20, 30, 0.0, 90.0, 0.0),
+        (1, 1, 5.0, 5.0, 1.0),
+        (1, 9, 3.0, 2.0, 0.0),
+        (40, 1, 0.0, 7.0, 3.0),
+    ],
+    ids=["longer than the image", "higher than the image", "one pixel", "one row", "one column"],
+)
+def test_hard_sizes_and_lengths(height: int, width: int, dx: float, dy: float, radius: float) -> None:
+    fields = constant_fields(height, width, dx, dy, radius)
+    warp = Warp.of(fields)
+    image, light = random_image(height, width), random_image(height, width)
+    expected = oracle(image[..., :3].astype(np.float64), fields, 0, warp.samples)
+    np.testing.assert_allclose(warp.forward(image)[..., :3], expected.detach().numpy(), atol=2e-5)
+    forth, back = warp.forward(image).astype(float), warp.transpose(light).astype(float)
+    assert np.vdot(forth, light) == pytest.approx(np.vdot(image.astype(float), back), rel=1e-5)
+
+
+def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
+    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    warp = Warp.of(fields)
+    flat = padded(np.full((*wall().shape, 3), 0.25, np.float32))
+    np.testing.assert_allclose(warp.forward(flat)[..., :3], 0.25, atol=1e-6)
+    light = random_image(*wall().shape)
+    back = warp.transpose(light)
+    np.testing.assert_allclose(back.sum((0, 1), dtype=float), light.sum((0, 1), dtype=float), rtol=1e-5)
+
+
+def test_a_still_frame_is_the_image_itself() -> None:
+    still = FrameMotion()
+    assert still.is_still
+    warp = Warp.of(fields_of(still, CAMERA, wall(), np.ones_like(wall())))
+    image = random_image(*wall().shape)
+    np.testing.assert_array_equal(warp.forward(image), image)
+    np.testing.assert_array_equal(warp.transpose(image), image)
+
+
+def test_depth_that_is_no_number_counts_as_the_median() -> None:
+    depth = wall().copy()
+    depth[10:20] = np.nan
+    depth[30:40] = 0.0
+    alpha = np.ones_like(depth)
+    alpha[50:60] = 0.0
+    alpha[70:80] = np.nan
+    fields = fields_of(ALL, CAMERA, depth, alpha)
+    flat = fields_of(ALL, CAMERA, np.full_like(depth, MEDIAN), np.ones_like(depth))
+    for rows in (slice(10, 20), slice(30, 40), slice(50, 60), slice(70, 80)):
+        np.testing.assert_array_equal(fields.sweep[:, rows], flat.sweep[:, rows])
+    assert np.isfinite([fields.offset, fields.sweep]).all()
+    assert np.isfinite(fields.radius).all()
+
+
+def test_a_depth_edge_moves_each_side_by_its_own_way() -> None:
+    """A step to the side moves what is near further: a scene point's way is inverse to its depth."""
+    depth = np.full_like(wall(), 4.0)
+    depth[:, :100] = 2.0
+    motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=4.0)
+    fields = fields_of(motion, CAMERA, depth, np.ones_like(depth))
+    np.testing.assert_allclose(fields.sweep[0, :, :100], -12.0)
+    np.testing.assert_allclose(fields.sweep[0, :, 100:], -6.0)
+
+
+def test_floaters_do_not_move_by_whole_images() -> None:
+    depth = wall().copy()
+    depth[:10, :10] = 1e-4
+    motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=MEDIAN)
+    fields = fields_of(motion, CAMERA, depth, np.ones_like(depth))
+    assert np.abs(fields.sweep).max() <= 6.0 * kernels.MAX_NEARNESS
+
+
+def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
+    """A turn about the vertical axis: the average of exactly rotated views, on an image of smooth waves."""
+    angle, count = 8.0 / CAMERA.fx, 41
+
+    def wave(x: Doubles, y: Doubles) -> Doubles:
+        return 0.5 + 0.2 * np.sin(x / 6.0) * np.cos(y / 13.0)
+
+    y, x = np.indices(wall().shape, float)
+    mean = np.zeros_like(x)
+    for t in (np.arange(count) + 0.5) / count - 0.5:
+        ray = np.stack(
+            [(x + 0.5 - CAMERA.cx) / CAMERA.fx, (y + 0.5 - CAMERA.cy) / CAMERA.fy, np.ones_like(x)]
+        )
+        s, c = np.sin(-angle * t), np.cos(angle * t)
+        turned = np.stack([c * ray[0] + s * ray[2], ray[1], -s * ray[0] + c * ray[2]])
+        at_x = turned[0] / turned[2] * CAMERA.fx + CAMERA.cx - 0.5
+        at_y = turned[1] / turned[2] * CAMERA.fy + CAMERA.cy - 0.5
+        mean += wave(at_x, at_y) / count
+    motion = FrameMotion(blur=twist(0, 0, 0, 0, 8, 0), median_depth=MEDIAN)
+    still = padded(np.repeat(wave(x, y)[..., None], 3, 2).astype(np.float32))
+    made = Warp.of(fields_of(motion, CAMERA, wall(), np.ones_like(wall()))).forward(still)[..., 0]
+    inner = np.s_[:, 8:-8]
+    assert np.abs(wave(x, y) - mean)[inner].max() > 0.02
+    # Eight samples of a way of eight pixels, and bilinear interpolation of the waves.
+    np.testing.assert_allclose(made[inner], mean[inner], atol=1.5e-3)
+
+
+def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
+    values = np.linspace(-0.1, 2.5, 9973).reshape(-1, 1, 1).repeat(3, 2).astype(np.float32)
+    usual = (values > 0) & (values < kernels.CURVE_LAST)
+    for curve, formula, tolerance in (
+        (linear_curve(), linear_from_srgb, 1e-6),
+        # Steepest where sRGB turns from straight to a power, at 0.003.
+        (srgb_curve(), srgb_from_linear, 3e-5),
+    ):
+        out, slope = through_curve(values, curve)
+        expected = formula(values.astype(np.float64))
+        np.testing.assert_allclose(out[usual], expected[usual], atol=tolerance)
+        assert np.isfinite(out).all()
+        step = np.float32(1e-3)
+        (further, _), (before, _) = (through_curve(values + sign * step, curve) for sign in (1, -1))
+        # Finite differences away from the formula's corner; the tables' pieces are 2.4e-4 wide.
+        smooth = usual[..., 0].ravel() & (values[:, 0, 0] > 0.05) & (values[:, 0, 0] < 1.9)
+        difference = (further - before)[smooth] / (2 * step)
+        np.testing.assert_allclose(slope[smooth], difference, rtol=5e-3)
+
+
+def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None:
+    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    warp = Warp.of(fields)
+    rng = np.random.default_rng(3)
+    image = rng.uniform(0.2, 0.8, (*wall().shape, 3)).astype(np.float32)
+    weight = rng.standard_normal(image.shape).astype(np.float32)
+    direction = rng.standard_normal(image.shape).astype(np.float32)
+
+    def chain(picture: Image) -> tuple[float, Image]:
+        linear, to_linear = through_curve(picture, linear_curve(), CHANNELS)
+        photo, to_srgb = through_curve(warp.forward(linear), srgb_curve())
+        back = times_slope(weight, to_srgb, CHANNELS)
+        return float(np.vdot(photo.astype(float), weight)), times_slope(warp.transpose(back), to_linear)
+
+    _, gradient = chain(image)
+    step = 2e-3
+    difference = (chain(image + step * direction)[0] - chain(image - step * direction)[0]) / (2 * step)
+    assert float(np.vdot(gradient.astype(float), direction)) == pytest.approx(difference, rel=2e-3)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    image = random_image(*wall().shape)
+    results = []
+    for threads in (1, 2):
+        set_threads(threads)
+        warp = Warp.of(fields_of(ALL, CAMERA, wall(), np.ones_like(wall())))
+        results.append((warp.forward(image), warp.transpose(image)))
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_samples_are_centred() -> None:
+    for count in (1, 3, 16, 64):
+        points = samples(count)
+        assert points.shape == (count, 3)
+        np.testing.assert_allclose(points[:, 0].mean(), 0.0, atol=1e-6)
+        np.testing.assert_allclose(points[:, 1:].mean(axis=0), 0.0, atol=1e-6)
+        assert np.hypot(points[:, 1], points[:, 2]).max() < 1.1
+    # The mean square of a disc's points is half of its rim's.
+    np.testing.assert_allclose((samples(64)[:, 1:] ** 2).sum(axis=1).mean(), 0.5, atol=0.02)
+
+
+def test_a_camera_of_another_size_scales_the_motion() -> None:
+    half = CAMERA.scaled(0.5)
+    assert isinstance(half, Camera)
+    full = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    small = wall()[::2, ::2].copy()
+    reduced = fields_of(ALL, half, small, np.ones_like(small), scale=0.5)
+    # A reduced pixel's centre lies half a pixel from the ones it is compared with.
+    np.testing.assert_allclose(reduced.sweep, 0.5 * full.sweep[:, ::2, ::2], atol=0.06)
