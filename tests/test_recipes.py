@@ -34,6 +34,10 @@ METHOD: dict[str, Any] = {
     "rivr.group": 8,  # along the trajectory
     "rivr.use_observation": True,
     "rivr.undo_motion": False,
+    "g0.formation.enabled": False,
+    "rivr.distil.formation.enabled": False,
+    "consolidate.distil.formation.enabled": False,
+    "rivr.keep_raw": False,
     "rivr.use_fused": True,
     "rivr.gate.max_share": 1.0,  # no gate
     "rivr.distil.pseudo_share": "even",

@@ -35,13 +35,22 @@ _WEIGHT_ONE = (
 )
 """Every active frame weighs as much as a strong one."""
 
+_PLAIN_G0 = ("g0.formation.enabled=false",)
+"""Raw frames are compared with the sharp render."""
+_PLAIN = (*_PLAIN_G0, "rivr.distil.formation.enabled=false", "consolidate.distil.formation.enabled=false")
+
 VARIANTS: tuple[Variant, ...] = (
-    Variant("all-view", "all-view G0", "g0", ("rva.enabled=false",)),
-    Variant("drop-blurry", "drop-blurry G0", "g0", ("rva.weighting=binary",)),
-    Variant("rva-paper", "RVA G0, the paper's", "g0", _PAPER_RVA),
-    Variant("rva-no-coverage", "the same w/o coverage", "g0", (*_PAPER_RVA, "rva.coverage=false")),
-    Variant("rva-binary", "the same, weights 0 and 1", "g0", (*_PAPER_RVA, *_WEIGHT_ONE)),
-    Variant("rva", "RVA G0", "g0"),
+    Variant("all-view", "all-view G0", "g0", ("rva.enabled=false", *_PLAIN_G0)),
+    Variant("drop-blurry", "drop-blurry G0", "g0", ("rva.weighting=binary", *_PLAIN_G0)),
+    Variant("rva-paper", "RVA G0, the paper's", "g0", (*_PAPER_RVA, *_PLAIN_G0)),
+    Variant(
+        "rva-no-coverage", "the same w/o coverage", "g0", (*_PAPER_RVA, *_PLAIN_G0, "rva.coverage=false")
+    ),
+    Variant("rva-binary", "the same, weights 0 and 1", "g0", (*_PAPER_RVA, *_PLAIN_G0, *_WEIGHT_ONE)),
+    Variant("rva", "RVA G0", "g0", _PLAIN_G0),
+    Variant("formation", "RVA G0 with formation", "g0"),
+    Variant("all-view-formation", "all-view G0 with formation", "g0", ("rva.enabled=false",)),
+    Variant("no-formation", "ClearGS w/o formation", "consolidate", _PLAIN),
     Variant(
         "no-repairs",
         "ClearGS w/o repairs",
@@ -67,6 +76,10 @@ QUESTIONS: tuple[tuple[str, str, str], ...] = (
     ("the whole method, against all-view training", WHOLE, "all-view"),
     ("the whole method, against dropping blurry frames", WHOLE, "drop-blurry"),
     ("the whole method, against the paper's with open models", WHOLE, "paper-open"),
+    ("image formation alone, against RVA without it", "formation", "rva"),
+    ("image formation in the whole method", WHOLE, "no-formation"),
+    ("repairs and consolidation, against formation alone as long", WHOLE, "formation"),
+    ("RVA's weights under formation", "formation", "all-view-formation"),
     ("RVA, against all-view training", "rva", "all-view"),
     ("RIVR and consolidation, against RVA trained as long", WHOLE, "rva"),
     ("repairs, against the same distillation without them", WHOLE, "no-repairs"),

@@ -1,4 +1,4 @@
-"""What a camera does to a sharp image (colour, motion blur, rolling shutter, defocus), and finding its numbers.
+"""What a camera does to a sharp image (colour, motion blur, rolling shutter, defocus); finding the numbers.
 
 A raw frame is compared with the render *as its camera saw it*:
 

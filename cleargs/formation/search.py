@@ -49,8 +49,8 @@ light does, says nothing of motion."""
 OUTLIER, LIMIT = 0.03, 0.1
 """Differences of linear light from which they count linearly, and no further."""
 
-LEAST_MISFIT = 1e-6
-"""Of linear light, from which there is something to explain."""
+LEAST_MISFIT = 5e-4
+"""Of linear light, from which there is something to explain: what rounding to eight bits leaves."""
 
 JUDGE_BLOCK, JUDGE_EVERY = 16, 4
 """Side in pixels of the blocks of which every fourth judges."""
@@ -181,12 +181,12 @@ class _Level:
         def reduced(image: Floats) -> Floats:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
-        def widened(image: Floats, how: int) -> Floats:
-            return np.asarray(cv2.copyMakeBorder(image, margin, margin, margin, margin, how), np.float32)
-
-        self._image = _high_passed(reduced(sight.luminance))
-        self._observed = _high_passed(reduced(widened(sight.observed, cv2.BORDER_REPLICATE)))
-        counted = (reduced(widened(sight.weight, cv2.BORDER_CONSTANT)) > 0.99).astype(np.float32)
+        inner = np.s_[margin : height - margin, margin : width - margin]
+        # Beyond the frame's border the render stands in, so that both are high-passed alike there.
+        observed, weight = sight.luminance.copy(), np.zeros_like(sight.luminance)
+        observed[inner], weight[inner] = sight.observed, sight.weight
+        self._image, self._observed = _high_passed(reduced(sight.luminance)), _high_passed(reduced(observed))
+        counted = (reduced(weight) > 0.99).astype(np.float32)
         judging = _judging(counted.shape)
         self._fitting, self._judging = counted * ~judging, counted * judging
         if not self._judging.any():  # an image of a few blocks

@@ -23,7 +23,21 @@ from cleargs.splat.trainer import Trained, Trainer, train
 from cleargs.splat.views import View
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 5
-CONFIG = TrainConfig(steps=60, densify=False, coarse_share=0.0, sh_interval=0, checkpoint_interval=17)
+CONFIG = TrainConfig(
+    steps=60,
+    densify=False,
+    coarse_share=0.0,
+    sh_interval=0,
+    checkpoint_interval=17,
+    # Training starts from the truth: what changes it is what the frames teach, not the first steps of Adam.
+    lr_means=0.0,
+    lr_scales=0.0,
+    lr_rotations=0.0,
+    lr_opacities=0.0,
+    lr_sh=2e-3,
+    opacity_reg=0.0,
+    scale_reg=0.0,
+)
 LOOK = FormationConfig(start=0.0, every=4)
 BLURRED = 2
 BLUR = FrameMotion(blur=np.array([0, 0, 0, 0, 7.0, 0]), median_depth=3.0)
@@ -89,15 +103,15 @@ def test_a_blurred_frame_is_found_and_the_sharp_ones_are_left_alone(tmp_path: Pa
     assert found.explained > 0.5
 
 
-def test_with_it_the_scene_stays_sharp(tmp_path: Path) -> None:
-    """Without, the blurred frame pulls the scene away from what the others show."""
+def test_with_it_a_blurred_frame_teaches_a_sharp_scene(tmp_path: Path) -> None:
+    """Alone with a blurred frame the scene learns its blur, or what was in front of the camera."""
     errors = {}
     sharp = views(blurred=None)[BLURRED]
     truth = torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
-    for name, formation in (("plain", None), ("formed", CaptureFormation(views(), LOOK))):
-        trained = run(tmp_path / name, views(), formation)
+    for name, formation in (("plain", None), ("formed", CaptureFormation([views()[BLURRED]], LOOK))):
+        trained = run(tmp_path / name, [views()[BLURRED]], formation)
         errors[name] = float((photograph(trained.scene, sharp) - truth).square().mean())
-    assert errors["formed"] < 0.5 * errors["plain"]
+    assert errors["formed"] < 0.1 * errors["plain"]
 
 
 def test_sharp_frames_train_as_without_it_bit_for_bit(tmp_path: Path) -> None:
@@ -181,5 +195,5 @@ def test_a_frame_is_rendered_with_a_margin() -> None:
     moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
     wide = photograph(scene(), seen[BLURRED], formation=moved)
     without = photograph(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
-    assert (wide - without)[:, 8:-8].abs().max() < 1e-5
+    assert (wide - without)[4:-4, 8:-8].abs().max() < 1e-5
     assert (wide - without)[:, :2].abs().max() > 0.01

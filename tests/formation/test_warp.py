@@ -199,7 +199,7 @@ def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
     motion = FrameMotion(blur=twist(0, 0, 0, 0, 8, 0), median_depth=MEDIAN)
     still = padded(np.repeat(wave(x, y)[..., None], 3, 2).astype(np.float32))
     made = Warp.of(fields_of(motion, CAMERA, wall(), np.ones_like(wall()))).forward(still)[..., 0]
-    inner = np.s_[:, 8:-8]
+    inner = np.s_[4:-4, 8:-8]  # a turn bends the rows near the corners
     assert np.abs(wave(x, y) - mean)[inner].max() > 0.02
     # Eight samples of a way of eight pixels, and bilinear interpolation of the waves.
     np.testing.assert_allclose(made[inner], mean[inner], atol=1.5e-3)

@@ -19,11 +19,15 @@ from tiny_capture import (
     Contrast,
     Darkness,
     Sharpen,
+    orbit,
     tiny_consolidate,
     tiny_rivr,
     write_capture,
 )
 
+from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.motion import FrameMotion
+from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.rivr.candidates import fuse
 from cleargs.rivr.tables import (
@@ -36,6 +40,8 @@ from cleargs.rivr.tables import (
     repaired_share,
     write_selection,
 )
+from cleargs.splat.config import FormationConfig
+from cleargs.splat.views import View
 from cleargs.stages import consolidate, rivr
 
 HELD_BACK = 3
@@ -140,6 +146,7 @@ def test_without_the_observation_the_expert_restores_the_render(capture: Capture
 
 
 def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: Sharpen) -> None:
+    capture.use_good_scene()
     context = capture.context("rivr", tiny_rivr(undo_motion=True))
     rivr.run(context)
     rows = read_selection(context.out / "selection.parquet")
@@ -187,12 +194,42 @@ class Faithful:
 def keeping(**changes: Any) -> Any:
     """The default: motion undone, no fusion, raw frames kept. The stand-in scorers have no calibrated scale,
     so that the margin leaves the choice to them only where they differ grossly."""
-    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
+    plain = {"steps": 12, "checkpoint_interval": 5, "formation": {"enabled": False}}
+    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, distil=plain, **changes)
+
+
+def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps its raw frame, the EXR shows how it is explained, and no repair of it is drawn."""
+    monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
+    capture.use_good_scene()
+    blurred = 2
+    views = [
+        View(k, orbit(k), 1.0 if ROLES[k] == "strong" else 0.5, "real", lambda: (None, None)) for k in TARGETS
+    ]
+    motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
+    known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0)}
+    weights = {view.frame_id: view.weight for view in views}
+    formation = CaptureFormation(views, FormationConfig(), known=known)
+    write_formation(capture.root / "g0" / "formation.parquet", formation, weights)
+    context = capture.context("rivr", tiny_rivr(rounds=1, keep_raw=True))
+    rivr.run(context)
+    rows = {row.frame_id: row for row in read_selection(context.out / "selection.parquet")}
+    assert (rows[blurred].chosen, rows[blurred].accepted) == ("observed", False)
+    assert rows[blurred].reason == "explained: blur 6.0 px"
+    layers = read_exr(context.out / rows[blurred].exr).layers
+    seen, explained, render = (from_layer(layers[name]) for name in ("observed", "explained", "render"))
+    # The frame is a mean over seven pixels along the rows, the render sharp; both are a little off in colour.
+    assert np.abs(explained - seen).mean() < 0.8 * np.abs(render - seen).mean()
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    assert (blurred, "pseudo") not in set(zip(log["frame_id"], log["kind"], strict=True))
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
+    capture.use_good_scene()
     context = capture.context("rivr", keeping())
     result = rivr.run(context)
     rows = read_selection(context.out / "selection.parquet")

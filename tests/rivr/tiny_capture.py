@@ -83,6 +83,12 @@ class Capture:
     def __init__(self, root: Path) -> None:
         self.root = root
 
+    def use_good_scene(self) -> None:
+        """Give G0 nearly the scene that the frames show: sharp enough to tell how they were taken."""
+        nearly = scene()
+        nearly.sh += 0.05
+        write_ply(self.root / "g0" / "scene.ply", Scene(nearly))
+
     def context(self, stage: str, config: Any, *, threads: int = 1, run: str = "run") -> StageContext[Any]:
         """A context whose outputs go to ``root/run/stage``."""
         out, checkpoints = self.root / run / stage, self.root / run / "work" / stage
