@@ -11,6 +11,7 @@ from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.resources import Resources, resources
 from cleargs.batch.scenes import Scene
 from cleargs.batch.sheet import Problem
+from cleargs.children import module_command
 from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo
@@ -22,7 +23,7 @@ from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 
-WATCHER = (sys.executable, "-m", "cleargs.batch.job")
+WATCHER = tuple(module_command("cleargs.batch.job"))
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TextIO
 
+from cleargs.children import module_command
 from cleargs.errors import StageError
 from cleargs.progress import Reporter, Task
 
@@ -60,7 +60,7 @@ def _die_with_parent() -> None:
 
 
 def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporter) -> None:
-    """Run ``python -m module job`` to its end, showing its progress.
+    """Run ``python -P -m module job`` to its end, showing its progress.
 
     Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted.
     Whatever ends this call early (Ctrl-C above all) kills the child first.
@@ -75,7 +75,7 @@ def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporte
     with (
         log.open("w", encoding="utf-8") as errors,
         subprocess.Popen(
-            [sys.executable, "-m", module, str(job)],
+            module_command(module, str(job)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
