@@ -13,7 +13,7 @@ from cleargs.capture.cameras import Camera, Pose, pinhole
 from cleargs.capture.layout import POSES_BOUNDS, image_folders
 from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
-from cleargs.media.image import IMAGE_SUFFIXES
+from cleargs.media import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True)

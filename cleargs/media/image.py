@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
-
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-"""File endings (lower case) taken for images."""
+from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 

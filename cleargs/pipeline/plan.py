@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from cleargs.errors import InputError, StoreError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import tree_digest
+from cleargs.pipeline.digest import require_utf8, tree_digest
 from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.stage import Estimate, StageContext
+from cleargs.pipeline.stage import Estimate, External, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
 
@@ -31,7 +31,7 @@ class Recipe:
 
     parts: KeyParts
     origins: Origins
-    externals: Mapping[str, Path]
+    externals: Mapping[str, External]
     inputs: Mapping[str, Path]
     """Upstream stage -> its finished folder."""
     inherited: tuple[str, ...]
@@ -114,13 +114,15 @@ class Planner:
         )
         return Recipe(parts, origins, external_files, folders, inherited)
 
-    def _external_digests(self, places: Mapping[str, Path]) -> dict[str, dict[str, str]]:
+    def _external_digests(self, places: Mapping[str, External]) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
         hint = "choose a folder beside the input with -o"
+        for place in (self.run.folder, self.run.source, self.store.root):
+            require_utf8(place)
         if self.run.folder == self.run.source:
             raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
         for place in places.values():
-            if self.run.folder.is_relative_to(place):
+            if isinstance(place, Path) and self.run.folder.is_relative_to(place):
                 raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
         return {role: self.store.memo.digests_of(place) for role, place in places.items()}
 
@@ -151,7 +153,7 @@ class Planner:
         self,
         name: str,
         inputs: Mapping[str, Path],
-        externals: Mapping[str, Path],
+        externals: Mapping[str, External],
         out: Path,
         checkpoints: Path,
     ) -> StageContext[Any]:
