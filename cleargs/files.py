@@ -55,6 +55,21 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n").encode())
 
 
+def sync_tree(folder: Path) -> None:
+    """Have the folder and all in it on the disk: a rename of it then shows all or nothing."""
+    for path in [*folder.rglob("*"), folder]:
+        sync(path)
+
+
+def sync(path: Path) -> None:
+    """Have the file or folder ``path`` on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def disk_error(error: OSError, path: Path) -> StoreError:
     """The StoreError that says what to do about a failed write of ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -56,7 +56,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, at_most: int = MAX_BYTES) -> bytes:
-    """The content of the regular file at ``path``. Raises OSError like `open_regular`, and for a larger one."""
+    """The content of the regular file at ``path``. Raises OSError for none such, and a larger one."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > at_most:

@@ -1,4 +1,4 @@
-"""The files that transforms.json lists. Imports nothing heavy: what a run is made from is looked up here too."""
+"""The files that transforms.json lists. Imports nothing heavy: every run looks up its inputs here."""
 
 from __future__ import annotations
 

@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
     "bench": ("cleargs.cli.bench", "Measure the splatting core on this machine."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
+    "verify": ("cleargs.cli.verify", "Read every file of a run again, and name what is damaged."),
     "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
 }
 """Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""

@@ -170,9 +170,12 @@ def _connect(path: Path) -> sqlite3.Connection:
     try:
         database.execute(
             "CREATE TABLE IF NOT EXISTS contents"
-            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, ctime_ns INTEGER, inode INTEGER, digest TEXT)"
+            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, ctime_ns INTEGER, inode INTEGER,"
+            " digest TEXT)"
         )
-        database.execute("SELECT path, size, mtime_ns, ctime_ns, inode, digest FROM contents LIMIT 1").fetchone()
+        database.execute(
+            "SELECT path, size, mtime_ns, ctime_ns, inode, digest FROM contents LIMIT 1"
+        ).fetchone()
     except sqlite3.Error:
         database.close()
         raise

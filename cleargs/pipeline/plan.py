@@ -74,10 +74,11 @@ class Planner:
     threads: int
     reporter: Reporter
 
-    def recipe(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+    def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
         """What ``name`` is made from, given the manifests of the stages before it.
 
-        Raises InputError when an external (the capture, a model) cannot be read.
+        With ``afresh`` every external is read, whatever the memo says of it. Raises InputError when one (the
+        capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
         origins: Origins = {}
@@ -89,7 +90,7 @@ class Planner:
                 origins[f"{upstream}/{path}"] = files
                 inputs[upstream][path] = tree_digest(files) if files else None
         external_files = dict(stage.externals(config, self.run.source))
-        digests = self._external_digests(external_files)
+        digests = self.external_digests(external_files, afresh=afresh)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
@@ -114,7 +115,9 @@ class Planner:
         )
         return Recipe(parts, origins, external_files, folders, inherited)
 
-    def _external_digests(self, places: Mapping[str, External]) -> dict[str, dict[str, str]]:
+    def external_digests(
+        self, places: Mapping[str, External], *, afresh: bool = False
+    ) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
         hint = "choose a folder beside the input with -o"
         for place in (self.run.folder, self.run.source, self.store.root):
@@ -124,7 +127,7 @@ class Planner:
         for place in places.values():
             if isinstance(place, Path) and self.run.folder.is_relative_to(place):
                 raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
-        return {role: self.store.memo.digests_of(place) for role, place in places.items()}
+        return {role: self.store.memo.digests_of(place, afresh=afresh) for role, place in places.items()}
 
     def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
@@ -183,7 +186,7 @@ class Planner:
             waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
             if waits_for:
                 stage = self.dag.load(name)
-                self._external_digests(stage.externals(self.run.config.sections[name], self.run.source))
+                self.external_digests(stage.externals(self.run.config.sections[name], self.run.source))
                 reason = f"waits for {', '.join(waits_for)}"
                 plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
                 continue

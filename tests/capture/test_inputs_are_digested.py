@@ -26,7 +26,7 @@ def moved(posed: Path, place: str, listed: str, key: str = '"file_path"') -> Pat
     file.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(posed / "images" / "000.png", file)
     text = (posed / "transforms.json").read_text()
-    text = text.replace('"file_path": "images/000.png"', f'{key}: {json.dumps(listed)}')
+    text = text.replace('"file_path": "images/000.png"', f"{key}: {json.dumps(listed)}")
     (posed / "transforms.json").write_text(text)
     return file
 
