@@ -6,8 +6,9 @@ COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
-import json
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,8 +22,12 @@ from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.world import Similarity, normalise
 from cleargs.errors import InputError, StageError
-from cleargs.files import write_json
+from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
+from cleargs.untrusted import FAULTS, cause, read_json
+
+GIVEN_POSES = "given_poses.json"
+"""In the folder of the model: how far the input's poses missed, and whether they were refined."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -162,8 +167,7 @@ def _run(
     job: _Job, folder: Path, config: IngestConfig, seed: int, threads: int, reporter: Reporter
 ) -> SparseModel:
     """Let COLMAP do the job, unless a killed run got as far as the model."""
-    model = folder / "model"
-    if not model.is_dir():
+    if (model := _resumed(folder, reporter, posed=job.poses is not None)) is None:
         settings = {
             **asdict(job),
             "folder": str(folder.resolve()),
@@ -179,13 +183,48 @@ def _run(
         }
         write_json(folder / "job.json", settings)
         run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", threads, reporter)
-    return read_model(model)
+        model = read_model(folder / "model")
+    return model
+
+
+def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | None:
+    """The model that a killed run left in ``folder``, or None.
+
+    What is damaged, COLMAP's database too, is thrown away with a warning.
+    """
+    model, database = folder / "model", folder / "database.db"
+    if model.exists():
+        try:
+            found = read_model(model)
+            if posed:
+                _what_became_of_poses(folder)
+            return found
+        except InputError as error:
+            reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
+            remove(model)
+    if database.exists() and not _sound(database):
+        reporter.warn("the damaged features of an interrupted run are found again")
+        for leftover in folder.glob("database.db*"):
+            leftover.unlink()
+    return None
+
+
+def _sound(database: Path) -> bool:
+    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
+    try:
+        with closing(sqlite3.connect(database)) as opened:
+            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
     """Median reprojection error at the given poses, px, and whether they were refined."""
-    said = json.loads((folder / "model" / "given_poses.json").read_text(encoding="utf-8"))
-    return said["missed_px"], said["refined"]
+    try:
+        said = read_json(folder / "model" / GIVEN_POSES)
+        return float(said["missed_px"]), bool(said["refined"])
+    except FAULTS as error:
+        raise InputError(f"{GIVEN_POSES} cannot be read: {cause(error)}", hint="run ingest again") from error
 
 
 def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
