@@ -18,6 +18,9 @@ from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 
+_COARSEST_MASK = 8
+"""Most pixels of a working image that one of its mask may stand for, along a side."""
+
 
 @dataclass(frozen=True)
 class WorkFrame:
@@ -135,9 +138,16 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
         camera = camera.resized(width, height)
     if frame.mask is not None and not resumable(mask, reporter, read_mask):
         stencil = read_mask(frame.mask)
-        if not _alike(stencil.shape[1], stencil.shape[0], rgb):
+        # To whole pixels, a mask of one pixel has any proportions.
+        coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
+        if coarse or not _alike(stencil.shape[1], stencil.shape[0], rgb):
+            what = (
+                f"is far smaller than {frame.name}"
+                if coarse
+                else f"does not have the proportions of {frame.name}"
+            )
             raise InputError(
-                f"the mask {frame.mask.name} does not have the proportions of {frame.name}",
+                f"the mask {frame.mask.name} {what}",
                 hint="make masks of the size of their images",
             )
         write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))

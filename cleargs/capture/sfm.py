@@ -26,6 +26,9 @@ from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
 from cleargs.untrusted import FAULTS, cause, read_json
 
+FARTHEST = 1e9
+"""Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
+
 GIVEN_POSES = "given_poses.json"
 """In the folder of the model: how far the input's poses missed, and whether they were refined."""
 
@@ -73,7 +76,11 @@ def reconstruct(
         return Reconstruction(_moved(model, similarity), similarity, None, refined=False)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
-    adopted = None if given is None else _moved(_adopted(given, posed), similarity)
+    adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
+    if adopted is not None and adopted.dropped:
+        reporter.warn(
+            f"{adopted.dropped} points of the input's sparse model are not finite or out of reach: left out"
+        )
     if adopted is not None and len(adopted.error):
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
@@ -230,6 +237,20 @@ def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
 def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
     images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
     return replace(model, images=images, xyz=similarity.points(model.xyz))
+
+
+def _within_reach(model: SparseModel) -> SparseModel:
+    """The model without the points beyond `FARTHEST`, which single precision may not hold."""
+    near = (np.abs(model.xyz) < FARTHEST).all(axis=1)  # infinite ones, and NaN, are not
+    if near.all():
+        return model
+    ids = model.point_ids[near]
+    images = {}
+    for key, image in model.images.items():
+        seen = np.isin(image.point_ids, ids)
+        images[key] = replace(image, xy=image.xy[seen], point_ids=image.point_ids[seen])
+    dropped = model.dropped + int((~near).sum())
+    return SparseModel(model.cameras, images, ids, model.xyz[near], model.error[near], dropped)
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -76,3 +77,17 @@ def test_a_colmap_model_lists_no_image_outside_its_folder(posed: Path, ingest: I
     model.write_bytes(model.read_bytes().replace(b"000000.png\0", name.encode() + b"\0"))
     with pytest.raises(InputError, match="outside images/"):
         open_capture(project, IngestConfig())
+
+
+@pytest.mark.parametrize("what", ["fifo", "device"])
+@pytest.mark.parametrize("name", ["view3.png", "notes.txt", "masks/view3.png"])
+def test_what_is_no_regular_file_is_named_at_once(images: Path, tmp_path: Path, what: str, name: str) -> None:
+    place = images / name
+    place.parent.mkdir(exist_ok=True)
+    place.unlink(missing_ok=True)
+    if what == "fifo":
+        os.mkfifo(place)
+    else:
+        place.symlink_to("/dev/zero")
+    with DigestMemo(tmp_path / "memo.sqlite") as memo, pytest.raises(InputError, match="no regular file"):
+        digests(images, memo)
