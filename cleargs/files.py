@@ -96,6 +96,8 @@ def disk_error(error: OSError, path: Path) -> StoreError:
         return StoreError(
             f"cannot write to {path.parent}: {error.strerror}", hint="choose a folder that you may write to"
         )
+    too_long = error.errno == errno.ENAMETOOLONG
     return StoreError(
-        f"cannot write {path}: {error.strerror or error}", hint="check the disk and its permissions"
+        f"cannot write {path}: {error.strerror or error}",
+        hint="choose a shorter path" if too_long else "check the disk and its permissions",
     )
