@@ -32,6 +32,7 @@ OUTPUTS = (
 )
 LIBRARIES = (
     "torch",
+    "triton",
     "numba",
     "numpy",
     "onnxruntime",

@@ -26,6 +26,7 @@ OUTPUTS = (
 )
 LIBRARIES = (
     "torch",
+    "triton",
     "numba",
     "numpy",
     "onnxruntime",

@@ -100,7 +100,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device,
-            libraries=library_versions(stage.LIBRARIES),
+            libraries=library_versions(stage.LIBRARIES, self.run.device),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited = tuple(
@@ -225,6 +225,10 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
     free = shutil.disk_usage(place).free / 1e9
     if needed > free:
         raise StoreError(
-            f"the run needs about {needed:.1f} GB of disk, {free:.1f} GB are free at {place}",
+            f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
         )
+
+
+def _size(gigabytes: float) -> str:
+    return f"{gigabytes:.1f} GB" if gigabytes >= 1 else f"{1000 * gigabytes:.0f} MB"

@@ -134,7 +134,7 @@ def noted_source(folder: Path) -> Path | None:
         source = read_toml(folder / RUN_FILE).get("input")
     except ConfigError:
         return None
-    return Path(source) if isinstance(source, str) else None
+    return Path(source) if isinstance(source, str) and "\0" not in source else None
 
 
 def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:
@@ -150,7 +150,9 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
     document = read_toml(folder / RUN_FILE)
     source, noted_store = document.pop("input", None), document.pop("store", None)
     noted_device = document.pop("device", "cpu")
-    if not isinstance(source, str) or noted_device not in ("cpu", "cuda"):
+    noted_store = "" if noted_store is None else noted_store
+    paths_sound = all(isinstance(path, str) and "\0" not in path for path in (source, noted_store))
+    if not paths_sound or not source or noted_device not in ("cpu", "cuda"):
         raise InputError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")
     return Run(
         folder,

@@ -119,7 +119,13 @@ class Store:
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Held by whoever works in the store, so that nothing is cleared away under its feet."""
+        """Held by whoever works in the store, so that nothing is cleared away under its feet.
+
+        In somebody else's store that may only be read there is nothing to hold: its results can be shown.
+        """
+        if self._only_readable():
+            yield
+            return
         with file_lock(self.root / "locks" / "store.lock", shared=True), lease(self._lease(self._writer)):
             yield
 
@@ -131,6 +137,11 @@ class Store:
         heartbeat is waited out; where a dead node's lock stays, it is passed over once no writer was seen
         alive for `DEAD_AFTER` seconds.
         """
+        if self._only_readable():
+            raise StoreError(
+                f"{stage} is to be made, but the store {self.root} may only be read",
+                hint="choose a --store of your own",
+            )
         path, held, said = self.root / "locks" / f"{key}.lock", False, False
         seen = time.monotonic()
         with ExitStack() as kept:
@@ -154,6 +165,9 @@ class Store:
                 yield
             finally:
                 self._let_go(key)
+
+    def _only_readable(self) -> bool:
+        return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
     def _lease(self, writer: str) -> Path:
         return self.root / "leases" / f"{writer}.json"
@@ -288,7 +302,7 @@ class Store:
         """Note that ``run`` links into this store, so that `collect` keeps what it shows."""
         name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
         note = self.root / "roots" / name
-        if not note.exists():
+        if not note.exists() and not self._only_readable():
             try:
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())

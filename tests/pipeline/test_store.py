@@ -301,3 +301,15 @@ def test_links_among_leftovers_are_not_published(bench: Bench) -> None:
     (out / "secret").symlink_to("/etc/passwd")
     assert bench.digests() == healthy
     assert any("out/secret" in line for line in bench.remarks.warnings)
+
+
+def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = bench.root / "shared"
+    bench.run(store=shared)
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK or Path(path) != shared)
+    before = sorted(shared.rglob("*"))
+    (bench.folder / "total").unlink()
+    assert [outcome.how for outcome in bench.run(store=shared)] == ["found"] * 3
+    assert (bench.folder / "total" / "total.txt").exists() and sorted(shared.rglob("*")) == before
+    with pytest.raises(StoreError, match="may only be read"):
+        bench.run("square.power=3", store=shared)
