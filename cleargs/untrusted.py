@@ -12,8 +12,9 @@ import os
 import stat
 import struct
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 MAX_BYTES = 4 * 2**30
 """Most bytes of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
@@ -37,7 +38,7 @@ FAULTS: tuple[type[Exception], ...] = (
 """What decoding a file of the wrong form may raise. Readers catch these where they say what they read."""
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> BufferedReader:
     """Open the regular file at ``path``, or the one that it links to, for reading.
 
     Raises OSError: there is no such file, it may not be read, or it is a folder, a FIFO or a device.

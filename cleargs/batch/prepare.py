@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,8 +61,11 @@ class Preparation:
         with (
             DigestMemo(self.folder.store / "digests.sqlite") as memo,
             reporter.task("scenes made ready", len(scenes)) as task,
+            ExitStack() as held,
         ):
             store = Store(self.folder.store, memo)
+            if not dry_run:
+                held.enter_context(store.in_use())  # what is linked here is not collected meanwhile
             for scene in scenes:
                 run = self._run(scene)
                 planner = Planner(self.dag, run, store, 1, SilentReporter())
