@@ -17,6 +17,10 @@ from cleargs.media import IMAGE_SUFFIXES
 from cleargs.untrusted import FAULTS, cause, open_regular
 
 
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
+"""NumPy lets errors of Python's tokenizer through where the header is damaged."""
+
+
 @dataclass(frozen=True)
 class LlffView:
     """One row of poses_bounds.npy with its image."""
@@ -60,8 +64,7 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")
         return np.array(table, np.float64)
-    except (*FAULTS, SyntaxError, TokenError) as error:
-        # NumPy lets errors of Python's tokenizer through where the header is damaged.
+    except _FAULTS as error:
         raise InputError(
             f"cannot read {path}: {cause(error)}",
             hint="write it again with LLFF's imgs2poses.py, or set ingest.poses=sfm",

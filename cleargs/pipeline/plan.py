@@ -120,8 +120,8 @@ class Planner:
     ) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
         hint = "choose a folder beside the input with -o"
-        for place in (self.run.folder, self.run.source, self.store.root):
-            require_utf8(place)
+        for folder in (self.run.folder, self.run.source, self.store.root):
+            require_utf8(folder)
         if self.run.folder == self.run.source:
             raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
         for place in places.values():
