@@ -16,7 +16,6 @@ from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.untrusted import FAULTS, cause, open_regular
 
-
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
 """NumPy lets errors of Python's tokenizer through where the header is damaged."""
 
