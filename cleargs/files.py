@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +56,36 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n").encode())
 
 
+def make_folder(path: Path, *, empty: bool = False) -> None:
+    """Have a folder at ``path``, in place of a file that lies there; ``empty`` also without what is in it."""
+    if empty or path.is_symlink() or not path.is_dir():
+        remove(path)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Have nothing at ``path``: neither a file, nor a link, nor a folder and all in it."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def sync_tree(folder: Path) -> None:
+    """Have the folder and all in it on the disk: a rename of it then shows all or nothing."""
+    for path in [*folder.rglob("*"), folder]:
+        sync(path)
+
+
+def sync(path: Path) -> None:
+    """Have the file or folder ``path`` on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def disk_error(error: OSError, path: Path) -> StoreError:
     """The StoreError that says what to do about a failed write of ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -65,6 +96,8 @@ def disk_error(error: OSError, path: Path) -> StoreError:
         return StoreError(
             f"cannot write to {path.parent}: {error.strerror}", hint="choose a folder that you may write to"
         )
+    too_long = error.errno == errno.ENAMETOOLONG
     return StoreError(
-        f"cannot write {path}: {error.strerror or error}", hint="check the disk and its permissions"
+        f"cannot write {path}: {error.strerror or error}",
+        hint="choose a shorter path" if too_long else "check the disk and its permissions",
     )

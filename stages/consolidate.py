@@ -34,6 +34,7 @@ OUTPUTS = (
 )
 LIBRARIES = (
     "torch",
+    "triton",
     "numba",
     "numpy",
     "onnxruntime",

@@ -22,7 +22,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "rva": ("frames.parquet",),
 }
 OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet", "state.safetensors")
-LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
+LIBRARIES = ("torch", "triton", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 _SECONDS_PER_STEP = 0.02
 _SECONDS_PER_MEGAPIXEL = 0.2
@@ -142,11 +142,16 @@ def _sparse_points(ingest: Path, frame_ids: list[int]) -> SparsePoints:
 def _start(
     context: StageContext[G0Config], views: list[View], sparse: SparsePoints, sh_degree: int
 ) -> Gaussians:
-    """One Gaussian a sparse point, and more behind random pixels until there are ``min_points``."""
-    from cleargs.splat.initialise import add_points, from_points
+    """One Gaussian a sparse point, and more behind random pixels until there are ``min_points``; never more
+    than ``budget``."""
+    from cleargs.splat.initialise import add_points, fewer_points, from_points
 
     config = context.config
-    missing = config.min_points - len(sparse.xyz)
+    most = config.budget or max(config.min_points, len(sparse.xyz))
+    if len(sparse.xyz) > most:
+        context.reporter.info(f"G0: {most} of {len(sparse.xyz)} sparse points, which g0.budget allows")
+        sparse = fewer_points(sparse, most, seed=context.seed)
+    missing = min(config.min_points, most) - len(sparse.xyz)
     if missing > 0:
         context.reporter.info(f"G0: {len(sparse.xyz)} sparse points, {missing} are added between them")
         sparse = add_points(sparse, views, missing, seed=context.seed)

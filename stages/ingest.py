@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
 
 VERSION = 3
 CONFIG = IngestConfig
@@ -16,7 +16,7 @@ OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images",
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy")
 
 
-def externals(config: IngestConfig, source: Path) -> Mapping[str, Path]:
+def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
     """The files and folders of the capture that are read."""
     return layout.externals(source, config)
 

@@ -36,6 +36,7 @@ OUTPUTS = (
 )
 LIBRARIES = (
     "torch",
+    "triton",
     "numba",
     "numpy",
     "onnxruntime",

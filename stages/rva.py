@@ -43,7 +43,8 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
     if config.evaluator == "statistics":
         return Estimate(minutes=frames / _FRAMES_PER_MINUTE, memory_gb=0.3, disk_gb=0.001)
     at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
-    weights = sum(file.stat().st_size for folder in context.externals.values() for file in folder.glob("*"))
+    folders = externals(config, context.source).values()
+    weights = sum(file.stat().st_size for folder in folders for file in folder.glob("*"))
     minutes = frames / (_REPLIES_PER_MINUTE * at_once)
     return Estimate(minutes=minutes, memory_gb=0.3 + weights / 1e9, disk_gb=0.001)
 

@@ -91,8 +91,14 @@ def only_batch(folder: BatchFolder) -> Iterator[int]:
 
     The lock lives as long as the engine, also where the command that started it was killed; one that was
     interrupted is waited for. Where the file system has no locks, the lease tells. Raises StageError when
-    another batch is at work, StoreError when the folder cannot be made.
+    another batch is at work, StoreError when the folder cannot be made,
+    InputError where Snakemake cannot work in it.
     """
+    if set("{}") & set(str(folder.root)):
+        raise InputError(
+            f"the batch folder {folder.root} has braces in its path, which Snakemake takes for wildcards",
+            hint="choose another -o",
+        )
     try:
         folder.root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -120,11 +126,14 @@ def run_engine(command: Sequence[str], folder: BatchFolder, lock: int, look: Cal
     what it gave to a cluster.
     """
     folder.engine_log.parent.mkdir(parents=True, exist_ok=True)
+    # It starts Pythons of its own in the batch folder: nothing is to be imported from there.
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
     with folder.engine_log.open("ab") as log:
         if _locked(folder):
             # We are the only batch, so this lock was left by an engine that was killed.
+            unlock = [*command, "--unlock"]
             subprocess.run(
-                [*command, "--unlock"], stdin=subprocess.DEVNULL, stdout=log, stderr=log, check=False
+                unlock, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, check=False
             )
         engine = subprocess.Popen(
             command,
@@ -132,6 +141,7 @@ def run_engine(command: Sequence[str], folder: BatchFolder, lock: int, look: Cal
             stdout=log,
             stderr=log,
             pass_fds=(lock,),
+            env=environment,
             start_new_session=True,  # so that a Ctrl-C reaches it once, from here
         )
         working = WORKING.format(engine.pid, socket.gethostname())

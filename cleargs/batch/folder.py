@@ -12,17 +12,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from cleargs.batch.resources import Resources
 from cleargs.errors import StoreError
 from cleargs.files import write_bytes
 from cleargs.pipeline.manifest import Manifest
+from cleargs.untrusted import FAULTS, read_json
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -164,6 +164,6 @@ def _write(path: Path, model: BaseModel) -> None:
 
 def _read(path: Path, kind: type[M]) -> M | None:
     try:
-        return kind.model_validate(json.loads(path.read_bytes()))
-    except (OSError, ValueError, ValidationError):
+        return kind.model_validate(read_json(path))
+    except FAULTS:  # ValidationError is a ValueError
         return None

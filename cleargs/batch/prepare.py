@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.resources import Resources, resources
 from cleargs.batch.scenes import Scene
 from cleargs.batch.sheet import Problem
+from cleargs.children import module_command
 from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo
@@ -22,7 +24,7 @@ from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 
-WATCHER = (sys.executable, "-m", "cleargs.batch.job")
+WATCHER = tuple(module_command("cleargs.batch.job"))
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,11 @@ class Preparation:
         with (
             DigestMemo(self.folder.store / "digests.sqlite") as memo,
             reporter.task("scenes made ready", len(scenes)) as task,
+            ExitStack() as held,
         ):
             store = Store(self.folder.store, memo)
+            if not dry_run:
+                held.enter_context(store.in_use())  # what is linked here is not collected meanwhile
             for scene in scenes:
                 run = self._run(scene)
                 planner = Planner(self.dag, run, store, 1, SilentReporter())

@@ -18,6 +18,7 @@ from cleargs.errors import InputError
 from cleargs.pipeline.config import Config, Document, check_document, merge, read_recipe
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import settings as flat
+from cleargs.untrusted import cause
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 NAME_RULE = "letters, digits, and _ . - after the first, at most 100"
@@ -96,7 +97,12 @@ class _Checker:
             self._note(row.line_of("input"), "the scene has no input")
             return self.folder
         source = self.folder / given
-        if not source.exists():
+        try:
+            there = source.exists()
+        except OSError as error:  # a name that is too long
+            self._note(row.line_of("input"), f"{source} cannot be read: {cause(error)}")
+            return source
+        if not there:
             self._note(row.line_of("input"), f"there is no {source}")
         return source
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from cleargs.errors import ConfigError, InputError
 from cleargs.pipeline.config import merge, parse_override, parse_toml
+from cleargs.untrusted import FAULTS, cause, read_text
 
 SCENE_HEADER = re.compile(r"\s*\[\[\s*scene\s*\]\]")
 ASSIGNMENT = re.compile(r"\s*([^=#\[\]]+?)\s*=")
@@ -67,10 +68,9 @@ def read_rows(path: Path) -> tuple[list[Row], list[Problem]]:
     a CSV.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise InputError(f"cannot read {path}: {cause}", hint="give a sheet, TOML or CSV") from error
+        text = read_text(path)
+    except FAULTS as error:
+        raise InputError(f"cannot read {path}: {cause(error)}", hint="give a sheet, TOML or CSV") from error
     is_csv = path.suffix.lower() == ".csv"
     rows, problems = _csv_rows(path, text) if is_csv else (_toml_rows(path, text), [])
     if not rows and not problems:

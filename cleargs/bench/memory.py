@@ -12,6 +12,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from cleargs.children import module_command
+
 STATUS = Path("/proc/self/status")
 RESET = Path("/proc/self/clear_refs")
 ITERATIONS = 3
@@ -19,7 +21,7 @@ ITERATIONS = 3
 
 def peak_memory(count: int, width: int, height: int, sigma: float) -> int | None:
     """Bytes that parameters, moments, gradients and buffers take at their peak; None where unknown."""
-    command = [sys.executable, "-m", __name__, str(count), str(width), str(height), str(sigma)]
+    command = module_command("cleargs.bench.memory", str(count), str(width), str(height), str(sigma))
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     value: int | None = json.loads(done.stdout)
     return value

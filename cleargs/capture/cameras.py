@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
+from cleargs.media import MAX_PIXELS
 
 SINGLE_FOCAL = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
@@ -42,6 +43,11 @@ class Camera:
         if not np.isfinite(self.params).all() or min(self.width, self.height) < 1:
             raise InputError(
                 "a camera has parameters that are not finite", hint="correct the camera in the input"
+            )
+        if self.width * self.height > MAX_PIXELS:
+            raise InputError(
+                f"a camera has more than {MAX_PIXELS} pixels",
+                hint="correct the camera in the input, or reduce its images",
             )
         if not self.colmap().verify_params() or min(self.focal) <= 0:
             raise InputError(

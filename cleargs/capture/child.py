@@ -8,20 +8,26 @@ other end closes when the parent is gone, however it went.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TextIO
 
+from cleargs.children import module_command
 from cleargs.errors import StageError
+from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
+
+_FULL = 8 * 2**20
+"""A disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB."""
 
 
 class ChildChannel:
@@ -60,9 +66,10 @@ def _die_with_parent() -> None:
 
 
 def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporter) -> None:
-    """Run ``python -m module job`` to its end, showing its progress.
+    """Run ``python -P -m module job`` to its end, showing its progress.
 
-    Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted.
+    Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted;
+    StoreError where the disk is full.
     Whatever ends this call early (Ctrl-C above all) kills the child first.
     """
     # One BLAS thread: sums in COLMAP's and numpy's linear algebra must not depend on the machine.
@@ -75,7 +82,7 @@ def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporte
     with (
         log.open("w", encoding="utf-8") as errors,
         subprocess.Popen(
-            [sys.executable, "-m", module, str(job)],
+            module_command(module, str(job)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -91,6 +98,8 @@ def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporte
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
             raise
+    if status != 0:
+        _check_space(log)
     if failure is not None:
         raise failure
     if status != 0:
@@ -98,6 +107,12 @@ def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporte
             f"COLMAP stopped ({_exit_reason(status)}): {_last_failure(log)}",
             hint="try other images, another ingest.camera_model or fewer ingest.max_features",
         )
+
+
+def _check_space(log: Path) -> None:
+    """Raise StoreError where the disk is full: COLMAP and SQLite then fail at whatever they were doing."""
+    if shutil.disk_usage(log.parent).free < _FULL:
+        raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
 
 
 def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | None:

@@ -3,12 +3,13 @@ every run, also of one with nothing to do."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from cleargs.capture.config import IngestConfig
+from cleargs.capture.listing import read_listing
+from cleargs.pipeline.stage import External
 
 POSES_BOUNDS = "poses_bounds.npy"
 """LLFF's file of poses."""
@@ -52,33 +53,32 @@ def mask_folder(source: Path) -> Path | None:
     return source / "masks" if (source / "masks").is_dir() else None
 
 
-def externals(source: Path, config: IngestConfig) -> Mapping[str, Path]:
-    """What ingest reads of ``source``: role -> file or folder. A missing input is left to ingest to name."""
+def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
+    """What ingest reads of ``source``: role -> file, folder, or single files by name.
+
+    A missing input is left to ingest to name. Raises InputError where transforms.json cannot be read.
+    """
     if not source.is_dir():
         return {"capture": source}
     kind = folder_kind(source, poses=config.poses == "auto")
     images, transforms = source / "images", source / "transforms.json"
+    found: dict[str, External]
     if kind == "llff":
         found = {"poses_bounds": source / POSES_BOUNDS}
         found.update((folder.name, folder) for folder in image_folders(source))
-    elif not images.is_dir() or (kind == "transforms" and _lists_outside(transforms)):
-        found = {"capture": source}
+    elif kind == "transforms":
+        found = {"transforms": transforms, "images": read_listing(transforms).files}
     else:
-        found = {"images": images}
+        found = {"images": images} if images.is_dir() else {"capture": source}
     if (masks := mask_folder(source)) is not None:
         found["masks"] = masks
-    if kind == "transforms":
-        found["transforms"] = transforms
-    elif kind == "colmap" and (model := find_model(source)) is not None:
+    if kind == "colmap" and (model := find_model(source)) is not None:
         found["sparse"] = model
     return found
 
 
-def _lists_outside(transforms: Path) -> bool:
-    """Whether transforms.json may list images elsewhere than in images/ (then the whole folder counts)."""
-    try:
-        text = transforms.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return True
-    listed = re.findall(r'"(?:file_path|mask_path)"\s*:\s*"([^"]*)"', text)
-    return not all(re.match(r"(\./)?(images|masks)/", path) for path in listed)
+def lies_below(name: str) -> bool:
+    """Whether a listed ``name`` stays in its folder and is not hidden: only such files are part of a folder's
+    digest."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and not any(part.startswith(".") for part in path.parts)

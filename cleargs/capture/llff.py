@@ -13,7 +13,11 @@ from cleargs.capture.cameras import Camera, Pose, pinhole
 from cleargs.capture.layout import POSES_BOUNDS, image_folders
 from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
-from cleargs.media.image import IMAGE_SUFFIXES
+from cleargs.media import IMAGE_SUFFIXES
+from cleargs.untrusted import FAULTS, cause, open_regular
+
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
+"""NumPy lets errors of Python's tokenizer through where the header is damaged."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +57,15 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
     Raises InputError when there is no such array in the file.
     """
     try:
+        open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
         table = np.lib.format.open_memmap(path, mode="r")
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")
         return np.array(table, np.float64)
-    except (OSError, ValueError, OverflowError, SyntaxError, TokenError) as error:
-        # NumPy lets errors of Python's tokenizer through where the header is damaged.
-        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except _FAULTS as error:
         raise InputError(
-            f"cannot read {path}: {cause}",
+            f"cannot read {path}: {cause(error)}",
             hint="write it again with LLFF's imgs2poses.py, or set ingest.poses=sfm",
         ) from error
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
+from cleargs.untrusted import FAULTS, cause, read_bytes, read_text
 
 MODEL_NAMES = (
     "SIMPLE_PINHOLE",
@@ -59,16 +60,18 @@ class SparseModel:
     point_ids: NDArray[np.int64]  # [P]
     xyz: NDArray[np.float64]  # [P, 3]
     error: NDArray[np.float64]  # [P] mean reprojection error, px
+    dropped: int = 0
+    """Points of the file that are not finite, and were left out."""
 
 
 def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model. Raises InputError when it is damaged or incomplete."""
     try:
-        if (folder / "images.bin").is_file():
+        if (folder / "images.bin").exists():
             return _read_binary(folder)
         return _read_text(folder)
-    except (OSError, struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        reason = "a file breaks off" if isinstance(error, struct.error) else error
+    except FAULTS as error:
+        reason = "a file breaks off" if isinstance(error, struct.error) else cause(error)
         raise InputError(
             f"cannot read the COLMAP model in {folder}: {reason}",
             hint="export cameras, images and points3D again, all binary or all text, or set ingest.poses=sfm",
@@ -114,7 +117,7 @@ class _Reader:
     """A binary file read from front to back."""
 
     def __init__(self, path: Path) -> None:
-        self.data = path.read_bytes()
+        self.data = read_bytes(path)
         self.position = 0
 
     def unpack(self, layout: str) -> tuple[int | float, ...]:
@@ -127,6 +130,11 @@ class _Reader:
         if number > len(self.data):
             raise ValueError("an impossible count")
         return int(number)
+
+    def skip(self, size: int) -> None:
+        if size > len(self.data) - self.position:
+            raise ValueError("an impossible count")
+        self.position += size
 
     def text(self) -> str:
         end = self.data.index(b"\0", self.position)
@@ -176,11 +184,11 @@ def _read_binary(folder: Path) -> SparseModel:
     errors: list[float] = []
     for _ in range(reader.count()):
         point_id, x, y, z, _r, _g, _b, error, length = reader.unpack("Q3d3BdQ")
-        reader.position += 8 * int(length)
+        reader.skip(8 * int(length))
         ids.append(int(point_id))
         xyz.append((x, y, z))
         errors.append(error)
-    point_ids, positions, residuals = _sorted_points(ids, xyz, errors)
+    point_ids, positions, residuals, dropped = _sorted_points(ids, xyz, errors)
 
     reader = _Reader(folder / "images.bin")
     images: dict[int, ModelImage] = {}
@@ -191,7 +199,7 @@ def _read_binary(folder: Path) -> SparseModel:
         images[int(image_id)] = _model_image(
             name, int(camera_id), _pose(name, pose), points2d["xy"], points2d["point_id"], point_ids
         )
-    return SparseModel(cameras, images, point_ids, positions, residuals)
+    return SparseModel(cameras, images, point_ids, positions, residuals, dropped)
 
 
 def _read_text(folder: Path) -> SparseModel:
@@ -201,7 +209,7 @@ def _read_text(folder: Path) -> SparseModel:
         cameras[int(camera_id)] = Camera(model, int(width), int(height), tuple(map(float, params)))
 
     rows = [line.split() for line in _lines(folder / "points3D.txt")]
-    point_ids, positions, residuals = _sorted_points(
+    point_ids, positions, residuals, dropped = _sorted_points(
         [int(row[0]) for row in rows],
         [tuple(map(float, row[1:4])) for row in rows],
         [float(row[7]) for row in rows],
@@ -222,11 +230,11 @@ def _read_text(folder: Path) -> SparseModel:
             points2d[:, 2].astype(np.int64),
             point_ids,
         )
-    return SparseModel(cameras, images, point_ids, positions, residuals)
+    return SparseModel(cameras, images, point_ids, positions, residuals, dropped)
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[str]:
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in read_text(path).splitlines():
         stripped = line.strip()
         if not stripped.startswith("#") and (stripped or keep_empty):
             yield stripped
@@ -234,18 +242,19 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[str]:
 
 def _pose(name: str, values: list[int | float] | list[float]) -> Pose:
     numbers = np.array(values, np.float64)
-    if not np.isfinite(numbers).all() or np.linalg.norm(numbers[:4]) < 1e-6:
+    if not np.isfinite(numbers).all() or not 1e-6 < np.abs(numbers[:4]).max() < 1e6:
         raise ValueError(f"the pose of {name} is not finite")
     return Pose.from_quaternion(numbers[:4], numbers[4:])
 
 
 def _sorted_points(
     ids: list[int], xyz: list[tuple[float, ...]], errors: list[float]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], int]:
+    """Ids, positions and errors of the points that can be used, by id; how many cannot."""
     point_ids = np.array(ids, np.int64)
+    positions, residuals = np.array(xyz, np.float64).reshape(-1, 3), np.array(errors, np.float64)
     order = np.argsort(point_ids)
-    return (
-        point_ids[order],
-        np.array(xyz, np.float64).reshape(-1, 3)[order],
-        np.array(errors, np.float64)[order],
-    )
+    if (np.diff(point_ids[order]) == 0).any():
+        raise ValueError("a point id is there twice")
+    usable = order[(np.isfinite(positions).all(axis=1) & np.isfinite(residuals))[order]]
+    return point_ids[usable], positions[usable], residuals[usable], len(ids) - len(usable)

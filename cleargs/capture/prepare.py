@@ -13,9 +13,13 @@ from numpy.typing import NDArray
 from cleargs.capture.cameras import Camera
 from cleargs.capture.sources import Capture, SourceFrame
 from cleargs.errors import InputError
+from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
+
+_COARSEST_MASK = 8
+"""Most pixels of a working image that one of its mask may stand for, along a side."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +43,34 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     Raises InputError for unreadable images and for images that do not have their camera's proportions.
     """
     images, masks = folder / "images", folder / "masks"
-    images.mkdir(parents=True, exist_ok=True)
-    masks.mkdir(parents=True, exist_ok=True)
+    make_folder(images)
+    make_folder(masks)
     names = [f"{index:06d}.png" for index in range(len(capture.frames))]
     with reporter.task("reading frames", len(names)) as task:
         if capture.kind == "video":
-            _decode_video(capture, images, names, long_side, task.advance)
+            _decode_video(capture, images, names, long_side, task.advance, reporter)
         else:
             for frame, name in zip(capture.frames, names, strict=True):
-                if not (images / name).is_file():
+                if not resumable(images / name, reporter):
                     write_rgb(images / name, reduced(_upright(frame), long_side))
                 task.advance()
     return [
-        _work_frame(frame, images / name, masks / f"{name}.png")
+        _work_frame(frame, images / name, masks / f"{name}.png", reporter)
         for frame, name in zip(capture.frames, names, strict=True)
     ]
+
+
+def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
+    """Whether a killed run left ``image`` whole. What else lies there is thrown away, with a warning."""
+    if not image.is_symlink() and not image.exists():
+        return False
+    try:
+        read(image)
+        return True
+    except InputError:
+        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is made again")
+        remove(image)
+        return False
 
 
 def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -72,12 +89,17 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
 
 
 def _decode_video(
-    capture: Capture, images: Path, names: list[str], long_side: int, advance: Callable[[], None]
+    capture: Capture,
+    images: Path,
+    names: list[str],
+    long_side: int,
+    advance: Callable[[], None],
+    reporter: Reporter,
 ) -> None:
     todo: dict[int, Path] = {}
     for frame, name in zip(capture.frames, names, strict=True):
         assert frame.pts is not None
-        if (images / name).is_file():
+        if resumable(images / name, reporter):
             advance()
         else:
             todo[frame.pts] = images / name
@@ -103,7 +125,7 @@ def _alike(width: int, height: int, image: NDArray[np.uint8]) -> bool:
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
-def _work_frame(frame: SourceFrame, image: Path, mask: Path) -> WorkFrame:
+def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter) -> WorkFrame:
     rgb = read_rgb(image)
     height, width = rgb.shape[:2]
     camera = frame.camera
@@ -114,11 +136,18 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path) -> WorkFrame:
                 hint="give the images that the poses were made from, or set ingest.poses=sfm",
             )
         camera = camera.resized(width, height)
-    if frame.mask is not None and not mask.is_file():
+    if frame.mask is not None and not resumable(mask, reporter, read_mask):
         stencil = read_mask(frame.mask)
-        if not _alike(stencil.shape[1], stencil.shape[0], rgb):
+        # To whole pixels, a mask of one pixel has any proportions.
+        coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
+        if coarse or not _alike(stencil.shape[1], stencil.shape[0], rgb):
+            what = (
+                f"is far smaller than {frame.name}"
+                if coarse
+                else f"does not have the proportions of {frame.name}"
+            )
             raise InputError(
-                f"the mask {frame.mask.name} does not have the proportions of {frame.name}",
+                f"the mask {frame.mask.name} {what}",
                 hint="make masks of the size of their images",
             )
         write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, guessed_camera
 from cleargs.capture.model import ModelImage, SparseModel, write_model
-from cleargs.capture.prepare import WorkFrame
+from cleargs.capture.prepare import WorkFrame, resumable
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.errors import StageError
+from cleargs.files import make_folder
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.progress import Reporter
 from cleargs.tables import write_table
@@ -47,7 +48,7 @@ def publish(
     all, after undistortion cropped them) is left out. Returns the published model.
     """
     for folder in ("images", *(["masks"] if any(frame.masked for frame in frames) else [])):
-        (out / folder).mkdir(parents=True, exist_ok=True)
+        make_folder(out / folder)
     views: list[_View] = []
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
@@ -60,7 +61,7 @@ def publish(
             if lens not in ways:
                 ways[lens] = undistorter(lens, max_size)
             way = ways[lens]
-            rgb = _write_picture(frame, way, work, out)
+            rgb = _write_picture(frame, way, work, out, reporter)
             image = registered.get(frame.image)
             if image is not None:
                 image = _flattened(image, way)
@@ -108,10 +109,12 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
     return cameras
 
 
-def _write_picture(frame: WorkFrame, way: Undistorter, work: Path, out: Path) -> NDArray[np.uint8]:
+def _write_picture(
+    frame: WorkFrame, way: Undistorter, work: Path, out: Path, reporter: Reporter
+) -> NDArray[np.uint8]:
     """Undistort image and mask of a frame (a killed run may have done so) and return the image."""
     target = out / "images" / frame.image
-    if target.is_file():
+    if resumable(target, reporter):
         rgb = read_rgb(target)
     else:
         rgb = way.image(read_rgb(work / "images" / frame.image))

@@ -6,8 +6,9 @@ COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
-import json
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,8 +22,15 @@ from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.world import Similarity, normalise
 from cleargs.errors import InputError, StageError
-from cleargs.files import write_json
+from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
+from cleargs.untrusted import FAULTS, cause, read_json
+
+FARTHEST = 1e9
+"""Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
+
+GIVEN_POSES = "given_poses.json"
+"""In the folder of the model: how far the input's poses missed, and whether they were refined."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -68,7 +76,11 @@ def reconstruct(
         return Reconstruction(_moved(model, similarity), similarity, None, refined=False)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
-    adopted = None if given is None else _moved(_adopted(given, posed), similarity)
+    adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
+    if adopted is not None and adopted.dropped:
+        reporter.warn(
+            f"{adopted.dropped} points of the input's sparse model are not finite or out of reach: left out"
+        )
     if adopted is not None and len(adopted.error):
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
@@ -162,8 +174,7 @@ def _run(
     job: _Job, folder: Path, config: IngestConfig, seed: int, threads: int, reporter: Reporter
 ) -> SparseModel:
     """Let COLMAP do the job, unless a killed run got as far as the model."""
-    model = folder / "model"
-    if not model.is_dir():
+    if (model := _resumed(folder, reporter, posed=job.poses is not None)) is None:
         settings = {
             **asdict(job),
             "folder": str(folder.resolve()),
@@ -179,18 +190,67 @@ def _run(
         }
         write_json(folder / "job.json", settings)
         run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", threads, reporter)
-    return read_model(model)
+        model = read_model(folder / "model")
+    return model
+
+
+def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | None:
+    """The model that a killed run left in ``folder``, or None.
+
+    What is damaged, COLMAP's database too, is thrown away with a warning.
+    """
+    model, database = folder / "model", folder / "database.db"
+    if model.exists():
+        try:
+            found = read_model(model)
+            if posed:
+                _what_became_of_poses(folder)
+            return found
+        except InputError as error:
+            reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
+            remove(model)
+    if database.exists() and not _sound(database):
+        reporter.warn("the damaged features of an interrupted run are found again")
+        for leftover in folder.glob("database.db*"):
+            leftover.unlink()
+    return None
+
+
+def _sound(database: Path) -> bool:
+    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
+    try:
+        with closing(sqlite3.connect(database)) as opened:
+            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
     """Median reprojection error at the given poses, px, and whether they were refined."""
-    said = json.loads((folder / "model" / "given_poses.json").read_text(encoding="utf-8"))
-    return said["missed_px"], said["refined"]
+    try:
+        said = read_json(folder / "model" / GIVEN_POSES)
+        return float(said["missed_px"]), bool(said["refined"])
+    except FAULTS as error:
+        raise InputError(f"{GIVEN_POSES} cannot be read: {cause(error)}", hint="run ingest again") from error
 
 
 def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
     images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
     return replace(model, images=images, xyz=similarity.points(model.xyz))
+
+
+def _within_reach(model: SparseModel) -> SparseModel:
+    """The model without the points beyond `FARTHEST`, which single precision may not hold."""
+    near = (np.abs(model.xyz) < FARTHEST).all(axis=1)  # infinite ones, and NaN, are not
+    if near.all():
+        return model
+    ids = model.point_ids[near]
+    images = {}
+    for key, image in model.images.items():
+        seen = np.isin(image.point_ids, ids)
+        images[key] = replace(image, xy=image.xy[seen], point_ids=image.point_ids[seen])
+    dropped = model.dropped + int((~near).sum())
+    return SparseModel(model.cameras, images, ids, model.xyz[near], model.error[near], dropped)
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from cleargs.capture.child import ChildChannel
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.files import make_folder, sync, sync_tree
 
 _PAIRS_PER_BLOCK = 100
 _REFINEMENTS = 4
@@ -53,8 +53,7 @@ def main() -> int:
         return 3
     _match(job, database, channel)
     partial = folder / "model.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
+    make_folder(partial, empty=True)
     if job["poses"] is None:
         model = _map(job, database, partial, channel)
     else:
@@ -70,13 +69,14 @@ def main() -> int:
             "record more frames with more overlap and texture, and move the camera rather than turn it",
         )
         return 3
-    for entry in partial.iterdir():
-        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    make_folder(partial, empty=True)
     model.write_binary(partial)
     if job["poses"] is not None:
         said = {"missed_px": missed, "refined": refined}
         (partial / "given_poses.json").write_text(json.dumps(said), encoding="utf-8")
+    sync_tree(partial)
     partial.rename(folder / "model")
+    sync(folder)
     return 0
 
 

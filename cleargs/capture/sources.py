@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import find_model, folder_kind, image_folders, mask_folder
+from cleargs.capture.layout import find_model, folder_kind, image_folders, lies_below, mask_folder
 from cleargs.capture.llff import read_llff
 from cleargs.capture.model import SparseModel, read_model
 from cleargs.capture.transforms import read_transforms
 from cleargs.errors import InputError
-from cleargs.media.image import IMAGE_SUFFIXES
+from cleargs.media import IMAGE_SUFFIXES
 from cleargs.media.video import Timeline, read_timeline
 
 T = TypeVar("T")
@@ -205,6 +205,12 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
     if not root.is_dir():
         raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
     posed = {image.name: image for image in model.images.values()}
+    outside = [name for name in posed if not lies_below(name)]
+    if outside:
+        raise InputError(
+            f"the COLMAP model lists images outside images/ or hidden in it, such as {outside[0]}",
+            hint="put them into images/ and export the model again, or set ingest.poses=sfm",
+        )
     missing = [name for name in posed if not (root / name).is_file()]
     if missing:
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.listing import read_listing
 from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
-from cleargs.media.image import IMAGE_SUFFIXES, read_rgb
+from cleargs.media.image import read_rgb
+from cleargs.untrusted import FAULTS, cause
 
 _FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
@@ -40,25 +41,8 @@ def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
 
     Raises InputError for damaged JSON, missing images, missing or NaN poses, unknown cameras.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(data, dict) or "frames" not in data:
-            raise ValueError("it has no 'frames'")
-        entries = data["frames"]
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise ValueError("'frames' is not a list of objects")
-        unnamed = [number for number, entry in enumerate(entries) if "file_path" not in entry]
-        if unnamed:
-            raise ValueError(f"frames[{unnamed[0]}] has no file_path")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"cannot read {path}: {error}",
-            hint="it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it",
-        ) from error
-    files = [_find_image(path.parent, entry) for entry in entries]
-    missing = [
-        str(entry.get("file_path")) for entry, file in zip(entries, files, strict=True) if file is None
-    ]
+    listing = read_listing(path)
+    missing = [entry.values["file_path"] for entry in listing.entries if entry.image is None]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise InputError(
@@ -66,32 +50,18 @@ def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
             hint="put the images where file_path says, or remove the entries",
         )
     frames = []
-    for entry, file in zip(entries, files, strict=True):
-        assert file is not None
-        name = str(Path(str(entry["file_path"])).with_suffix(file.suffix))
-        mask = _resolve(path.parent, entry["mask_path"]) if "mask_path" in entry else None
-        camera = _camera({**data, **entry}, file) if poses else None
-        frames.append(TransformsFrame(name, file, mask, camera, _pose(entry, name) if poses else None))
+    for entry in listing.entries:
+        assert entry.image is not None
+        name = str(Path(entry.values["file_path"]).with_suffix(entry.image.suffix))
+        if entry.mask is None and "mask_path" in entry.values:
+            raise InputError(
+                f"{name} names the mask {entry.values['mask_path']}, which does not exist",
+                hint="put the mask there, or remove mask_path",
+            )
+        camera = _camera({**listing.common, **entry.values}, entry.image) if poses else None
+        pose = _pose(entry.values, name) if poses else None
+        frames.append(TransformsFrame(name, entry.image, entry.mask, camera, pose))
     return frames
-
-
-def _resolve(root: Path, listed: object) -> Path:
-    return root / str(listed).replace("\\", "/")
-
-
-def _find_image(root: Path, entry: Mapping[str, Any]) -> Path | None:
-    """The listed file; where it is listed without an extension, the image of that stem."""
-    path = _resolve(root, entry.get("file_path", ""))
-    if path.is_file():
-        return path
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        return None
-    for suffix in sorted(IMAGE_SUFFIXES):
-        for spelling in (suffix, suffix.upper()):
-            candidate = path.with_name(path.name + spelling)
-            if candidate.is_file():
-                return candidate
-    return None
 
 
 def _camera(values: Mapping[str, Any], image: Path) -> Camera:
@@ -105,12 +75,12 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
         fy = _focal(values, "y", height)
         if fx is None and fy is None:
             raise ValueError("neither fl_x nor camera_angle_x is given")
-        fx, fy = fx or fy or 0.0, fy or fx or 0.0
+        fx, fy = _either(fx, fy), _either(fy, fx)
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         k1, k2, k3, k4, p1, p2 = (float(values.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    except (TypeError, ValueError) as error:
+    except FAULTS as error:
         raise InputError(
-            f"the camera of {image.name} cannot be read: {error}",
+            f"the camera of {image.name} cannot be read: {cause(error)}",
             hint="give w, h, fl_x, fl_y, cx, cy (or camera_angle_x), or set ingest.poses=sfm",
         ) from error
     model = str(values.get("camera_model", "OPENCV")).upper()
@@ -128,6 +98,11 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
     return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
+def _either(focal: float | None, other: float | None) -> float:
+    """``focal``, or the other axis's where it is not given; 0 is given, and refused later."""
+    return other or 0.0 if focal is None else focal
+
+
 def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:
     if values.get(f"fl_{axis}") is not None:
         return float(values[f"fl_{axis}"])
@@ -142,7 +117,7 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
         raise InputError(f"{name} has no pose (transform_matrix)", hint=hint)
     try:
         matrix = np.array(entry["transform_matrix"], np.float64)
-    except (TypeError, ValueError) as error:
+    except FAULTS as error:
         raise InputError(f"the pose of {name} is not a matrix of numbers", hint=hint) from error
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"the pose of {name} is not a 4x4 matrix", hint=hint)

@@ -14,6 +14,7 @@ import click
 import cleargs
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag, installed
+from cleargs.text import printable
 
 INTERRUPTED = 130
 
@@ -36,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
     "bench": ("cleargs.cli.bench", "Measure the splatting core on this machine."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
+    "verify": ("cleargs.cli.verify", "Read every file of a run again, and name what is damaged."),
     "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
 }
 """Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""
@@ -87,7 +89,9 @@ def cli(debug: bool) -> None:
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
     """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
     from cleargs.cli.interrupt import answer_signals
+    from cleargs.cli.terminal import protect_streams
 
+    protect_streams()
     given = list(sys.argv[1:] if arguments is None else arguments)
     answer_signals()
     code = invoke(given, dag)
@@ -127,15 +131,18 @@ def explanation(error: Exception) -> tuple[int, str, str]:
     """Exit code, cause and remedy for an error, each of the two in one line."""
     match error:
         case CleargsError():
-            return error.exit_code, _one_line(error), error.hint
+            return error.exit_code, _one_line(error), _one_line(error.hint)
         case click.ClickException():
             context = getattr(error, "ctx", None)
             command = context.command_path if context is not None else "cleargs"
             return error.exit_code, _one_line(error.format_message()), f"see {command} --help"
-        case MemoryError():
+        case _ if _lacks_memory(error):
             return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
+        case OSError() if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            where = f": {error.filename}" if error.filename else ""
+            return 2, f"{error.strerror}{where}", "choose another path"
         case OSError():
             where = f": {error.filename}" if error.filename else ""
             return 1, f"{error.strerror or _one_line(error)}{where}", "check the disk and its permissions"
@@ -144,5 +151,19 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, cause, "run it again with --debug for the traceback, and please report it"
 
 
+def _lacks_memory(error: Exception) -> bool:
+    """Whether memory ran out, which threads and libraries that are being loaded say in words of their own."""
+    said = str(error)
+    match error:
+        case MemoryError():
+            return True
+        case RuntimeError():
+            return any(words in said for words in ("can't start new thread", "can't allocate memory"))
+        case ImportError() | OSError():
+            return any(words in said for words in ("failed to map segment", "Cannot allocate memory"))
+        case _:
+            return False
+
+
 def _one_line(text: object) -> str:
-    return " ".join(str(text).split()) or "no further details"
+    return printable(" ".join(str(text).split())) or "no further details"

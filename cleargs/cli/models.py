@@ -42,6 +42,8 @@ def list_models(directory: Path | None, as_json: bool) -> None:
             facts = [entry.source.label, _size(entry.source), entry.licence]
             if not entry.commercial:
                 facts.append("NOT for commercial use")
+            if not entry.source.verified:
+                facts.append("unverified: its publisher states no whole digest")
             click.echo(f"{'':<33} {', '.join(fact for fact in facts if fact)}")
     click.echo(f"folder: {folder}")
 
@@ -69,6 +71,12 @@ def install(name: str, archive: Path | None, accept_licence: bool, directory: Pa
         click.echo(f"licence of {name}: {model.licence}", err=True)
     if archive is None and model.source is not None and model.source.spec != "file":
         click.echo(f"fetching {model.source.label} ({_size(model.source)}) ...", err=True)
+    if model.source is not None and not model.source.verified:
+        click.echo(
+            f"warning: the publisher of {model.source.label} states no whole digest: whether the file is the "
+            "published one cannot be verified. Its own is noted, and kept to",
+            err=True,
+        )
     for path in install_model(model, directory or model_dir(), archive, licence_accepted=accept_licence):
         click.echo(path)
 

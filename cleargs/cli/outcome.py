@@ -11,6 +11,7 @@ import click
 from cleargs.cli.common import print_json
 from cleargs.pipeline.plan import StagePlan, cost_line
 from cleargs.pipeline.runner import Outcome
+from cleargs.text import printable
 
 DONE_IN_PART = 3
 
@@ -29,7 +30,7 @@ def print_outcomes(outcomes: Sequence[Outcome], run: Path) -> None:
         click.echo(f"{outcome.stage:<12} {how}{partial}")
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
-        click.echo(f"missing: {missing}", err=True)
+        click.echo(f"missing: {printable(missing)}", err=True)
     if last.status == "partial":
         click.echo("hint: the same command tries again; --allow-partial goes on without", err=True)
     scene = "scene.ply" in last.files

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cleargs.progress import Reporter, SilentTask, Task
+from cleargs.text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,7 +38,7 @@ class QuietReporter:
     def info(self, text: str) -> None: ...
 
     def warn(self, text: str) -> None:
-        click.echo(f"warning: {text}", err=True)
+        click.echo(f"warning: {printable(text)}", err=True)
 
 
 class LineReporter(QuietReporter):
@@ -46,13 +47,14 @@ class LineReporter(QuietReporter):
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         begin = time.monotonic()
+        label = printable(label)
         line = LineTask(label, total)
         yield line
         note = f", {line.note}" if line.note else ""
         click.echo(f"{label}: done in {time.monotonic() - begin:.1f} s{note}", err=True)
 
     def info(self, text: str) -> None:
-        click.echo(text, err=True)
+        click.echo(printable(text), err=True)
 
 
 class LineTask:
@@ -70,7 +72,7 @@ class LineTask:
 
     def update(self, *, done: int | None = None, note: str | None = None) -> None:
         self.done = self.done if done is None else done
-        self.note = self.note if note is None else note
+        self.note = self.note if note is None else printable(note)
         now = time.monotonic()
         if now - self._said >= LINE_EVERY:
             self._said = now
@@ -91,11 +93,13 @@ class BarReporter:
     def __init__(self) -> None:
         from rich.console import Console
 
-        self._console = Console(stderr=True)
+        # Not sys.stderr, which escapes (see `terminal`): bars move the cursor.
+        self._console = Console(file=sys.__stderr__)
         self._progress: Progress | None = None
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        label = printable(label)
         if self._progress is not None:
             bar = self._progress.add_task(label, total=total, note="")
             yield BarTask(self._progress, bar)
@@ -110,10 +114,10 @@ class BarReporter:
             self._progress = None
 
     def info(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False)
+        self._console.print(printable(text), markup=False, highlight=False)
 
     def warn(self, text: str) -> None:
-        self._console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+        self._console.print(f"warning: {printable(text)}", style="yellow", markup=False, highlight=False)
 
 
 class BarTask:
@@ -131,7 +135,7 @@ class BarTask:
         if done is not None:
             changes["completed"] = done
         if note is not None:
-            changes["note"] = note
+            changes["note"] = printable(note)
         self._progress.update(self._bar, **changes)
 
 

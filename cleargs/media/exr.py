@@ -18,13 +18,17 @@ from OpenImageIO import HALF, ImageInput, ImageOutput, ImageSpec, geterror
 
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path
+from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.untrusted import FAULTS, cause, open_regular
 
 Image: TypeAlias = NDArray[np.float32]  # [H, W, 3] sRGB
 Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709
 Attribute: TypeAlias = int | float | str
 
 _CHANNELS = "RGB"
+_MAX_CHANNELS = 64
+"""Most channels of a file that is read; ours have six layers of three."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,25 +76,34 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
 
     Raises StoreError when the file is missing, damaged, or has a channel outside an RGB layer.
     """
-    source = ImageInput.open(str(path))
-    if source is None:
-        raise _damaged(path, geterror())
     try:
-        spec = source.spec()
-        pixels = source.read_image(HALF)
-        if pixels is None:
-            raise _damaged(path, source.geterror())
-    finally:
-        source.close()
+        open_regular(path).close()
+        source = ImageInput.open(str(path))
+        if source is None:
+            raise ValueError(_first_line(geterror()))
+        try:
+            return _read(source, prefix)
+        finally:
+            source.close()
+    except FAULTS as error:  # OpenImageIO's own words may hold bytes of the file that are no text
+        raise StoreError(
+            f"cannot read {path.name}: {cause(error)}", hint="delete the file and run its stage again"
+        ) from error
+
+
+def _read(source: ImageInput, prefix: str) -> LayeredImage:
+    spec = source.spec()
+    if spec.width * spec.height > MAX_PIXELS or spec.nchannels > _MAX_CHANNELS:
+        raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
+    pixels = source.read_image(HALF)
+    if pixels is None:
+        raise ValueError(_first_line(source.geterror()))
     place = {name: k for k, name in enumerate(spec.channelnames)}
     names = dict.fromkeys(name.rpartition(".")[0] for name in spec.channelnames)
-    try:
-        layers = {
-            name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
-            for name in names
-        }
-    except KeyError as missing:
-        raise _damaged(path, f"no channel {missing}") from missing
+    layers = {
+        name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
+        for name in names
+    }
     attributes: dict[str, Any] = {
         item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
     }
@@ -101,12 +114,6 @@ def _unwritable(path: Path, reason: str) -> StoreError:
     return StoreError(
         f"cannot write {path.name}: {_first_line(reason)}",
         hint="check the free space and the permissions of the run folder",
-    )
-
-
-def _damaged(path: Path, reason: str) -> StoreError:
-    return StoreError(
-        f"cannot read {path.name}: {_first_line(reason)}", hint="delete the file and run its stage again"
     )
 
 

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
-
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-"""File endings (lower case) taken for images."""
-
-_PNG = b"\x89PNG\r\n\x1a\n"
+from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
+from cleargs.media import MAX_PIXELS
+from cleargs.media.header import PNG, image_size
+from cleargs.untrusted import cause, read_bytes
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -62,19 +61,23 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
     """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        content = read_bytes(path)
     except OSError as error:
         raise InputError(
-            f"cannot read {path}: {error.strerror or error}",
+            f"cannot read {path}: {cause(error)}",
             hint="check that the file exists and is readable",
         ) from error
-    if data.size == 0:
+    if not content:
         raise InputError(f"{path} is empty (zero bytes)", hint="remove the file, or copy it again")
-    image = None
+    image, size = None, image_size(content)
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise InputError(
+            f"{path} has {size[0]}x{size[1]} pixels; at most {MAX_PIXELS} are read", hint="reduce the image"
+        )
     # libpng would tell of a file that breaks off on stderr.
-    if not (data[:8].tobytes() == _PNG and b"IEND" not in data.tobytes()):
+    if size is not None and not (content.startswith(PNG) and b"IEND" not in content):
         with suppress(cv2.error):
-            image = cv2.imdecode(data, flags)
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
         raise InputError(
             f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"

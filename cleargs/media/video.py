@@ -21,8 +21,10 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import rgb_from_yuv, srgb_from_hdr
 from cleargs.media.image import to_uint8
+from cleargs.untrusted import open_regular
 
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}
@@ -134,11 +136,18 @@ def _plane(plane: VideoPlane, code: type[np.uint8] | type[np.uint16]) -> NDArray
 def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Open the first video stream; every FFmpeg error inside the block becomes an InputError."""
     try:
-        if path.stat().st_size == 0:
-            raise InputError(f"{path.name} is empty (zero bytes)", hint=_HINT)
-        with av.open(path) as container:
+        with open_regular(path) as file:
+            if not file.read(1):
+                raise InputError(f"{path.name} is empty (zero bytes)", hint=_HINT)
+        # Titles and comments, which nothing here reads, may be in any encoding.
+        with av.open(path, metadata_errors="replace") as container:
             if not container.streams.video:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
+            width, height = container.streams.video[0].width, container.streams.video[0].height
+            if width * height > MAX_PIXELS:
+                raise InputError(
+                    f"{path.name} has {width}x{height} pixels; at most {MAX_PIXELS} are read", hint=_HINT
+                )
             yield container, container.streams.video[0]
     except (av.error.FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)

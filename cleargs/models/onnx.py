@@ -7,10 +7,10 @@ image tile each), and every call computes the same bits. On a GPU one caller giv
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.resources import files
 from io import StringIO
 from pathlib import Path
@@ -19,11 +19,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StageError
+from cleargs.untrusted import cause, read_bytes
 
 Device = Literal["cpu", "cuda"]
 
 CUDA_PROVIDER = "CUDAExecutionProvider"
+
+_FATAL = 4
+_EXTERNAL_FOLDER = "session.model_external_initializers_file_folder_path"
+"""Where onnxruntime looks for weights that a model given as bytes keeps outside."""
 
 _CUDA_OPTIONS = {
     "use_tf32": "0",  # ten bits of mantissa would be too few to compare scores by
@@ -67,30 +72,37 @@ class TensorInfo:
 class OnnxModel:
     """An ONNX file ready to run, on the CPU where the GPU's provider does not load (see `network_device`).
 
-    Raises InputError when the file is missing or not an ONNX model that onnxruntime can run.
+    The model is the file and nothing else: weights that it keeps in other files are in no digest and would
+    change unseen. Raises InputError when the file is missing, refers to other files, or is not an ONNX model
+    that onnxruntime can run; MemoryError when the model does not fit.
     """
 
     def __init__(self, path: Path, device: Device = "cpu") -> None:
         import onnxruntime
 
-        if not path.is_file():
+        if not path.exists():
             raise InputError(f"model file {path} does not exist", hint="give the path of an .onnx file")
+        try:
+            model = read_bytes(path)
+        except OSError as error:
+            raise InputError(
+                f"the model {path} cannot be read: {cause(error)}", hint="give the path of an .onnx file"
+            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
-        options.log_severity_level = 3
+        options.log_severity_level = _FATAL  # what goes wrong is raised, and told once
+        options.add_session_config_entry(_EXTERNAL_FOLDER, os.devnull)  # nothing can lie in there
         try:
-            session = _cuda_session(path, options) if device == "cuda" else None
+            session = _cuda_session(model, options) if device == "cuda" else None
             if session is None:
-                session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+                session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's exceptions share no base class of their own
-            reason = str(error).strip().splitlines()[0]
-            raise InputError(
-                f"{path} is not an ONNX model that can be run: {reason}",
-                hint="export the model again as a single ONNX file with standard operators",
-            ) from error
+            raise _unusable(path, str(error)) from error
         self.path = path
+        self.digest = hashlib.sha256(model).hexdigest()
+        """SHA-256 of the file in hexadecimal."""
         self.device: Device = "cuda" if CUDA_PROVIDER in session.get_providers() else "cpu"
         self.inputs = _describe(session.get_inputs())
         self.outputs = _describe(session.get_outputs())
@@ -101,27 +113,51 @@ class OnnxModel:
         """Whether several items a call are possible, and worth it: on a GPU, where the first axis is free."""
         return self.device == "cuda" and all(info.shape[:1] == (None,) for info in self.inputs)
 
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of the file in hexadecimal."""
-        with self.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
     def run(self, *tensors: NDArray[Any]) -> list[NDArray[np.float32]]:
-        """All outputs for the given inputs, in the model's order. Several threads may call this at once."""
+        """All outputs for the given inputs, in the model's order. Several threads may call this at once.
+
+        Raises MemoryError, and StageError for whatever else onnxruntime stops at.
+        """
         feeds = {info.name: tensor for info, tensor in zip(self.inputs, tensors, strict=True)}
-        outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
+        try:
+            outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
+        except Exception as error:  # onnxruntime's exceptions share no base class of their own
+            if _lacks_memory(str(error)):
+                raise MemoryError(f"{self.path.name}: {_reason(str(error))}") from error
+            raise StageError(
+                f"the model {self.path.name} failed: {_reason(str(error))}",
+                hint="check it with `cleargs models verify`, or choose another model",
+            ) from error
         return outputs
 
 
-def _cuda_session(path: Path, options: Any) -> Any:
+def _unusable(path: Path, said: str) -> Exception:
+    """The error for a file that makes no session, by what onnxruntime said."""
+    if _lacks_memory(said):
+        return MemoryError(f"{path.name}: {_reason(said)}")
+    reason = "it keeps weights in other files" if "xternal data" in said else _reason(said)
+    return InputError(
+        f"{path} is not an ONNX model that can be run: {reason}",
+        hint="export the model again as a single ONNX file with standard operators",
+    )
+
+
+def _lacks_memory(said: str) -> bool:
+    return any(words in said for words in ("bad_alloc", "Failed to allocate memory", "out of memory"))
+
+
+def _reason(said: str) -> str:
+    return (said.strip() or "no reason was given").splitlines()[0]
+
+
+def _cuda_session(model: bytes, options: Any) -> Any:
     """A session on the GPU; None where that fails, be it for the provider or for the model."""
     import onnxruntime
 
     providers = [(CUDA_PROVIDER, _CUDA_OPTIONS), "CPUExecutionProvider"]
     try:
         with redirect_stdout(StringIO()):  # onnxruntime prints on stdout that a provider does not load
-            return onnxruntime.InferenceSession(str(path), options, providers=providers)
+            return onnxruntime.InferenceSession(model, options, providers=providers)
     except Exception:  # onnxruntime's exceptions share no base class of their own
         return None
 

@@ -41,6 +41,11 @@ class Source(BaseModel):
     )
 
     @property
+    def verified(self) -> bool:
+        """Whether the published file is known by its whole digest, not by a part of it or not at all."""
+        return self.sha256 is not None and len(self.sha256) == 64
+
+    @property
     def label(self) -> str:
         """How messages name the source."""
         return f"{self.file} of {self.origin}" if self.origin else self.spec

@@ -5,6 +5,7 @@ A document has one table a stage, and beside them ``seed``. What a stage may be 
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from pydantic.fields import FieldInfo
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.dag import Dag
+from cleargs.untrusted import FAULTS, MAX_NESTING, cause, read_text, shallow
 
 RECIPES = "cleargs.workflows"
 """The package that holds the recipes known by name."""
@@ -34,6 +36,9 @@ KIND_WORDS: Mapping[Any, str] = {
 """How the types of settings are called in an error."""
 
 Document = dict[str, Any]
+
+LONG_KEY = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]+\s*\.\s*){{{MAX_NESTING}}}")
+"""A dotted name of more parts than a document may be deep."""
 
 
 @dataclass(frozen=True)
@@ -90,19 +95,24 @@ def recipe_names() -> list[str]:
 def read_toml(path: Path) -> Document:
     """Read a TOML file. Raises ConfigError when it cannot be read."""
     try:
-        return parse_toml(path.read_text(encoding="utf-8"), path.name)
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(f"cannot read {path}: {cause}", hint="check the path of the TOML file") from error
+        text = read_text(path)
+    except FAULTS as error:
+        raise ConfigError(
+            f"cannot read {path}: {cause(error)}", hint="check the path of the TOML file"
+        ) from error
+    return parse_toml(text, path.name)
 
 
 def parse_toml(text: str, name: str) -> Document:
     """Parse TOML; ``name`` stands in the error."""
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        if LONG_KEY.search(text):  # 5,000 parts take tomllib most of a minute
+            raise RecursionError
+        document: Document = shallow(tomllib.loads(text))
+        return document
+    except FAULTS as error:  # TOMLDecodeError is a ValueError
         raise ConfigError(
-            f"{name} is not valid TOML: {error}", hint="see https://toml.io for the syntax"
+            f"{name} is not valid TOML: {cause(error)}", hint="see https://toml.io for the syntax"
         ) from error
 
 
@@ -114,6 +124,8 @@ def parse_override(text: str) -> Document:
         raise ConfigError(
             f"--set {text!r} is not of the form a.b=value", hint="write --set rva.tau_R=0.7, say"
         )
+    if len(parts) > MAX_NESTING:
+        raise ConfigError(f"--set {text[:40]!r}... names no setting", hint="write --set rva.tau_R=0.7, say")
     document: Any = _toml_value(value.strip())
     for part in reversed(parts):
         document = {part: document}
@@ -123,8 +135,8 @@ def parse_override(text: str) -> Document:
 
 def _toml_value(text: str) -> Any:
     try:
-        document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        document = shallow(tomllib.loads(f"value = {text}"))
+    except FAULTS:
         return text
     return document["value"] if len(document) == 1 else text
 

@@ -13,14 +13,17 @@ from types import TracebackType
 
 from cleargs.errors import InputError
 from cleargs.pipeline.keys import canonical_json
+from cleargs.pipeline.stage import External
+from cleargs.text import is_utf8
+from cleargs.untrusted import open_regular
 
 RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
 
 
 def file_digest(path: Path) -> str:
-    """sha256 of the file's bytes, hexadecimal."""
-    with path.open("rb") as file:
+    """sha256 of the bytes of a regular file, hexadecimal. Raises OSError like `open_regular`."""
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -42,7 +45,9 @@ def files_under(path: Path) -> dict[str, Path]:
 
 
 class DigestMemo:
-    """Digests by (path, size, mtime_ns, inode), kept in an SQLite file.
+    """Digests by path, size, inode, and times of content (mtime) and state (ctime), kept in an SQLite file.
+
+    Any program may set mtime; ctime only the kernel sets, at every write and also where mtime is put back.
 
     The memo only saves time: where its file is damaged, locked or not writable, digests are computed
     afresh and nobody is troubled. The file appears with the first flush, if its folder is there by then.
@@ -50,7 +55,7 @@ class DigestMemo:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._pending: dict[str, tuple[int, int, int, str]] = {}
+        self._pending: dict[str, tuple[int, int, int, int, str]] = {}
         self._database = _open(path) if path.exists() else None
 
     def __enter__(self) -> DigestMemo:
@@ -71,17 +76,17 @@ class DigestMemo:
             return
         rows = [(path, *row) for path, row in self._pending.items()]
         with suppress(sqlite3.Error), self._database:  # locked or damaged: the next run hashes again
-            self._database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", rows)
+            self._database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
             self._pending.clear()
 
     def digest(self, path: Path) -> str:
-        """The digest of the file at ``path``: remembered where size, time and inode are unchanged."""
+        """The digest of the file at ``path``: remembered where size, times and inode are unchanged."""
         name, state = _state(path)
         known = self._pending.get(name) or self._lookup(name)
-        if known is not None and known[:3] == state:
-            return known[3]
+        if known is not None and known[:4] == state:
+            return known[4]
         digest = file_digest(path)
-        if time.time_ns() - state[1] > RACY_NS:
+        if time.time_ns() - max(state[1:3]) > RACY_NS:
             self._pending[name] = (*state, digest)
         return digest
 
@@ -96,38 +101,55 @@ class DigestMemo:
         self._pending.pop(name, None)
         if self._database is not None:
             with suppress(sqlite3.Error), self._database:
-                self._database.execute("DELETE FROM digests WHERE path = ?", (name,))
+                self._database.execute("DELETE FROM contents WHERE path = ?", (name,))
 
-    def digests_of(self, path: Path) -> dict[str, str]:
-        """Relative path -> digest for a folder, or {"": digest} for a file.
+    def digests_of(self, place: External, *, afresh: bool = False) -> dict[str, str]:
+        """Relative path -> digest for a folder, {"": digest} for a file, name -> digest for files by name.
 
-        Raises InputError when there is nothing at ``path`` or it cannot be read.
+        With ``afresh`` every file is read, whatever is known of it. Raises InputError when a file is missing
+        or not regular, cannot be read, or has a name that is not UTF-8.
         """
+        files = named_files(place)
+        for file in files.values():
+            require_utf8(file)
+            if afresh:
+                self.forget(file)
         try:
-            if path.is_dir():
-                return {name: self.digest(file) for name, file in files_under(path).items()}
-            return {"": self.digest(path)}
+            return {name: self.digest(file) for name, file in files.items()}
         except OSError as error:
             raise InputError(
-                f"cannot read {error.filename or path}: {error.strerror or error}",
-                hint="check the path and its permissions",
+                f"cannot read {error.filename}: {error.strerror or error}",
+                hint="check the path and its permissions, or remove it from the input",
             ) from error
 
-    def _lookup(self, name: str) -> tuple[int, int, int, str] | None:
+    def _lookup(self, name: str) -> tuple[int, int, int, int, str] | None:
         if self._database is None:
             return None
         try:
-            row: tuple[int, int, int, str] | None = self._database.execute(
-                "SELECT size, mtime_ns, inode, digest FROM digests WHERE path = ?", (name,)
+            row: tuple[int, int, int, int, str] | None = self._database.execute(
+                "SELECT size, mtime_ns, ctime_ns, inode, digest FROM contents WHERE path = ?", (name,)
             ).fetchone()
         except sqlite3.Error:
             return None
         return row
 
 
-def _state(path: Path) -> tuple[str, tuple[int, int, int]]:
+def named_files(place: External) -> dict[str, Path]:
+    """Every file of ``place`` by the name under which its digest is noted."""
+    if isinstance(place, Mapping):
+        return dict(place)
+    return files_under(place) if place.is_dir() else {"": place}
+
+
+def require_utf8(path: Path) -> None:
+    """Raise InputError where the name of ``path`` is not UTF-8: no table or manifest could hold it."""
+    if not is_utf8(str(path)):
+        raise InputError(f"the name of {path} is not UTF-8", hint="rename it")
+
+
+def _state(path: Path) -> tuple[str, tuple[int, int, int, int]]:
     status = path.stat()
-    return str(path.absolute()), (status.st_size, status.st_mtime_ns, status.st_ino)
+    return str(path.absolute()), (status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
 
 
 def _open(path: Path) -> sqlite3.Connection | None:
@@ -147,10 +169,13 @@ def _connect(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(path, timeout=5)
     try:
         database.execute(
-            "CREATE TABLE IF NOT EXISTS digests"
-            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, inode INTEGER, digest TEXT)"
+            "CREATE TABLE IF NOT EXISTS contents"
+            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, ctime_ns INTEGER, inode INTEGER,"
+            " digest TEXT)"
         )
-        database.execute("SELECT path, size, mtime_ns, inode, digest FROM digests LIMIT 1").fetchone()
+        database.execute(
+            "SELECT path, size, mtime_ns, ctime_ns, inode, digest FROM contents LIMIT 1"
+        ).fetchone()
     except sqlite3.Error:
         database.close()
         raise

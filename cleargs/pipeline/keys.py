@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
 
@@ -67,15 +68,41 @@ def key_config(config: BaseModel) -> dict[str, Any]:
     return kept
 
 
-def library_versions(distributions: tuple[str, ...]) -> dict[str, str]:
-    """Installed version of each distribution; "absent" where it is not installed."""
+def library_versions(distributions: tuple[str, ...], device: Literal["cpu", "cuda"]) -> dict[str, str]:
+    """What of each distribution computes on ``device``: its installed version; "absent" without one.
+
+    ``triton`` compiles kernels for a GPU and counts there only. ``onnxruntime`` is what was installed under
+    any of its names, with the provider that runs the networks.
+    """
     versions = {}
     for name in distributions:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "absent"
+        if name == "onnxruntime":
+            versions[name] = _onnxruntime(device)
+        elif name != "triton" or device == "cuda":
+            versions[name] = _version(name)
     return versions
+
+
+ONNXRUNTIMES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")
+"""Distributions that bring the module onnxruntime, each with providers of its own."""
+
+
+@cache
+def _onnxruntime(device: Literal["cpu", "cuda"]) -> str:
+    installed = [f"{name} {found}" for name in ONNXRUNTIMES if (found := _version(name)) != "absent"]
+    if device == "cuda":
+        # Imported, as only a trial says whether the provider loads.
+        from cleargs.models.onnx import network_device
+
+        device = network_device(device, lambda warning: None)
+    return ", ".join([*(installed or ["absent"]), f"on {device}"])
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "absent"
 
 
 def differences(

@@ -6,17 +6,17 @@ folders and results change hands by rename alone.
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 from cleargs.files import write_json
+from cleargs.untrusted import FAULTS, read_json
 
 BEAT = 10.0
 """Seconds between two heartbeats."""
@@ -36,6 +36,10 @@ class Holder:
     """When the process began, by the host's own count; pids come back. "" where unknown."""
     job: str
     """Id of its Slurm job; "" outside Slurm."""
+
+
+_KINDS = (str, int, str, str, str)
+"""Types of the fields of a `Holder`."""
 
 
 def this_process() -> Holder:
@@ -66,16 +70,19 @@ def living_holder(path: Path) -> Holder | None:
     job, and whoever gave no heartbeat for `DEAD_AFTER` seconds by the clock of the file system.
     """
     try:
-        holder = Holder(**json.loads(path.read_bytes()))
+        holder = Holder(**read_json(path))
         beat = path.stat().st_mtime
-    except (OSError, ValueError, TypeError):
+    except FAULTS:
+        return None
+    if not all(isinstance(value, kind) for value, kind in zip(astuple(holder), _KINDS, strict=True)):
         return None
     here = this_process()
     if holder.born and (holder.host, holder.pid_space) == (here.host, here.pid_space):
         return holder if _born(holder.pid) == holder.born else None
     if here.job and holder.job == here.job and holder.host != here.host:
         return None
-    return holder if _now(path.parent) - beat < DEAD_AFTER else None
+    # A beat from the future is no sign of life either: a clock was wrong, or the time stamp is a lie.
+    return holder if abs(_now(path.parent) - beat) < DEAD_AFTER else None
 
 
 def _beat(path: Path, ended: threading.Event) -> None:

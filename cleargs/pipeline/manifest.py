@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 import cleargs
 from cleargs.files import is_partial, write_json
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.keys import KeyParts, canonical_json
+from cleargs.untrusted import FAULTS, read_json
 
 MANIFEST = "manifest.json"
 
@@ -67,6 +67,10 @@ class Manifest(BaseModel):
         """Size of all files together."""
         return sum(record.size for record in self.files.values())
 
+    def is_part(self, name: str, paths: Iterable[str]) -> bool:
+        """Whether the file ``name`` is one of ``paths``, or in a folder of them."""
+        return any(name == path or name.startswith(path.rstrip("/") + "/") for path in paths)
+
     def under(self, path: str) -> dict[str, str]:
         """Digests of the file ``path``, or of all files in the folder ``path``; empty without either."""
         if path in self.files:
@@ -96,14 +100,14 @@ def read_manifest(folder: Path) -> Manifest:
     Raises FileNotFoundError when there is none (the stage is not done), ValueError when it is damaged.
     """
     try:
-        content = json.loads((folder / MANIFEST).read_bytes())
+        content = read_json(folder / MANIFEST)
         seal = content.pop("seal")
         if seal != _seal(content):
             raise ValueError("the manifest was changed")
         return Manifest.model_validate(content)
     except FileNotFoundError:
         raise
-    except (OSError, ValidationError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except FAULTS as error:  # ValidationError is a ValueError
         raise ValueError("the manifest is damaged") from error
 
 
@@ -120,7 +124,7 @@ def published_files(folder: Path) -> dict[str, Path]:
     return {
         file.relative_to(folder).as_posix(): file
         for file in sorted(folder.rglob("*"))
-        if file.is_file() and not is_partial(file) and file != folder / MANIFEST
+        if file.is_file() and not file.is_symlink() and not is_partial(file) and file != folder / MANIFEST
     }
 
 
@@ -129,20 +133,29 @@ def damage(folder: Path, manifest: Manifest, memo: DigestMemo) -> str | None:
 
     Sizes are always read; digests come through ``memo``, and one that differs is computed afresh first.
     """
-    for name, record in manifest.files.items():
-        file = folder / name
+    return next(damages(folder, manifest, manifest.files, memo), None)
+
+
+def damages(
+    folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, afresh: bool = False
+) -> Iterator[str]:
+    """What is wrong with the files ``names`` in ``folder``; with ``afresh`` each of them is read."""
+    for name in names:
+        record, file = manifest.files[name], folder / name
         try:
             if file.stat().st_size != record.size:
-                return f"{name} has another size"
+                yield f"{name} has another size"
+                continue
+            if afresh:
+                memo.forget(file)
             if memo.digest(file) != record.digest:
                 memo.forget(file)
                 if memo.digest(file) != record.digest:
-                    return f"{name} has other content"
+                    yield f"{name} has other content"
         except FileNotFoundError:
-            return f"{name} is missing"
+            yield f"{name} is missing"
         except OSError as error:
-            return f"{name} cannot be read: {error.strerror or error}"
-    return None
+            yield f"{name} cannot be read: {error.strerror or error}"
 
 
 def plain_json(value: Any) -> Any:

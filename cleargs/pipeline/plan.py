@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from cleargs.errors import InputError, StoreError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import tree_digest
+from cleargs.pipeline.digest import require_utf8, tree_digest
 from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.stage import Estimate, StageContext
+from cleargs.pipeline.stage import Estimate, External, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
 
@@ -31,7 +31,7 @@ class Recipe:
 
     parts: KeyParts
     origins: Origins
-    externals: Mapping[str, Path]
+    externals: Mapping[str, External]
     inputs: Mapping[str, Path]
     """Upstream stage -> its finished folder."""
     inherited: tuple[str, ...]
@@ -74,10 +74,11 @@ class Planner:
     threads: int
     reporter: Reporter
 
-    def recipe(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+    def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
         """What ``name`` is made from, given the manifests of the stages before it.
 
-        Raises InputError when an external (the capture, a model) cannot be read.
+        With ``afresh`` every external is read, whatever the memo says of it. Raises InputError when one (the
+        capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
         origins: Origins = {}
@@ -89,7 +90,7 @@ class Planner:
                 origins[f"{upstream}/{path}"] = files
                 inputs[upstream][path] = tree_digest(files) if files else None
         external_files = dict(stage.externals(config, self.run.source))
-        digests = self._external_digests(external_files)
+        digests = self.external_digests(external_files, afresh=afresh)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
@@ -99,7 +100,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device,
-            libraries=library_versions(stage.LIBRARIES),
+            libraries=library_versions(stage.LIBRARIES, self.run.device),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited = tuple(
@@ -114,15 +115,19 @@ class Planner:
         )
         return Recipe(parts, origins, external_files, folders, inherited)
 
-    def _external_digests(self, places: Mapping[str, Path]) -> dict[str, dict[str, str]]:
+    def external_digests(
+        self, places: Mapping[str, External], *, afresh: bool = False
+    ) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
         hint = "choose a folder beside the input with -o"
+        for folder in (self.run.folder, self.run.source, self.store.root):
+            require_utf8(folder)
         if self.run.folder == self.run.source:
             raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
         for place in places.values():
-            if self.run.folder.is_relative_to(place):
+            if isinstance(place, Path) and self.run.folder.is_relative_to(place):
                 raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
-        return {role: self.store.memo.digests_of(place) for role, place in places.items()}
+        return {role: self.store.memo.digests_of(place, afresh=afresh) for role, place in places.items()}
 
     def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
@@ -151,7 +156,7 @@ class Planner:
         self,
         name: str,
         inputs: Mapping[str, Path],
-        externals: Mapping[str, Path],
+        externals: Mapping[str, External],
         out: Path,
         checkpoints: Path,
     ) -> StageContext[Any]:
@@ -181,7 +186,7 @@ class Planner:
             waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
             if waits_for:
                 stage = self.dag.load(name)
-                self._external_digests(stage.externals(self.run.config.sections[name], self.run.source))
+                self.external_digests(stage.externals(self.run.config.sections[name], self.run.source))
                 reason = f"waits for {', '.join(waits_for)}"
                 plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
                 continue
@@ -220,6 +225,10 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
     free = shutil.disk_usage(place).free / 1e9
     if needed > free:
         raise StoreError(
-            f"the run needs about {needed:.1f} GB of disk, {free:.1f} GB are free at {place}",
+            f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
         )
+
+
+def _size(gigabytes: float) -> str:
+    return f"{gigabytes:.1f} GB" if gigabytes >= 1 else f"{1000 * gigabytes:.0f} MB"

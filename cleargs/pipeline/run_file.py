@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
 import tomli_w
 
-from cleargs.errors import ConfigError, InputError
+from cleargs.errors import ConfigError, InputError, StageError
 from cleargs.files import disk_error, write_bytes
 from cleargs.pipeline.config import Config, check_document, read_toml
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.keys import key_config
+from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.store import STORE_FOLDER
+from cleargs.untrusted import MAX_TEXT_BYTES, read_bytes
 
 RUN_FILE = "run.toml"
+
+LOCK = ".lock"
+"""Held by whoever works in the run folder."""
 
 HEADER = """\
 # The full configuration of this run, as `cleargs run` resolved it; stage, explain and show read it.
@@ -40,17 +48,84 @@ class Run:
 
 def write_run_file(run: Run) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
-    document = {"input": str(run.source), "device": run.device}
-    if run.store != run.folder / STORE_FOLDER:
-        document["store"] = str(run.store)
-    text = HEADER + tomli_w.dumps({**document, **run.config.document()})
     path = run.folder / RUN_FILE
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            write_bytes(path, text.encode())
+        if not is_noted(run):
+            write_bytes(path, _text(run).encode())
     except OSError as error:
         raise disk_error(error, path) from error
+
+
+def is_noted(run: Run) -> bool:
+    """Whether ``run.toml`` says just this."""
+    try:
+        return read_bytes(run.folder / RUN_FILE, MAX_TEXT_BYTES) == _text(run).encode()
+    except OSError:
+        return False
+
+
+@contextmanager
+def at_work(run: Run, dag: Dag, check: Callable[[], None]) -> Iterator[None]:
+    """Work in the run folder for the block.
+
+    Runs of the same results may share the folder. Others would overwrite each other's ``run.toml`` and links,
+    and none be told: ``run.toml`` changes only while nobody works, after ``check`` (which may raise) has
+    looked at what is there. Raises StageError where another run is at work, StoreError where the folder
+    cannot be written.
+    """
+    with ExitStack() as held:
+        try:
+            while not _joined(run, held, lambda: is_noted(run)):
+                with file_lock(run.folder / LOCK, wait=False) as alone:
+                    if alone:
+                        check()
+                        write_run_file(run)
+                if alone:
+                    continue
+                if _joined(run, held, lambda: _results_alike(run, dag)):
+                    break
+                raise StageError(
+                    f"another run, of other settings or another input, is at work in {run.folder}",
+                    hint="wait until it is done, or choose another folder with -o",
+                )
+        except OSError as error:
+            raise disk_error(error, run.folder / LOCK) from error
+        yield
+
+
+def _joined(run: Run, held: ExitStack, ours: Callable[[], bool]) -> bool:
+    """Share the run folder until ``held`` ends, if its ``run.toml`` is ``ours``."""
+    with ExitStack() as attempt:
+        attempt.enter_context(file_lock(run.folder / LOCK, shared=True))
+        if ours():
+            held.enter_context(attempt.pop_all())
+            return True
+    return False
+
+
+def _results_alike(run: Run, dag: Dag) -> bool:
+    """Whether ``run.toml`` leads to the same results in the same place: settings outside keys may differ."""
+    try:
+        noted = read_run_file(run.folder, dag)
+    except InputError:
+        return False
+    stages = {name: dag.load(name) for name in dag.names}
+    return all(
+        (noted.source, noted.store, noted.device, noted.config.seed)
+        == (run.source, run.store, run.device, run.config.seed)
+        and key_config(noted.config.sections[name]) == key_config(run.config.sections[name])
+        and stage.externals(noted.config.sections[name], run.source)
+        == stage.externals(run.config.sections[name], run.source)
+        for name, stage in stages.items()
+    )
+
+
+def _text(run: Run) -> str:
+    document = {"input": str(run.source), "device": run.device}
+    if run.store != run.folder / STORE_FOLDER:
+        document["store"] = str(run.store)
+    return HEADER + tomli_w.dumps({**document, **run.config.document()})
 
 
 def noted_source(folder: Path) -> Path | None:
@@ -59,7 +134,7 @@ def noted_source(folder: Path) -> Path | None:
         source = read_toml(folder / RUN_FILE).get("input")
     except ConfigError:
         return None
-    return Path(source) if isinstance(source, str) else None
+    return Path(source) if isinstance(source, str) and "\0" not in source else None
 
 
 def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:
@@ -75,7 +150,9 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
     document = read_toml(folder / RUN_FILE)
     source, noted_store = document.pop("input", None), document.pop("store", None)
     noted_device = document.pop("device", "cpu")
-    if not isinstance(source, str) or noted_device not in ("cpu", "cuda"):
+    noted_store = "" if noted_store is None else noted_store
+    paths_sound = all(isinstance(path, str) and "\0" not in path for path in (source, noted_store))
+    if not paths_sound or not source or noted_device not in ("cpu", "cuda"):
         raise InputError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")
     return Run(
         folder,

@@ -6,23 +6,26 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from cleargs.errors import InputError, StageError
+from cleargs.errors import InputError, StageError, StoreError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import file_digest, tree_digest
+from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.manifest import (
     FileRecord,
     Manifest,
+    damages,
     linked_manifest,
     plain_json,
     published_files,
     versions,
     write_manifest,
 )
-from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line
-from cleargs.pipeline.run_file import RUN_FILE, Run, noted_source, write_run_file
+from cleargs.pipeline.plan import Planner, Recipe, StagePlan, check_disk, cost_line
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_source
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
@@ -67,14 +70,16 @@ class Runner:
         line = cost_line(plans)
         if line:
             self.reporter.info(line)
-        write_run_file(self.run)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
-        with self.store.in_use():
+        same_input = partial(check_same_input, self.run, self.dag, self.store)
+        with at_work(self.run, self.dag, same_input), self.store.in_use():
             self.store.add_root(self.run.folder)
+            as_planned = True
             for plan in plans:
                 name = plan.stage
-                if plan.recipe is not None and plan.manifest is not None:
+                as_planned = as_planned and self._still_there(plan)
+                if as_planned and plan.recipe is not None and plan.manifest is not None:
                     outcome = self._show("found", plan.recipe, plan.manifest)
                 else:
                     outcome = self._bring(name, done, forced=name in forced)
@@ -90,7 +95,7 @@ class Runner:
         Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
         """
         done: dict[str, Manifest] = {}
-        with self.store.in_use():
+        with file_lock(self.run.folder / LOCK, shared=True), self.store.in_use():
             self.store.add_root(self.run.folder)
             for upstream in self.dag.until(name)[:-1]:
                 if upstream in self._all_upstream(name):
@@ -117,6 +122,11 @@ class Runner:
             )
         return entry.manifest
 
+    def _still_there(self, plan: StagePlan) -> bool:
+        """Whether what the plan found is in the store: until we held that, `collect` was free to act."""
+        entry = None if plan.manifest is None else self.store.find(plan.stage, plan.manifest.key)
+        return entry is not None and entry.whole is not None
+
     def _find(self, name: str, recipe: Recipe) -> Entry | None:
         """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
         entry = self.store.find(name, recipe.key)
@@ -134,6 +144,8 @@ class Runner:
         manifest = entry.whole if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
+            recipe = self._read_again(name, done)
+            entry = self.store.find(name, recipe.key)
             reasons = ("forced",) if forced else self._why(recipe, entry)
             with self.store.lock(recipe.key, self.reporter, name):
                 entry = self._find(name, recipe)
@@ -142,6 +154,23 @@ class Runner:
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
                     manifest, how = self._make(recipe, entry, forced=forced), "made"
         return self._show(how, recipe, manifest)
+
+    def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+        """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
+
+        Raises StoreError when an upstream result is damaged.
+        """
+        for upstream, paths in self.dag.load(name).INPUTS.items():
+            manifest = done[upstream]
+            folder = self.store.folder(upstream, manifest.key)
+            names = [file for file in manifest.files if manifest.is_part(file, paths)]
+            damaged = next(damages(folder, manifest, names, self.store.memo, afresh=True), None)
+            if damaged is not None:
+                raise StoreError(
+                    f"{upstream}: the stored results are damaged ({damaged})",
+                    hint="the same command makes them again",
+                )
+        return self.planner.recipe(name, done, afresh=True)
 
     def _show(self, how: Literal["found", "made"], recipe: Recipe, manifest: Manifest) -> Outcome:
         """Let the run folder show the finished results of ``recipe``."""
@@ -160,11 +189,19 @@ class Runner:
         name = recipe.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(recipe.key, fresh=forced, entry=entry)
+        for place in work.thrown_away:
+            self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         result = stage.run(context)
         seconds = time.monotonic() - clock
         cost = {"seconds": seconds, "cpu_seconds": usage.cpu_seconds, "peak_memory_gb": usage.peak_memory_gb}
+        now = self.planner.external_digests(recipe.externals)
+        if any(recipe.origins[role] != digests for role, digests in now.items()):
+            self.store.discard(work.folder)
+            raise StageError(
+                f"the input changed while {name} was reading it", hint="the same command starts it again"
+            )
         if not result.missing:
             absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
             if absent:

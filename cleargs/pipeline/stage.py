@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
 from cleargs.progress import Reporter
+
+External: TypeAlias = Path | Mapping[str, Path]
+"""Files outside the store: one, all of a folder that are not hidden, or single ones by name."""
 
 C = TypeVar("C", bound=BaseModel, covariant=True)
 
@@ -24,7 +27,7 @@ class StageContext(Generic[C]):
     """The capture as the user gave it; only ``ingest`` reads it."""
     inputs: Mapping[str, Path]
     """Finished folder of each upstream stage, by name."""
-    externals: Mapping[str, Path]
+    externals: Mapping[str, External]
     """What the stage's ``externals`` returned: files whose content is part of the key."""
     out: Path
     """Outputs go here. What a killed try of the same key left is still here; files appear atomically."""
@@ -72,8 +75,8 @@ class Stage(Protocol):
     LIBRARIES: tuple[str, ...]
     """Distributions whose version changes results; their versions enter the key."""
 
-    def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
-        """Role -> file or folder outside the store whose content enters the key (capture, model weights)."""
+    def externals(self, config: Any, source: Path) -> Mapping[str, External]:
+        """Role -> files outside the store whose content enters the key (capture, model weights)."""
 
     def preflight(self, config: Any) -> None:
         """Raise InputError when a model or a server that the settings name cannot be had.

@@ -21,12 +21,12 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from cleargs.errors import StoreError
-from cleargs.files import disk_error, is_partial, write_bytes
+from cleargs.files import disk_error, is_partial, sync, sync_tree, write_bytes
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.lease import DEAD_AFTER, Holder, lease, living_holder, this_process
 from cleargs.pipeline.lock import file_lock
@@ -39,6 +39,7 @@ from cleargs.pipeline.manifest import (
     write_manifest,
 )
 from cleargs.progress import Reporter
+from cleargs.untrusted import FAULTS, read_text
 
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""
@@ -72,6 +73,8 @@ class Work:
     """Where one key is being worked on."""
 
     folder: Path
+    thrown_away: tuple[str, ...] = ()
+    """What could not be used of an earlier try, and was removed."""
 
     @property
     def out(self) -> Path:
@@ -116,7 +119,13 @@ class Store:
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Held by whoever works in the store, so that nothing is cleared away under its feet."""
+        """Held by whoever works in the store, so that nothing is cleared away under its feet.
+
+        In somebody else's store that may only be read there is nothing to hold: its results can be shown.
+        """
+        if self._only_readable():
+            yield
+            return
         with file_lock(self.root / "locks" / "store.lock", shared=True), lease(self._lease(self._writer)):
             yield
 
@@ -128,6 +137,11 @@ class Store:
         heartbeat is waited out; where a dead node's lock stays, it is passed over once no writer was seen
         alive for `DEAD_AFTER` seconds.
         """
+        if self._only_readable():
+            raise StoreError(
+                f"{stage} is to be made, but the store {self.root} may only be read",
+                hint="choose a --store of your own",
+            )
         path, held, said = self.root / "locks" / f"{key}.lock", False, False
         seen = time.monotonic()
         with ExitStack() as kept:
@@ -151,6 +165,9 @@ class Store:
                 yield
             finally:
                 self._let_go(key)
+
+    def _only_readable(self) -> bool:
+        return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
     def _lease(self, writer: str) -> Path:
         return self.root / "leases" / f"{writer}.json"
@@ -189,10 +206,11 @@ class Store:
         """
         work = Work(self._claim(f"{key}.forced" if fresh else key))
         try:
+            work = replace(work, thrown_away=tuple(_only_files(work.folder)))
             if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
                 _link_files(entry.folder, work.out)
             work.out.mkdir(parents=True, exist_ok=True)
-            work.checkpoints.mkdir(exist_ok=True)
+            work.checkpoints.mkdir(parents=True, exist_ok=True)
             (work.out / MANIFEST).unlink(missing_ok=True)
             for file in [*work.out.rglob("*"), *work.checkpoints.rglob("*")]:
                 if is_partial(file) and not file.is_dir():
@@ -216,7 +234,7 @@ class Store:
         final = self.folder(manifest.stage, manifest.key)
         try:
             write_manifest(work.out, manifest)
-            _sync_tree(work.out)
+            sync_tree(work.out)
             final.parent.mkdir(parents=True, exist_ok=True)
             there = self.find(manifest.stage, manifest.key)
             if there is not None:
@@ -233,7 +251,7 @@ class Store:
                     raise
                 shutil.rmtree(work.folder)
                 return winner.usable
-            _sync(final.parent)
+            sync(final.parent)
         except OSError as error:
             raise disk_error(error, final) from error
         for name, record in manifest.files.items():
@@ -284,7 +302,7 @@ class Store:
         """Note that ``run`` links into this store, so that `collect` keeps what it shows."""
         name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
         note = self.root / "roots" / name
-        if not note.exists():
+        if not note.exists() and not self._only_readable():
             try:
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
@@ -333,8 +351,8 @@ class Store:
     def _linked(self, stages: tuple[str, ...]) -> set[Path]:
         runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
         for note in (self.root / "roots").glob("*"):
-            with suppress(OSError, UnicodeDecodeError):
-                runs.append(Path(note.read_text(encoding="utf-8").rstrip("\n")))
+            with suppress(*FAULTS):
+                runs.append(Path(read_text(note).rstrip("\n")))
         return {(run / stage).resolve() for run in runs for stage in stages if (run / stage).is_symlink()}
 
 
@@ -370,6 +388,20 @@ def _size(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
+def _only_files(folder: Path) -> Iterator[str]:
+    """Leave nothing but files of our own in folders below ``folder``; yields what was removed.
+
+    A link or a device among outputs would be published, and change with what it stands for.
+    """
+    if folder.is_symlink() or not folder.is_dir():
+        folder.unlink(missing_ok=True)
+    for place in sorted(folder.rglob("*")):
+        depth = len(place.relative_to(folder).parts)
+        if place.is_symlink() or not (place.is_dir() or (place.is_file() and depth > 1)):
+            place.unlink(missing_ok=True)
+            yield place.relative_to(folder).as_posix()
+
+
 def _link_files(source: Path, target: Path) -> None:
     """Bring the files of ``source`` into ``target`` without copying their content where hard links work.
 
@@ -387,16 +419,3 @@ def _link_files(source: Path, target: Path) -> None:
             shutil.copy2(file, place)
     beside.mkdir(parents=True, exist_ok=True)
     beside.rename(target)
-
-
-def _sync_tree(folder: Path) -> None:
-    for path in [*folder.rglob("*"), folder]:
-        _sync(path)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -51,7 +51,10 @@ class TrainConfig(BaseModel):
         True, description="move dead Gaussians, grow to the budget, add noise to the means (MCMC)"
     )
     budget: int | None = Field(
-        None, ge=1, le=20_000_000, description="most Gaussians; unset = from the number of training pixels"
+        None,
+        ge=1,
+        le=20_000_000,
+        description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
     )
     growth: float = Field(
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
@@ -124,7 +127,7 @@ class G0Config(TrainConfig):
         20_000,
         ge=1,
         le=5_000_000,
-        description="fewest Gaussians to start from; sparse points are added to reach it",
+        description="fewest Gaussians to start from, within the budget; points are added to reach it",
     )
     init_scale: float = Field(
         0.5, gt=0, description="starting scale as a share of the distance to the neighbours"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from cleargs.errors import InputError
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.reference import sh_basis
 from cleargs.splat.scene import Scene
@@ -30,7 +31,7 @@ def transform_scene(
 
     ``rotation`` must be proper (determinant 1) and ``scale`` positive, else ValueError is raised. Computed
     in float64; the result is float32 as the files are, so an offset that is large beside the scene costs
-    digits of the means.
+    digits of the means. Raises InputError where it would not be finite.
     """
     if (
         scale <= 0
@@ -52,6 +53,11 @@ def transform_scene(
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
     )
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in moved.tensors().values()):
+        raise InputError(
+            "in that world the scene leaves the range of the file's single precision",
+            hint="export it in the normalised world (without --world input)",
+        )
     return replace(scene, gaussians=moved)
 
 

@@ -23,6 +23,9 @@ DEPTH_JITTER = 0.05
 ADDED_POINTS = 100
 """Purpose of the random numbers of added points; the trainer's purposes are below it."""
 
+FEWER_POINTS = 101
+"""Purpose of the random numbers by which points are left out."""
+
 BLIND_DEPTHS = (0.5, 5.0)
 """Depths between which points are added where a view sees no sparse point; the cameras span a radius of 1."""
 
@@ -70,6 +73,16 @@ def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init
         logit_opacities=torch.full((count,), float(np.log(init_opacity / (1.0 - init_opacity)))),
         sh=sh,
     )
+
+
+def fewer_points(sparse: SparsePoints, count: int, *, seed: int) -> SparsePoints:
+    """``count`` of the points, drawn at random, in their order."""
+    rng = np.random.default_rng([seed, FEWER_POINTS])
+    kept = np.sort(rng.permutation(len(sparse.xyz))[:count])
+    place = np.full(len(sparse.xyz), -1)
+    place[kept] = np.arange(count)
+    observed = [place[seen][place[seen] >= 0] for seen in sparse.observed]
+    return SparsePoints(sparse.xyz[kept], sparse.rgb[kept], observed)
 
 
 def add_points(sparse: SparsePoints, views: Sequence[View], count: int, *, seed: int) -> SparsePoints:

@@ -16,9 +16,12 @@ from cleargs.errors import StoreError
 from cleargs.files import atomic_path
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
+from cleargs.untrusted import FAULTS, cause, open_regular
 
 _ANTIALIAS = "cleargs antialias"
 _BACKGROUND = "cleargs background"
+_LONGEST_LINE = 4096
+"""Most bytes of a line of the header."""
 
 
 def write_ply(path: Path, scene: Scene) -> None:
@@ -51,10 +54,11 @@ def write_ply(path: Path, scene: Scene) -> None:
 def read_ply(path: Path) -> Scene:
     """Read a scene in the Inria layout, with float32 properties in any order.
 
-    Raises StoreError when the file is missing, cut short, or lacks a property.
+    Raises StoreError when the file is missing, cut short, lacks a property, or holds a value that is not
+    finite.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             count, names, comments = _read_header(file)
             rows = np.frombuffer(file.read(), dtype="<f4").reshape(count, len(names))
         columns = {name: rows[:, index] for index, name in enumerate(names)}
@@ -74,20 +78,25 @@ def read_ply(path: Path) -> Scene:
         background = tuple(float(c) for c in comments.get(_BACKGROUND, "0 0 0").split())
         if len(background) != 3:
             raise ValueError("the background needs three values")
+        gaussians = Gaussians(
+            means=get("x", "y", "z"),
+            log_scales=get("scale_0", "scale_1", "scale_2"),
+            rotations=get("rot_0", "rot_1", "rot_2", "rot_3"),
+            logit_opacities=get("opacity")[:, 0].contiguous(),
+            sh=sh,
+        )
+        for name, values in gaussians.tensors().items():
+            if not bool(torch.isfinite(values).all()):
+                raise ValueError(f"some {name} are not finite")
         return Scene(
-            Gaussians(
-                means=get("x", "y", "z"),
-                log_scales=get("scale_0", "scale_1", "scale_2"),
-                rotations=get("rot_0", "rot_1", "rot_2", "rot_3"),
-                logit_opacities=get("opacity")[:, 0].contiguous(),
-                sh=sh,
-            ),
+            gaussians,
             antialias=comments.get(_ANTIALIAS, "none") == "mip",
             background=background,
         )
-    except (OSError, ValueError, KeyError) as error:
+    except FAULTS as error:
         raise StoreError(
-            f"cannot read the scene {path}: {error}", hint="run the stage that wrote it again with --force"
+            f"cannot read the scene {path}: {cause(error)}",
+            hint="run the stage that wrote it again with --force",
         ) from error
 
 
@@ -106,17 +115,20 @@ def _properties(coefficients: int) -> list[str]:
 def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
     """Number of vertices, property names, and ClearGS's comments; leaves ``file`` at the first vertex."""
     lines: list[list[str]] = []
-    while (line := file.readline()) not in (b"end_header\n", b"end_header\r\n"):
-        if not line or len(lines) > 1000:
+    while (line := file.readline(_LONGEST_LINE)) not in (b"end_header\n", b"end_header\r\n"):
+        if not line.endswith(b"\n") or len(lines) > 1000:
             raise ValueError("the header does not end")
-        lines.append(line.decode("ascii").split())
+        if words := line.decode("ascii").split():
+            lines.append(words)
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise ValueError("not a binary little endian PLY")
     elements = [line for line in lines if line[0] == "element"]
-    if len(elements) != 1 or elements[0][1] != "vertex":
+    if [line[:2] for line in elements] != [["element", "vertex"]] or len(elements[0]) != 3:
         raise ValueError("expected vertices and nothing else")
+    if not elements[0][2].isdecimal():
+        raise ValueError(f"{elements[0][2]} is no number of vertices")
     properties = [line for line in lines if line[0] == "property"]
-    if any(line[1] not in ("float", "float32") for line in properties):
+    if any(len(line) != 3 or line[1] not in ("float", "float32") for line in properties):
         raise ValueError("expected float properties only")
     comments = {" ".join(line[1:3]): " ".join(line[3:]) for line in lines if line[0] == "comment"}
     return int(elements[0][2]), [line[2] for line in properties], comments

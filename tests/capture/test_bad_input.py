@@ -13,6 +13,7 @@ import pytest
 
 from cleargs.capture.config import IngestConfig
 from cleargs.capture.sources import open_capture
+from cleargs.capture.tables import load_points
 from cleargs.errors import CleargsError, ConfigError, InputError, StageError
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.config import load_config
@@ -176,3 +177,49 @@ def test_holdout_says_what_it_takes() -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(installed(), overrides=["ingest.holdout=evry:3"])
     assert "every:N" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.__setitem__("w", float("inf")), "too large"),
+        (lambda d: d.__setitem__("w", 1e308), "more than"),
+        (lambda d: d.__setitem__("cx", 10**400), "too large"),
+        (lambda d: d.__setitem__("fl_x", 0), "focal length of 0"),
+        (lambda d: [d.pop("fl_x"), d.pop("fl_y"), d.__setitem__("camera_angle_x", 0)], "camera of"),
+        (lambda d: d["frames"][3].__setitem__("mask_path", "a\0b"), "does not exist"),
+        (lambda d: d["frames"][3].__setitem__("mask_path", 7), "mask_path"),
+    ],
+)
+def test_numbers_and_names_that_are_none(posed: Path, change: Any, words: str) -> None:
+    edit_transforms(posed, change)
+    with pytest.raises(InputError, match=words) as caught:
+        open_capture(posed, IngestConfig())
+    assert refused(caught)
+
+
+def test_json_that_is_nested_too_deeply(posed: Path) -> None:
+    (posed / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
+    with pytest.raises(InputError, match="nested deeper") as caught:
+        open_capture(posed, IngestConfig())
+    assert refused(caught)
+
+
+def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) -> None:
+    project = ingest(posed, "first").out
+    model = project / "colmap" / "sparse" / "0"
+    points = bytearray((model / "points3D.bin").read_bytes())
+    for value in (float("nan"), 1e300):  # of the first point: x, then y
+        struct.pack_into("<d", points, 16, value)
+        (model / "points3D.bin").write_bytes(points)
+        again = ingest(project, f"again {value}")
+        assert any("1 points of the input's sparse model" in line for line in again.warnings)
+        table = load_points(again.out)
+        assert len(table.xyz) and np.isfinite(table.xyz).all() and np.abs(table.xyz).max() < 1e9
+
+
+def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
+    (posed / "masks").mkdir()
+    cv2.imwrite(str(posed / "masks" / "003.png"), np.full((1, 1), 255, np.uint8))
+    with pytest.raises(InputError, match=r"mask 003\.png is far smaller than images/003\.png"):
+        ingest(posed)

@@ -13,7 +13,7 @@ import pytest
 
 from cleargs.capture import child
 from cleargs.capture.child import run_child
-from cleargs.errors import StageError
+from cleargs.errors import StageError, StoreError
 from cleargs.progress import SilentReporter
 
 PREAMBLE = """
@@ -142,3 +142,13 @@ def test_importing_colmap_leaves_signals_as_they_are(importer: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "answered\n", "")
+
+
+def test_a_full_disk_is_the_cause(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP and SQLite fail at whatever they were doing, and speak of that."""
+    usage = child.shutil.disk_usage(module.parent)
+    monkeypatch.setattr(child.shutil, "disk_usage", lambda path: usage._replace(free=2**20))
+    module.write_text(PREAMBLE + "channel.error('no features were found', 'other images')\nsys.exit(3)")
+    with pytest.raises(StoreError, match="no space left") as caught:
+        run(module)
+    assert "free some space" in caught.value.hint

@@ -20,6 +20,7 @@ from cleargs.capture.model import write_model
 from cleargs.capture.sources import Capture, open_capture
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
+from cleargs.pipeline.digest import named_files
 
 from .conftest import FOCAL, HEIGHT, WIDTH, Ingest, camera_to_world
 from .test_parts import small_model
@@ -284,8 +285,9 @@ def test_gsotm_synthetic(tmp_path: Path) -> None:
         assert frame.camera is not None and frame.camera.params == (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     # Every eighth is rendered without blur, as a test view (nerfstudio's eval-interval).
     assert held_out_names(capture, "every:8") == ["images/000.png", "images/008.png", "images/016.png"]
-    roles = {"images": tmp_path / "images", "transforms": tmp_path / "transforms.json"}
-    assert externals(tmp_path, IngestConfig()) == roles
+    read = externals(tmp_path, IngestConfig())
+    assert read["transforms"] == tmp_path / "transforms.json"
+    assert set(named_files(read["images"]).values()) == {tmp_path / "images" / name for name in names}
 
 
 def test_gsotm_smartphone(tmp_path: Path) -> None:
@@ -320,4 +322,5 @@ def test_gs2e_as_data_readme_arranges_it(tmp_path: Path) -> None:
         assert blurred.name == sharp.name and blurred.path != sharp.path
         assert blurred.pose is not None and sharp.pose is not None
         assert np.array_equal(blurred.pose.rotation, sharp.pose.rotation)
-    assert externals(tmp_path / "medium", IngestConfig())["images"] == tmp_path / "medium" / "images"
+    read = externals(tmp_path / "medium", IngestConfig())["images"]
+    assert {file.parent for file in named_files(read).values()} == {tmp_path / "medium" / "images"}

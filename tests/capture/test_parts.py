@@ -306,7 +306,8 @@ def test_forms_of_transforms(images: Path, extra: dict, model: str, params: tupl
 
 def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     config = IngestConfig()
-    assert externals(posed, config) == {"transforms": posed / "transforms.json", "images": posed / "images"}
+    listed = {f"images/{index:03d}.png": posed / "images" / f"{index:03d}.png" for index in range(10)}
+    assert externals(posed, config) == {"transforms": posed / "transforms.json", "images": listed}
     assert externals(images, config) == {"capture": images}
     assert externals(images / "view0.png", config) == {"capture": images / "view0.png"}
     (posed / "masks").mkdir()

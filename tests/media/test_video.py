@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from fractions import Fraction
 from pathlib import Path
@@ -245,3 +246,26 @@ def test_not_a_video(tmp_path: Path) -> None:
     path.write_text("these are notes")
     with pytest.raises(InputError, match="cannot be read as a video"):
         read_timeline(path)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv", ".mp4"])
+def test_a_title_in_another_encoding(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"v{suffix}"
+    title = b"Caf\xe9 in Latin-1"
+    with av.open(path, "w") as container:
+        container.metadata["title"] = "Cafe in Latin-1"
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        for _ in range(4):
+            container.mux(stream.encode(av.VideoFrame(32, 32, "yuv420p")))
+        container.mux(stream.encode())
+    data = path.read_bytes()
+    assert data.count(b"Cafe in Latin-1") == 1
+    path.write_bytes(data.replace(b"Cafe in Latin-1", title))
+    assert len(read_timeline(path).pts) == 4
+
+
+def test_a_fifo_is_no_video(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "v.mp4")
+    with pytest.raises(InputError, match="no regular file"):
+        read_timeline(tmp_path / "v.mp4")

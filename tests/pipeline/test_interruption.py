@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,10 +17,10 @@ from toy import Bench
 PROGRAM = Path(__file__).with_name("toy.py")
 
 
-def start(bench: Bench, *overrides: str) -> subprocess.Popen[str]:
+def start(bench: Bench, *overrides: str, capture: Path | None = None) -> subprocess.Popen[str]:
     recipe = bench.root / "empty.toml"
     recipe.touch()
-    command = [sys.executable, PROGRAM, bench.journal, "run", bench.capture, "-o", bench.folder]
+    command = [sys.executable, PROGRAM, bench.journal, "run", capture or bench.capture, "-o", bench.folder]
     command += ["--workflow", recipe, *(part for text in overrides for part in ("--set", text))]
     return subprocess.Popen(
         [str(part) for part in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -86,3 +87,34 @@ def test_interrupted_run_says_so_and_goes_on(bench: Bench, number: signal.Signal
     bench.work_done()
     bench.run()
     assert "square 0.txt" not in bench.work_done()
+
+
+def test_two_runs_of_different_inputs_in_one_folder(bench: Bench) -> None:
+    """Else both would end well, and the folder show now the one, now the other."""
+    other = bench.root / "other"
+    shutil.copytree(bench.capture, other)
+    (other / "5.txt").write_text("50")
+    (bench.root / "hold").touch()
+    first = start(bench, f"square.hold={bench.root / 'hold'}")
+    wait_for(bench, "held")
+    (bench.folder / "count").unlink()  # as if the second had looked before the first one finished a stage
+    (bench.folder / "run.toml").unlink()
+    second = start(bench, capture=other)
+    _, errors = second.communicate(timeout=60)
+    assert second.returncode == 1 and "another run" in errors and "at work" in errors
+    (bench.root / "hold").unlink()
+    _, errors = first.communicate(timeout=60)
+    assert first.returncode == 0, errors
+
+
+def test_two_runs_of_different_settings_in_one_folder(bench: Bench) -> None:
+    (bench.root / "hold").touch()
+    first = start(bench, f"square.hold={bench.root / 'hold'}")
+    wait_for(bench, "held")
+    second = start(bench, "square.power=3")
+    _, errors = second.communicate(timeout=60)
+    assert second.returncode == 1 and "other settings" in errors
+    (bench.root / "hold").unlink()
+    _, errors = first.communicate(timeout=60)
+    assert first.returncode == 0, errors
+    assert (bench.folder / "square" / "powers" / "5.txt").read_text() == "25"

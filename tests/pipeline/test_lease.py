@@ -55,10 +55,16 @@ def test_who_counts_as_dead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert living_holder(pretend(path, pid=dead_pid(), pid_space="pid:[1]")) is not None
     assert living_holder(pretend(path, age=DEAD_AFTER + 1, **elsewhere)) is None
     assert living_holder(pretend(path, age=DEAD_AFTER / 2, **elsewhere)) is not None
+    assert living_holder(pretend(path, age=-3e8, **elsewhere)) is None, "a beat ten years from now"
     monkeypatch.setenv("SLURM_JOB_ID", "17")
     assert living_holder(pretend(path, job="17", **elsewhere)) is None, "Slurm ended that try of our job"
     assert living_holder(pretend(path, job="18", **elsewhere)) is not None
-    path.write_text("{")
+    for damaged in ("{", "[]", "[" * 100_000, '{"pid": "1\\u0000"}'):
+        path.write_text(damaged)
+        assert living_holder(path) is None
+    assert living_holder(pretend(path, pid="1\0")) is None
+    path.unlink()
+    os.mkfifo(path)
     assert living_holder(path) is None
 
 

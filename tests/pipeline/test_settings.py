@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 import pytest
 from toy import Bench, toy_dag
 
-from cleargs.errors import ConfigError
+from cleargs.errors import ConfigError, InputError, StoreError
 from cleargs.pipeline.config import (
     check_document,
     load_config,
     merge,
     parse_override,
     read_recipe,
+    read_toml,
     recipe_names,
 )
 from cleargs.pipeline.dag import Dag, installed
@@ -138,3 +141,46 @@ def test_run_file_gives_back_the_run(bench: Bench) -> None:
 def test_marked_settings_stay_out_of_the_key(dag: Dag) -> None:
     config = check_document(dag, {"count": {"weights": "/somewhere"}}).sections["count"]
     assert key_config(config) == {"limit": 100, "mode": "plain", "inner": {"depth": 3}}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('input = "x"\nstore = ["a"]\n', "damaged"),
+        ('input = "a\\u0000b"\n', "damaged"),
+        ('input = "x"\nstore = "a\\u0000b"\n', "damaged"),
+        ("input = 7\n", "damaged"),
+        ('input = "x"\na = ' + "[" * 5000, "nested deeper"),
+        ('input = "x"\n' + ".".join("a" * 50_000) + " = 1\n", "nested deeper"),
+        ('input = "x"\n"a" . ' + " . ".join("b" * 40) + " = 1\n", "nested deeper"),
+        ('input = "x"\na = ' + "[" * 40 + "]" * 40 + "\n", "nested deeper"),
+        ('input = "x"\nseed = ' + "9" * 5000 + "\n", "not valid TOML"),
+    ],
+)
+def test_run_files_that_nobody_wrote(bench: Bench, text: str, words: str) -> None:
+    bench.folder.mkdir()
+    (bench.folder / "run.toml").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_run_file(bench.folder, bench.dag)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_for_a_run_file(bench: Bench) -> None:
+    bench.folder.mkdir()
+    os.mkfifo(bench.folder / "run.toml")
+    with pytest.raises(InputError, match="no run"):
+        read_run_file(bench.folder, bench.dag)
+    with pytest.raises(ConfigError, match="no regular file"):
+        read_toml(bench.folder / "run.toml")
+
+
+def test_a_setting_of_very_many_parts(bench: Bench) -> None:
+    with pytest.raises(ConfigError, match="names no setting"):
+        bench.settings([".".join("a" * 5000) + "=1"])
+
+
+def test_disk_is_told_in_the_unit_that_says_something(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(bench.root)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=12_000))
+    with pytest.raises(StoreError, match=r"needs about 3 MB of disk, 0 MB are free"):
+        bench.run()

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from toy import Bench
 
-from cleargs.errors import StoreError
-from cleargs.pipeline.digest import DigestMemo, file_digest
+from cleargs.errors import StageError, StoreError
+from cleargs.pipeline.digest import RACY_NS, DigestMemo, file_digest
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.manifest import MANIFEST, damage, read_manifest
+from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.pipeline.store import Store
 
 
@@ -35,6 +40,21 @@ def from_elsewhere(folder: Path) -> None:
     shutil.copy(other / MANIFEST, folder / MANIFEST)
 
 
+def deep(folder: Path) -> None:
+    (folder / MANIFEST).write_text("[" * 200_000)
+
+
+def pipe(folder: Path) -> None:
+    (folder / MANIFEST).unlink()
+    os.mkfifo(folder / MANIFEST)
+
+
+def no_digest(folder: Path) -> None:
+    content = json.loads((folder / MANIFEST).read_text())
+    content["files"]["log.txt"]["digest"] = None
+    (folder / MANIFEST).write_text(json.dumps(content))
+
+
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "cut manifest": lambda folder: (folder / MANIFEST).write_bytes((folder / MANIFEST).read_bytes()[:-40]),
     "empty manifest": lambda folder: (folder / MANIFEST).write_bytes(b""),
@@ -43,6 +63,9 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "edited manifest": edit_manifest,
     "manifest of another stage": from_elsewhere,
     "no manifest": lambda folder: (folder / MANIFEST).unlink(),
+    "deep manifest": deep,
+    "pipe for a manifest": pipe,
+    "digest that is none": no_digest,
     "file gone": lambda folder: (folder / "log.txt").unlink(),
     "file cut": lambda folder: (folder / "numbers" / "1.txt").write_bytes(b""),
     "file changed": lambda folder: flip(folder / "numbers" / "1.txt"),
@@ -157,3 +180,136 @@ def test_collect_keeps_what_runs_show(bench: Bench) -> None:
             store.collect(bench.dag.names, checkpoints=False, dry_run=False)
     assert [outcome.how for outcome in bench.run()] == ["found"] * 3
     assert bench.run("square.power=3")[1].how == "made"
+
+
+def damage_unseen(file: Path) -> None:
+    """One byte changes as on a disk that rots: size and all times stay, as far as the memo can tell."""
+    before = file.stat()
+    flip(file)
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_a_byte_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> None:
+    """`cp -p` and archivers put mtime back; the kernel's own time of the last change stays."""
+    bench.run()
+    bench.run()  # all digests are remembered now
+    damage_unseen(bench.folder / "count" / "log.txt")
+    assert bench.run()[0].how == "made"
+    assert "damaged" in bench.remarks.warnings[0]
+
+
+def test_an_input_changed_behind_an_old_time_stamp_is_no_hit(bench: Bench) -> None:
+    for file in bench.capture.iterdir():
+        os.utime(file, (1e9, 1e9))
+    time.sleep(RACY_NS / 1e9 + 0.1)
+    bench.run()
+    damage_unseen(bench.capture / "3.txt")
+    assert bench.run()[0].how == "made"
+
+
+def rot(bench: Bench, file: Path) -> None:
+    """A byte changes with no trace in any time stamp, as a disk does it: the memo still knows the old one."""
+    known = file_digest(file)
+    flip(file)
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        memo.remember(file, known)
+
+
+def test_a_stage_that_runs_reads_its_inputs_again(bench: Bench) -> None:
+    bench.run()
+    before = read_manifest(bench.folder / "count").key
+    rot(bench, bench.capture / "3.txt")
+    assert bench.run()[0].how == "found", "nothing runs, nothing is read"
+    bench.run("count.mode=padded")
+    made = read_manifest(bench.folder / "count")
+    assert made.key != before
+    assert made.origins["capture"]["3.txt"] == file_digest(bench.capture / "3.txt")
+
+
+def test_a_stage_that_runs_finds_a_rotten_result_upstream(bench: Bench) -> None:
+    bench.run()
+    rot(bench, (bench.folder / "count" / "numbers" / "3.txt").resolve())
+    with pytest.raises(StoreError, match=r"count: .*damaged \(numbers/3\.txt has other content\)"):
+        bench.run("square.power=3")
+    assert bench.run("square.power=3")[0].how == "made"
+
+
+def test_an_input_that_changes_while_it_is_read_is_not_published(bench: Bench) -> None:
+    stage = bench.dag.load("count")
+    run = stage.run
+
+    def meddling(context: StageContext[Any]) -> StageResult:
+        (bench.capture / "5.txt").write_text("55")
+        return run(context)
+
+    object.__setattr__(stage, "run", meddling)
+    with pytest.raises(StageError, match="changed while count was reading it"):
+        bench.run()
+    object.__setattr__(stage, "run", run)
+    assert not (bench.folder / "count").exists()
+    bench.run()
+    assert (bench.folder / "count" / "numbers" / "5.txt").read_text() == "55"
+
+
+def test_collecting_between_plan_and_work_costs_nothing(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`gc` beside a run: what was found while planning is gone when the run holds the store."""
+    bench.run("square.power=3")
+    bench.run()
+    in_use = Store.in_use
+
+    @contextmanager
+    def late(store: Store) -> Iterator[None]:
+        store.collect(bench.dag.names, checkpoints=False, dry_run=False)
+        with in_use(store):
+            yield
+
+    monkeypatch.setattr(Store, "in_use", late)
+    outcomes = bench.run("square.power=3")
+    assert [outcome.how for outcome in outcomes] == ["found", "made", "made"]
+    for name in bench.dag.names:
+        assert (bench.folder / name).resolve().is_dir(), "no link dangles"
+
+
+@pytest.mark.parametrize("place", ["out", "checkpoints"])
+@pytest.mark.parametrize("what", ["file", "link", "pipe"])
+def test_work_folders_that_are_none_are_thrown_away(bench: Bench, place: str, what: str) -> None:
+    healthy = bench.digests()
+    key = read_manifest(bench.folder / "square").key
+    shutil.rmtree(bench.store / "square")
+    found = bench.store / "work" / f"{key}@left" / place
+    found.parent.mkdir(parents=True)
+    if what == "file":
+        found.write_bytes(b"no folder")
+    elif what == "link":
+        found.symlink_to(bench.capture)
+    else:
+        os.mkfifo(found)
+    assert bench.digests() == healthy
+    assert any(f"square: {place} of an interrupted try" in line for line in bench.remarks.warnings)
+    assert len(list(bench.capture.iterdir())) == 6, "what a link names is not touched"
+
+
+def test_links_among_leftovers_are_not_published(bench: Bench) -> None:
+    healthy = bench.digests()
+    key = read_manifest(bench.folder / "count").key
+    shutil.rmtree(bench.store / "count")
+    out = bench.store / "work" / f"{key}@left" / "out"
+    (out / "numbers").mkdir(parents=True)
+    (out / "numbers" / "1.txt").symlink_to(bench.capture / "1.txt")
+    (out / "secret").symlink_to("/etc/passwd")
+    assert bench.digests() == healthy
+    assert any("out/secret" in line for line in bench.remarks.warnings)
+
+
+def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = bench.root / "shared"
+    bench.run(store=shared)
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK or Path(path) != shared)
+    before = sorted(shared.rglob("*"))
+    (bench.folder / "total").unlink()
+    assert [outcome.how for outcome in bench.run(store=shared)] == ["found"] * 3
+    assert (bench.folder / "total" / "total.txt").exists() and sorted(shared.rglob("*")) == before
+    with pytest.raises(StoreError, match="may only be read"):
+        bench.run("square.power=3", store=shared)

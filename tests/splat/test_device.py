@@ -57,7 +57,7 @@ def test_the_device_is_part_of_the_key(stage: str) -> None:
         externals={},
         seed=0,
         device="cpu",
-        libraries=library_versions(module.LIBRARIES),
+        libraries=library_versions(module.LIBRARIES, "cpu"),
     )
     assert parts.key != parts.model_copy(update={"device": "cuda"}).key
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
 from cleargs.splat.export import sh_rotation, transform_scene
 from cleargs.splat.gaussians import Gaussians
@@ -95,3 +96,17 @@ def test_reflections_are_refused() -> None:
         transform_scene(
             make_scene(2, 4), scale=1.0, rotation=np.diag([1.0, 1.0, -1.0]), translation=TRANSLATION
         )
+
+
+def test_a_world_beyond_single_precision_is_refused() -> None:
+    scene = Scene(
+        Gaussians(
+            means=torch.ones(2, 3),
+            log_scales=torch.zeros(2, 3),
+            rotations=torch.ones(2, 4),
+            logit_opacities=torch.zeros(2),
+            sh=torch.zeros(2, 1, 3),
+        )
+    )
+    with pytest.raises(InputError, match="single precision"):
+        transform_scene(scene, scale=1e39, rotation=np.eye(3), translation=np.zeros(3))

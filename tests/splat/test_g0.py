@@ -173,3 +173,13 @@ def test_no_active_frame_is_an_error(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "ingest").symlink_to(capture / "ingest")
     with pytest.raises(InputError, match="weight"):
         g0.run(context(tmp_path, tmp_path / "work"))
+
+
+@pytest.mark.parametrize("budget", [1, 30, 80])
+def test_the_budget_is_a_maximum_from_the_first_step(capture: Path, tmp_path: Path, budget: int) -> None:
+    """Below the sparse points (60), and between them and min_points (100)."""
+    config = CONFIG.model_copy(update={"budget": budget, "steps": 3})
+    result = g0.run(context(capture, tmp_path, config))
+    summary = dict(result.summary)
+    assert summary["gaussians_start"] == budget
+    assert summary["gaussians"] == read_ply(tmp_path / "out" / "scene.ply").gaussians.num == budget

@@ -75,6 +75,12 @@ def test_no_gaussians(tmp_path: Path) -> None:
         lambda data: b"",
         lambda data: data.replace(b"opacity", b"opaciti"),
         lambda data: data.replace(b"binary_little_endian", b"ascii"),
+        lambda data: data.replace(b"element vertex 5", b"element"),
+        lambda data: data.replace(b"element vertex 5", b"element vertex"),
+        lambda data: data.replace(b"element vertex 5", b"element vertex -1"),
+        lambda data: data.replace(b"property float opacity", b"property"),
+        lambda data: data[:-4] + np.float32(np.nan).tobytes(),
+        lambda data: data[:-4] + np.float32(np.inf).tobytes(),
     ],
 )
 def test_a_damaged_file_is_refused(damage: object, tmp_path: Path) -> None:

@@ -71,3 +71,31 @@ def test_importing_the_core_imports_neither_numba_nor_media_libraries():
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o775, 0o722])
+def test_a_cache_that_others_may_write_to_is_passed_over(monkeypatch, tmp_path, mode):
+    """What lies in it is run."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shared"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    planted = runtime.cache_folder()
+    assert planted.parent == tmp_path / "shared" and planted.stat().st_mode & 0o777 == 0o700
+    planted.chmod(mode)
+    assert runtime.cache_folder().parent == tmp_path / "own" / "cleargs"
+
+
+def test_a_cache_of_somebody_else_is_passed_over(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shared"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    planted = runtime.cache_folder()
+    monkeypatch.setattr(runtime.os, "geteuid", lambda: planted.stat().st_uid + 1)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert not runtime.cache_folder().is_relative_to(tmp_path / "shared")
+
+
+def test_a_link_is_no_cache(monkeypatch, tmp_path):
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared" / f"kernels-{runtime.kernel_digest()}").symlink_to(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shared"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    assert runtime.cache_folder().parent == tmp_path / "own" / "cleargs"

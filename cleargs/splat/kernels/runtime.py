@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +29,8 @@ def cache_folder() -> Path:
     """A writable folder for compiled kernels, made if needed.
 
     Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
-    or ``~/.cache``), else, when none can be written to, a fresh temporary folder.
+    or ``~/.cache``), else, when none can be written to, a fresh temporary folder. One that others own or may
+    write to is passed over: what lies there is run.
     """
     name = f"kernels-{kernel_digest()}"
     candidates = []
@@ -40,12 +42,25 @@ def cache_folder() -> Path:
     for candidate in candidates:
         try:
             folder = candidate.expanduser() / name
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=0o700, exist_ok=True)
+            if not _private(folder):
+                continue
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except (OSError, RuntimeError):  # RuntimeError: expanduser without a home
             continue
     return Path(tempfile.mkdtemp(prefix="cleargs-kernels-"))
+
+
+def _private(folder: Path) -> bool:
+    """Whether nobody but the user (and root) can put something into ``folder``."""
+    status = folder.lstat()
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid == os.geteuid()
+        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
 
 
 def configure_numba() -> None:

@@ -1,0 +1,98 @@
+"""``cleargs verify``: every file of a run read again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from cleargs.cli.common import json_option, opened_store, print_json, run_argument, store_option
+from cleargs.errors import InputError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import named_files
+from cleargs.pipeline.manifest import Manifest, damages, read_manifest
+from cleargs.pipeline.run_file import Run, read_run_file
+from cleargs.pipeline.store import Store
+
+Fault = tuple[Literal["damaged", "changed"], str, str]
+"""A damaged result or a changed input, the stage, and what is wrong."""
+
+
+@click.command(
+    epilog="""\b
+Example:
+  cleargs verify room      before an archive is trusted, or after a disk was
+"""
+)
+@run_argument
+@store_option
+@json_option
+@click.pass_obj
+def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
+    """Read every file that RUN shows, and every input that it was made from, and compare them with the
+    digests in its manifests.
+
+    Other commands trust a file whose size and time stamps did not change. Damaged results are made again by
+    the next `cleargs run`. Exit code 1 when something is damaged or changed.
+    """
+    settings = read_run_file(run, dag, store=store)
+    faults: list[Fault] = []
+    stages: list[str] = []
+    files = 0
+    with opened_store(settings.store) as opened:
+        for name in dag.names:
+            folder = settings.folder / name
+            if not folder.is_symlink():
+                continue
+            stages.append(name)
+            try:
+                manifest = read_manifest(folder)
+            except (OSError, ValueError) as error:
+                text = "it is no longer in the store" if isinstance(error, OSError) else str(error)
+                faults.append(("damaged", name, text))
+                continue
+            files += len(manifest.files)
+            place = folder.resolve()
+            for line in damages(place, manifest, manifest.files, opened.memo, afresh=True):
+                faults.append(("damaged", name, line))
+            faults += _changed_inputs(dag, settings, opened, manifest)
+    if as_json:
+        names = ("kind", "stage", "what")
+        faults_json = [dict(zip(names, fault, strict=True)) for fault in faults]
+        print_json({"stages": stages, "files": files, "faults": faults_json})
+    else:
+        for kind, stage, text in faults:
+            click.echo(f"{kind:<8} {stage:<12} {text}")
+        count = f"{len(faults)} faults" if len(faults) != 1 else "1 fault"
+        click.echo(
+            f"{files} files of {len(stages)} stages read: {count if faults else 'all as they were made'}"
+        )
+    if any(kind == "damaged" for kind, _, _ in faults):
+        click.echo(f"hint: `cleargs run {settings.source} -o {run}` makes damaged results again", err=True)
+    return 1 if faults else 0
+
+
+def _changed_inputs(dag: Dag, run: Run, store: Store, manifest: Manifest) -> Iterator[Fault]:
+    """What differs between the files outside the store that a stage was made from, and those there now."""
+    stage = manifest.stage
+    for role, place in dag.load(stage).externals(run.config.sections[stage], run.source).items():
+        before = manifest.origins.get(role)
+        if before is None:
+            continue  # the stage was made with other settings, which `cleargs explain` tells
+        files = named_files(place)
+        for name in sorted(before.keys() | files.keys()):
+            label = f"{role} {name}".rstrip()
+            if name not in files:
+                yield "changed", stage, f"{label} is missing"
+                continue
+            try:
+                now = store.memo.digests_of(files[name], afresh=True)[""]
+            except InputError as error:
+                yield "changed", stage, f"{label}: {error}"
+                continue
+            if name not in before:
+                yield "changed", stage, f"{label} is new"
+            elif now != before[name]:
+                yield "changed", stage, f"{label} has other content"

@@ -1,0 +1,121 @@
+"""Files that somebody else wrote: opened only where they are regular, read only up to a stated size.
+
+A FIFO or a device in place of a file would block its reader, or never end; a size, a count or a depth that a
+file only claims would take all memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+import struct
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+MAX_BYTES = 4 * 2**30
+"""Most bytes of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
+
+MAX_TEXT_BYTES = 256 * 2**20
+"""Most bytes of a document (JSON, TOML, CSV); transforms.json of 100,000 frames has 80 MB."""
+
+MAX_NESTING = 32
+"""Most tables and lists inside each other in a document; ours have six."""
+
+FAULTS: tuple[type[Exception], ...] = (
+    OSError,
+    ValueError,  # UnicodeDecodeError and JSONDecodeError are such
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,  # OverflowError and ZeroDivisionError are such
+    RecursionError,
+    struct.error,
+)
+"""What decoding a file of the wrong form may raise. Readers catch these where they say what they read."""
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open the regular file at ``path``, or the one that it links to, for reading.
+
+    Raises OSError: there is no such file, it may not be read, or it is a folder, a FIFO or a device.
+    """
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "the name holds a zero byte", str(path))
+    # Without O_NONBLOCK the call itself would wait for a FIFO's writer.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_bytes(path: Path, at_most: int = MAX_BYTES) -> bytes:
+    """The content of the regular file at ``path``. Raises OSError for none such, and a larger one."""
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > at_most:
+            raise OSError(errno.EFBIG, f"it has {size} bytes, at most {at_most} are read", str(path))
+        return file.read(at_most)
+
+
+def read_text(path: Path) -> str:
+    """The UTF-8 text at ``path``, without a byte order mark. Raises OSError like `read_bytes`, and
+    UnicodeDecodeError."""
+    return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
+
+
+def read_json(path: Path) -> Any:
+    """The JSON document at ``path``.
+
+    Raises OSError like `read_bytes`, ValueError where it is no JSON or nested deeper than `MAX_NESTING`.
+    """
+    data = read_bytes(path, MAX_TEXT_BYTES)
+    try:
+        return shallow(json.loads(data))
+    except RecursionError:
+        raise _too_deep() from None
+
+
+def shallow(document: Any) -> Any:
+    """``document``, when it is nested no deeper than `MAX_NESTING`. Raises ValueError otherwise."""
+    level = [document]
+    for _ in range(MAX_NESTING):
+        level = [item for container in level for item in _items(container)]
+        if not level:
+            return document
+    raise _too_deep()
+
+
+def cause(error: Exception) -> str:
+    """Why a file cannot be read, in one line without its path: what one of `FAULTS` says."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    if isinstance(error, UnicodeDecodeError):
+        return "it is not UTF-8 text"
+    if isinstance(error, struct.error):
+        return "it breaks off"
+    if isinstance(error, OverflowError):
+        return "a number is too large"
+    if isinstance(error, RecursionError):
+        return str(_too_deep())
+    if isinstance(error, KeyError):
+        return f"{error.args[0]!r} is missing" if error.args else "something is missing"
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _items(container: Any) -> Iterator[Any]:
+    if isinstance(container, dict):
+        yield from container.values()
+    elif isinstance(container, list):
+        yield from container
+
+
+def _too_deep() -> ValueError:
+    return ValueError(f"it is nested deeper than {MAX_NESTING} levels")

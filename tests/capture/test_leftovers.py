@@ -1,0 +1,85 @@
+"""What a killed ingest left may be damaged: thrown away with a warning, the results are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cleargs.capture.sfm import GIVEN_POSES
+from cleargs.files import remove
+from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.manifest import published_files
+
+from .conftest import Ingest
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def empty(file: Path) -> None:
+    file.write_bytes(b"")
+
+
+def garbage(file: Path) -> None:
+    file.write_bytes(b"\xff\x07" * 700)
+
+
+def a_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+def a_file(folder: Path) -> None:
+    remove(folder)
+    folder.write_bytes(b"no folder")
+
+
+MODEL = ["cameras.bin", "images.bin", "points3D.bin"]
+DAMAGES: dict[str, Callable[[Path, Path], object]] = {
+    "empty working image": lambda work, out: empty(work / "images" / "000003.png"),
+    "cut working image": lambda work, out: cut(work / "images" / "000003.png"),
+    "a folder for a working image": lambda work, out: a_folder(work / "images" / "000003.png"),
+    "empty published image": lambda work, out: empty(out / "images" / "000003.png"),
+    "a file for the working images": lambda work, out: a_file(work / "images"),
+    "a file for the published images": lambda work, out: a_file(out / "images"),
+    "a file for the model": lambda work, out: a_file(work / "model"),
+    "model without given poses": lambda work, out: (work / "model" / GIVEN_POSES).unlink(),
+    "empty given poses": lambda work, out: empty(work / "model" / GIVEN_POSES),
+    **{f"empty {name}": lambda work, out, name=name: empty(work / "model" / name) for name in MODEL},
+    **{f"garbage {name}": lambda work, out, name=name: garbage(work / "model" / name) for name in MODEL},
+}
+
+
+def digests(out: Path) -> dict[str, str]:
+    return {name: file_digest(file) for name, file in published_files(out).items()}
+
+
+@pytest.fixture
+def settings() -> dict[str, int]:
+    """Small images: COLMAP may start anew for a damage."""
+    return {"feature_size": 160, "max_size": 160, "max_features": 256}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_damaged_leftovers(
+    posed: Path, ingest: Ingest, tmp_path: Path, settings: dict[str, int], what: str
+) -> None:
+    healthy = digests(ingest(posed, **settings).out)
+    DAMAGES[what](tmp_path / "out.work", tmp_path / "out")
+    again = ingest(posed, **settings)
+    assert digests(again.out) == healthy
+    silent = what.startswith("a file for the working") or what.startswith("a file for the published")
+    assert bool(again.warnings) != silent, again.warnings
+
+
+def test_a_damaged_database_is_made_again(
+    posed: Path, ingest: Ingest, tmp_path: Path, settings: dict[str, int]
+) -> None:
+    healthy = digests(ingest(posed, **settings).out)
+    for damage in (empty, cut, garbage):
+        remove(tmp_path / "out.work" / "model")
+        damage(tmp_path / "out.work" / "database.db")
+        assert digests(ingest(posed, **settings).out) == healthy

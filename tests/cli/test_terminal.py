@@ -1,0 +1,131 @@
+"""What is printed: names from files cannot steer the terminal, and no error is unexpected."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from toy import Bench
+
+from cleargs.cli.main import explanation, invoke
+from cleargs.cli.progress import LineReporter
+from cleargs.cli.terminal import EscapingStream
+from cleargs.errors import InputError
+from cleargs.text import printable
+
+CLIPBOARD = "\x1b]52;c;ZXZpbA==\x07"
+CLEAR = "\x1b[2J\x1b[H"
+FORGED = "x\nerror: everything is lost"
+REVERSED = "gpj.\u202eexe"
+
+
+@pytest.mark.parametrize(
+    "name", [CLIPBOARD, CLEAR, "\x9b2J", FORGED, REVERSED, "caf\udce9", "\x7f", "\u2028"]
+)
+def test_harmful_characters_are_shown(name: str) -> None:
+    shown = printable(name)
+    assert "\n" not in shown and shown.isprintable() and shown.encode()
+    assert json.loads(f'"{shown}"') == name, "the form is JSON's"
+
+
+@pytest.mark.parametrize("name", ["Zimmer 3/größe.png", "写真.jpg", "e\u0301 🙂", "مرحبا"])
+def test_other_languages_stay(name: str) -> None:
+    assert printable(name) == name
+
+
+def printed(text: str, encoding: str = "utf-8") -> str:
+    buffer = io.BytesIO()
+    stream = EscapingStream(buffer, encoding=encoding, errors="backslashreplace", write_through=True)
+    stream.write(text)
+    return buffer.getvalue().decode(encoding)
+
+
+def test_the_streams_escape_all_but_lines_and_colours() -> None:
+    assert printed(f"a\tb\n{CLEAR}\n") == "a\tb\n\\u001b[2J\\u001b[H\n"
+    assert printed("\x1b[1;31mred\x1b[0m\n") == "\x1b[1;31mred\x1b[0m\n"
+    assert printed("3 ● größe\n", "ascii") == "3 \\u25cf gr\\xf6\\xdfe\n"
+
+
+def test_errors_and_reports_are_one_line_each(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _, cause, remedy = explanation(InputError(f"no {CLIPBOARD}{FORGED}", hint=FORGED))
+    assert cause.isprintable() and remedy.isprintable()
+    reporter = LineReporter()
+    reporter.warn(FORGED)
+    reporter.info(CLEAR)
+    with reporter.task(CLIPBOARD, 1) as task:
+        task.update(note=FORGED)
+    told = capsys.readouterr().err
+    assert len(told.splitlines()) == 3 and "\x1b" not in told and "\x07" not in told
+    (bench.capture / "2.txt").write_text("")
+    (bench.capture / "2.txt").rename(bench.capture / f"2{CLEAR}\nerror: x.txt")
+    invoke(["run", str(bench.capture), "-o", str(bench.folder), "--workflow", str(empty(bench))], bench.dag)
+    told = capsys.readouterr().err
+    assert "\x1b" not in told and "\nerror" not in told and "is empty" in told
+
+
+def empty(bench: Bench) -> Path:
+    recipe = bench.root / "empty.toml"
+    recipe.touch()
+    return recipe
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (MemoryError(), 1, "out of memory"),
+        (RuntimeError("can't start new thread"), 1, "out of memory"),
+        (ImportError("libx.so: failed to map segment from shared object"), 1, "out of memory"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 300), 2, "too long"),
+    ],
+)
+def test_errors_of_the_system_are_explained(error: Exception, code: int, words: str) -> None:
+    found, cause, _ = explanation(error)
+    assert found == code and words in cause and "unexpected" not in cause
+
+
+def test_a_path_that_is_too_long(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["run", str(bench.capture), "-o", str(bench.root / ("x" * 300)), "--workflow"]
+    assert invoke([*arguments, str(empty(bench))], bench.dag) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: File name too long") and "choose another path" in told
+
+
+def test_a_name_that_is_not_utf8(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    for place in (bench.capture / os.fsdecode(b"caf\xe9.txt"), bench.root / os.fsdecode(b"caf\xe9")):
+        arguments = ["run", str(bench.capture), "-o", str(bench.folder), "--workflow", str(empty(bench))]
+        if place.parent == bench.capture:
+            place.write_text("7")
+        else:
+            arguments[3] = str(place)
+        assert invoke(arguments, bench.dag) == 2
+        told = capsys.readouterr().err
+        assert "caf\\udce9" in told and "is not UTF-8" in told and "rename it" in told
+        place.unlink(missing_ok=True)
+        assert not bench.folder.exists()
+
+
+def test_an_early_interrupt_is_silent() -> None:
+    """The console script imports `entry` first."""
+    program = (
+        "import cleargs.cli.entry, os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -2 and done.stderr == ""
+
+
+def test_the_installed_script_escapes(bench: Bench) -> None:
+    """Through a real process, as a shell starts it; on a pipe the rule is the same as on a terminal."""
+    program = "import sys; from cleargs.cli.main import main; main(sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "show", str(bench.root / f"no{CLEAR}\nerror: run")],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert done.returncode == 2 and "\x1b" not in done.stderr and "\nerror: run" not in done.stderr

@@ -1,0 +1,67 @@
+"""``cleargs verify``: what no time stamp tells."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from toy import Bench, make_bench
+
+from cleargs.cli.main import invoke
+from cleargs.pipeline.digest import DigestMemo, file_digest
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    made = make_bench(tmp_path)
+    made.run()
+    return made
+
+
+def rot(bench: Bench, file: Path) -> None:
+    """A byte changes with no trace in any time stamp: the memo still knows the old one."""
+    known = file_digest(file)
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(bytes(data))
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        memo.remember(file, known)
+
+
+def test_a_healthy_run(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 0
+    assert "15 files of 3 stages read: all as they were made" in capsys.readouterr().out
+
+
+def test_what_rotted_is_named_and_made_again(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    healthy = bench.digests()
+    rot(bench, (bench.folder / "count" / "numbers" / "3.txt").resolve())
+    assert bench.run()[0].how == "found", "no time stamp tells"
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 1
+    told = capsys.readouterr()
+    assert "damaged  count        numbers/3.txt has other content" in told.out
+    assert "15 files of 3 stages read: 1 fault" in told.out and "makes damaged results again" in told.err
+    assert bench.run()[0].how == "made"
+    assert bench.digests() == healthy
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 0
+
+
+def test_inputs_that_changed_or_went(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    rot(bench, bench.capture / "3.txt")
+    (bench.capture / "4.txt").unlink()
+    (bench.capture / "9.txt").write_text("9")
+    assert invoke(["verify", str(bench.folder), "--json"], bench.dag) == 1
+    faults = json.loads(capsys.readouterr().out)["faults"]
+    assert [(fault["kind"], fault["what"]) for fault in faults] == [
+        ("changed", "capture 3.txt has other content"),
+        ("changed", "capture 4.txt is missing"),
+        ("changed", "capture 9.txt is new"),
+    ]
+
+
+def test_a_result_that_left_the_store(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in (bench.store / "total").iterdir():
+        folder.rename(bench.root / "away")
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 1
+    assert "total        it is no longer in the store" in capsys.readouterr().out

@@ -1,0 +1,72 @@
+"""Image files that cannot be, or that would take all memory."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cleargs.errors import InputError
+from cleargs.media import MAX_PIXELS
+from cleargs.media.header import PNG, image_size
+from cleargs.media.image import read_mask, read_rgb
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def bomb(side: int) -> bytes:
+    """A small PNG of a huge size."""
+    header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(64 * (side + 1)), 9)
+    return PNG + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif", ".bmp"])
+@pytest.mark.parametrize("shape", [(3, 5, 3), (300, 200), (1, 1, 3)])
+def test_sizes_are_read_from_the_first_bytes(suffix: str, shape: tuple[int, ...]) -> None:
+    ok, data = cv2.imencode(suffix, np.full(shape, 7, np.uint8))
+    assert ok and image_size(data.tobytes()) == (shape[1], shape[0])
+
+
+def test_lossy_and_turned_files_state_their_size() -> None:
+    picture = np.zeros((40, 60, 3), np.uint8)
+    for flags in ([cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]):
+        assert image_size(cv2.imencode(".jpg", picture, flags)[1].tobytes()) == (60, 40)
+    lossy = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, 50])[1]
+    assert image_size(lossy.tobytes()) == (60, 40)
+
+
+def test_an_image_bomb_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "small.png"
+    path.write_bytes(bomb(32_000))
+    assert path.stat().st_size < 2**20
+    with pytest.raises(InputError, match=f"32000x32000 pixels; at most {MAX_PIXELS}"):
+        read_rgb(path)
+    with pytest.raises(InputError, match="32000x32000"):
+        read_mask(path)
+
+
+@pytest.mark.parametrize("what", ["fifo", "device", "folder", "nothing"])
+def test_only_regular_files_are_images(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "x.png"
+    if what == "fifo":
+        os.mkfifo(path)
+    elif what == "device":
+        path.symlink_to("/dev/zero")
+    elif what == "folder":
+        path.mkdir()
+    with pytest.raises(InputError, match="cannot read"):
+        read_rgb(path)
+
+
+def test_a_link_to_an_image_is_an_image(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 6, 3), np.uint8))
+    (tmp_path / "b.png").symlink_to("a.png")
+    assert read_rgb(tmp_path / "b.png").shape == (4, 6, 3)

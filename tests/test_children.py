@@ -1,0 +1,52 @@
+"""Child processes never import what lies in the working folder."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import cleargs
+from cleargs.batch.prepare import WATCHER
+from cleargs.bench.memory import peak_memory
+from cleargs.capture.child import run_child
+from cleargs.children import module_command
+from cleargs.errors import StageError
+from cleargs.progress import SilentReporter
+
+HOSTILE = ["pycolmap.py", "json.py", "numpy.py", "cleargs/__init__.py"]
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Path:
+    """A working folder with a module that leaves a mark when it is imported; returns the mark."""
+    mark = tmp_path / "imported"
+    module = tmp_path / "capture" / request.param
+    module.parent.mkdir(parents=True)
+    module.write_text(f"open({str(mark)!r}, 'w').close()\nraise SystemExit(9)\n")
+    monkeypatch.chdir(tmp_path / "capture")
+    return mark
+
+
+@pytest.mark.parametrize("trap", HOSTILE, indirect=True)
+def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: Path) -> None:
+    with pytest.raises(StageError):  # there is no such job, which the child only finds out when it runs
+        run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", 1, SilentReporter())
+    assert "no.json" in (tmp_path / "log").read_text()
+    subprocess.run(WATCHER, stderr=subprocess.DEVNULL, check=False)
+    subprocess.run([*module_command("cleargs.bench.memory")], stderr=subprocess.DEVNULL, check=False)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("trap", ["json.py"], indirect=True)
+def test_the_measured_child_imports_nothing_from_the_working_folder(trap: Path) -> None:
+    peak_memory(10, 16, 16, 1.0)
+    assert not trap.exists()
+
+
+def test_every_module_is_started_by_module_command() -> None:
+    for file in Path(cleargs.__file__).parent.rglob("*.py"):
+        if file.name != "children.py":
+            assert not re.search(r"sys\.executable[^\n]*\"-m\"", file.read_text()), file
