@@ -35,6 +35,9 @@ force_help = "Make the stage again, even if its results are there."
 partial_option = click.option(
     "--allow-partial", is_flag=True, help="Go on after a stage that is done only in part."
 )
+stale_option = click.option(
+    "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
+)
 run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
 
 

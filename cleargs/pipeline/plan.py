@@ -80,16 +80,8 @@ class Planner:
         Raises InputError when an external (the capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
-        origins: Origins = {}
-        inputs: dict[str, dict[str, str | None]] = {}
-        for upstream, paths in stage.INPUTS.items():
-            inputs[upstream] = {}
-            for path in paths:
-                files = done[upstream].under(path)
-                origins[f"{upstream}/{path}"] = files
-                inputs[upstream][path] = tree_digest(files) if files else None
-        external_files = dict(stage.externals(config, self.run.source))
-        digests = self._external_digests(external_files)
+        inputs, origins = self.inputs(name, done)
+        digests = self.external_digests(name)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
@@ -112,10 +104,31 @@ class Planner:
                 )
             )
         )
-        return Recipe(parts, origins, external_files, folders, inherited)
+        return Recipe(parts, origins, self._externals(name), folders, inherited)
 
-    def _external_digests(self, places: Mapping[str, Path]) -> dict[str, dict[str, str]]:
-        """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
+    def inputs(
+        self, name: str, done: Mapping[str, Manifest]
+    ) -> tuple[dict[str, dict[str, str | None]], Origins]:
+        """Digests of what ``name`` reads of the stages before it, and those of the single files."""
+        origins: Origins = {}
+        inputs: dict[str, dict[str, str | None]] = {}
+        for upstream, paths in self.dag.load(name).INPUTS.items():
+            inputs[upstream] = {}
+            for path in paths:
+                files = done[upstream].under(path)
+                origins[f"{upstream}/{path}"] = files
+                inputs[upstream][path] = tree_digest(files) if files else None
+        return inputs, origins
+
+    def _externals(self, name: str) -> Mapping[str, Path]:
+        return self.dag.load(name).externals(self.run.config.sections[name], self.run.source)
+
+    def external_digests(self, name: str) -> dict[str, dict[str, str]]:
+        """Role -> relative path -> digest of what ``name`` reads outside the store.
+
+        Raises InputError when one cannot be read or holds the run.
+        """
+        places = self._externals(name)
         hint = "choose a folder beside the input with -o"
         if self.run.folder == self.run.source:
             raise InputError(f"the run folder {self.run.folder} is the input itself", hint=hint)
@@ -143,9 +156,8 @@ class Planner:
             if linked_manifest(self.run.folder, upstream) is not None
         }
         nowhere = self.store.root / "work" / "estimate"
-        config = self.run.config.sections[name]
-        externals = stage.externals(config, self.run.source)
-        return stage.estimate(self.context(name, inputs, externals, nowhere / "out", nowhere / "checkpoints"))
+        out, checkpoints = nowhere / "out", nowhere / "checkpoints"
+        return stage.estimate(self.context(name, inputs, self._externals(name), out, checkpoints))
 
     def context(
         self,
@@ -180,8 +192,7 @@ class Planner:
         for name in self.dag.until(until):
             waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
             if waits_for:
-                stage = self.dag.load(name)
-                self._external_digests(stage.externals(self.run.config.sections[name], self.run.source))
+                self.external_digests(name)
                 reason = f"waits for {', '.join(waits_for)}"
                 plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
                 continue

@@ -140,7 +140,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
         (["run", ".", "-o", "r", "--workflow", "fast"], 2, "there is no workflow 'fast'", "choose default"),
         (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
         (["explain", "nowhere"], 2, "is no run", "cleargs run INPUT"),
-        (["show", "nowhere"], 2, "is no run", "cleargs run -o"),
+        (["show", "nowhere"], 2, "is no run", "cleargs run INPUT"),
         (["gc"], 2, "neither a run nor a store", "--store"),
         (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "the stages are count, square, total"),
     ],
