@@ -62,14 +62,17 @@ def threads_or_all(threads: int | None) -> int:
     return threads or len(os.sched_getaffinity(0))
 
 
-def resolve_device(choice: DeviceChoice) -> Device:
+def resolve_device(choice: DeviceChoice, say: Callable[[str], None] | None = None) -> Device:
     """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
 
-    Raises InputError when ``cuda`` is asked for and cannot be had.
+    Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
+    cannot be had.
     """
+    obstacle = None if choice == "cpu" else cuda_obstacle()
     if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
+        if choice == "auto" and obstacle is None and say is not None:
+            say("there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does")
         return "cpu"
-    obstacle = cuda_obstacle()
     if obstacle is not None:
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
     return "cuda"

@@ -174,8 +174,8 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
 def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     """How many views of ``reference`` show frames that the scene of ``stage`` was trained on.
 
-    These have the stem and about the pose of one. None where nothing is known of them. The frames are the rows
-    of the scene's exposure table, as long as RUN/ingest still has the images that it was made from.
+    These have the stem and about the pose of one. None where nothing is known of them. The frames are the
+    rows of the scene's exposure table, as long as RUN/ingest still has the images that it was made from.
     """
     made, ingest = linked_manifest(run, stage), linked_manifest(run, "ingest")
     if made is None or ingest is None:

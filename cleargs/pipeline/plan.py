@@ -18,6 +18,9 @@ from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
 
+NOT_MADE = "not made yet"
+"""Why the results of a stage are not there that the run never had."""
+
 Origins = dict[str, dict[str, str]]
 
 State = Literal["hit", "partial", "miss", "waits"]
@@ -143,7 +146,7 @@ class Planner:
             return (f"damaged: {entry.damage}",)
         before = linked_manifest(self.run.folder, recipe.parts.stage)
         if before is None:
-            return ("not made yet",)
+            return (NOT_MADE,)
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
@@ -210,6 +213,17 @@ class Planner:
                 done[name] = usable
                 plans.append(StagePlan(name, "hit", (), None, recipe, usable))
         return plans
+
+
+def redo_lines(plans: list[StagePlan]) -> list[str]:
+    """What of an existing run would be made again, and why; none where nothing is there yet."""
+    lines = [
+        f"{plan.stage} is made again: {'; '.join(plan.reasons)}"
+        for plan in plans
+        if plan.state in ("miss", "partial") and plan.reasons != (NOT_MADE,)
+    ]
+    after = [plan.stage for plan in plans if plan.state == "waits"]
+    return [*lines, f"then {', '.join(after)}"] if lines and after else lines
 
 
 def cost_line(plans: list[StagePlan]) -> str:

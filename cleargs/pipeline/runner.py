@@ -21,8 +21,8 @@ from cleargs.pipeline.manifest import (
     versions,
     write_manifest,
 )
-from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line
-from cleargs.pipeline.run_file import RUN_FILE, Run, noted_source, write_run_file
+from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line, redo_lines
+from cleargs.pipeline.run_file import RUN_FILE, Run, noted_place, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
@@ -59,9 +59,9 @@ class Runner:
         forced = tuple(self.dag.check(name) for name in force)
         plans = self.planner.plan(until, forced)
         check_disk(plans, self.store.root)
-        line = cost_line(plans)
-        if line:
-            self.reporter.info(line)
+        for line in (*redo_lines(plans), cost_line(plans)):
+            if line:
+                self.reporter.info(line)
         write_run_file(self.run)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
@@ -218,7 +218,7 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
 
     A capture that moved is the same when its content is.
     """
-    before = noted_source(run.folder)
+    before = noted_place(run.folder).source
     if before is None or before == run.source:
         return
     first = dag.names[0]

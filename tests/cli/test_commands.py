@@ -60,6 +60,76 @@ def test_run_twice(shell: Shell) -> None:
     assert code == 0 and out.count("already there") == 3 and err == ""
 
 
+def again(shell: Shell, *arguments: str) -> tuple[int, str, str]:
+    """``cleargs run`` on the same folder without any settings."""
+    return shell("run", str(shell.bench.capture), "-o", str(shell.bench.folder), *arguments)
+
+
+def test_an_existing_run_keeps_its_settings_and_says_so(shell: Shell) -> None:
+    shell.run("--set", "square.power=3", "--seed", "5")
+    shell.bench.work_done()
+    code, _, err = again(shell)
+    assert code == 0 and shell.bench.work_done() == []
+    assert "square.power=3" in err and "seed=5" in err and "--reset" in err
+    again(shell, "--set", "count.limit=4")
+    assert (shell.bench.folder / "total" / "total.txt").read_text() == "plain 36.0 5", "0 + 1 + 8 + 27"
+    assert shell("explain", str(shell.bench.folder))[1].count("hit") == 3
+
+
+def test_reset_and_workflow_start_from_the_recipe(shell: Shell) -> None:
+    shell.run("--set", "square.power=3")
+    shell.run("--set", "total.offset=1")
+    total = shell.bench.folder / "total" / "total.txt"
+    assert total.read_text() == "plain 56.0 0", "an explicit recipe forgets the power"
+    code, _, err = again(shell, "--reset", "--workflow", shell.recipe)
+    assert code == 0 and total.read_text() == "plain 55.0 0" and "--reset" not in err
+
+
+def test_run_says_what_it_will_redo_before_it_begins(shell: Shell) -> None:
+    assert "made again" not in shell.run()[2]
+    _, _, err = again(shell, "--set", "square.power=3")
+    lines = err.splitlines()
+    assert lines[0] == "square is made again: setting square.power: 2 -> 3"
+    assert lines[1] == "then total"
+    assert lines[2].startswith("expected about") and lines[3].startswith("square: starts")
+
+
+def test_an_existing_run_keeps_its_store(shell: Shell, tmp_path: Path) -> None:
+    shell.run("--store", str(tmp_path / "shared"))
+    shell.bench.work_done()
+    assert again(shell)[0] == 0 and shell.bench.work_done() == []
+    assert not shell.bench.store.exists()
+
+
+def test_settings_that_cannot_be_kept(shell: Shell) -> None:
+    shell.run()
+    for text in ("[half", "[square]\npowre = 3\n"):
+        (shell.bench.folder / "run.toml").write_text(text)
+        code, _, err = again(shell)
+        assert code == 2 and "--reset" in err.splitlines()[-1]
+
+
+def test_settings_lists_what_the_models_say(shell: Shell) -> None:
+    found = json.loads(shell("settings", "count", "--json")[1])
+    assert found[0] == {
+        "name": "count.limit",
+        "default": 100,
+        "allowed": "a whole number, at least 1 and at most 1000",
+        "meaning": "at most so many numbers",
+    }
+    assert [setting["name"] for setting in found][-1] == "count.inner.depth"
+    code, out, _ = shell("settings")
+    assert code == 0 and "at most so many numbers" in out and "power" in out and "offset" in out
+    assert shell("settings", "cuont")[2].endswith("hint: did you mean count?\n")
+
+
+def test_the_page_of_settings_is_current(capsys: pytest.CaptureFixture[str]) -> None:
+    """Made anew by: cleargs settings --markdown > docs/settings.md"""
+    assert invoke(["settings", "--markdown"]) == 0
+    page = Path(__file__).parents[2] / "docs" / "settings.md"
+    assert capsys.readouterr().out == page.read_text(encoding="utf-8")
+
+
 def test_run_json_is_json_and_nothing_else(shell: Shell) -> None:
     code, out, _ = shell.run("--json")
     stages = json.loads(out)
