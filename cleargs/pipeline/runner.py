@@ -157,8 +157,13 @@ class Runner:
         work = self.store.open_work(recipe.key, fresh=forced, entry=entry)
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
         started, clock = datetime.now(UTC), time.monotonic()
-        result = stage.run(context)
-        seconds = time.monotonic() - clock
+        earlier = work.seconds
+        try:
+            result = stage.run(context)
+        except BaseException:  # an interruption too: what it had done counts when it goes on
+            work.note_seconds(earlier + time.monotonic() - clock)
+            raise
+        seconds = earlier + time.monotonic() - clock
         if not result.missing:
             absent = [output for output in stage.OUTPUTS if not (work.out / output).exists()]
             if absent:

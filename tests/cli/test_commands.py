@@ -8,13 +8,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Literal
 
 import pyarrow as pa
 import pytest
 from toy import Bench
 
 from cleargs.cli.main import COMMANDS, explanation, invoke
+from cleargs.cli.outcome import print_outcomes
+from cleargs.cli.progress import LineTask
 from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.pipeline.keys import KeyParts
+from cleargs.pipeline.manifest import FileRecord, Manifest
+from cleargs.pipeline.runner import Outcome
 from cleargs.tables import column
 
 
@@ -54,10 +60,11 @@ def shell(
 def test_run_twice(shell: Shell) -> None:
     code, out, err = shell.run()
     assert code == 0
-    assert "total        made in" in out and "results:" in out
+    assert out.startswith(f"results: {shell.bench.folder}/total\n") and "time: " in out
+    assert f"next: cleargs show {shell.bench.folder}\n" in out
     assert "expected about" in err and "square: starts (not made yet)" in err
     code, out, err = shell.run()
-    assert code == 0 and out.count("already there") == 3 and err == ""
+    assert code == 0 and "already there: count, square, total\n" in out and err == ""
 
 
 def again(shell: Shell, *arguments: str) -> tuple[int, str, str]:
@@ -190,7 +197,7 @@ def test_gc(shell: Shell) -> None:
     assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
     shell("gc", folder)
     assert not any(Path(item["folder"]).exists() for item in garbage)
-    assert shell.run()[1].count("already there") == 3
+    assert "already there: count, square, total" in shell.run()[1]
 
 
 def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -228,7 +235,7 @@ def test_damaged_run_file_is_written_anew(shell: Shell) -> None:
     (shell.bench.folder / "run.toml").write_text("[half")
     assert shell("explain", str(shell.bench.folder))[0] == 2
     code, out, _ = shell.run()
-    assert code == 0 and out.count("already there") == 3
+    assert code == 0 and "already there: count, square, total" in out
     assert shell("explain", str(shell.bench.folder))[0] == 0
 
 
@@ -346,3 +353,60 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     )
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
+
+
+def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def outcome(stage: str, how: Literal["found", "made"], files: list[str], **summary: object) -> Outcome:
+        parts = KeyParts(
+            stage=stage, version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
+        )
+        manifest = Manifest(
+            stage=stage,
+            key="",
+            status="complete",
+            missing=(),
+            inherited=(),
+            parts=parts,
+            origins={},
+            files={name: FileRecord(size=1, digest="") for name in files},
+            digest="",
+            versions={},
+            started="",
+            seconds=90.0,
+            device="cpu",
+            summary=summary,
+        )
+        return Outcome(stage, how, manifest, tmp_path)
+
+    held_back = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
+    outcomes = [
+        outcome("ingest", "found", [], frames=24, registered=22, test=0),
+        outcome("rva", "found", [], roles={"strong": 7}),
+        outcome("g0", "made", ["scene.ply"], psnr_active=24.0, views=22),
+        outcome("rivr", "made", ["scene.ply", "candidates.png"], held_back=held_back),
+        outcome("consolidate", "made", ["scene.ply", "before_after.png"], repairs=11, held_back=held_back),
+    ]
+    run = tmp_path / "my room"
+    print_outcomes(outcomes, run)
+    assert capsys.readouterr().out.splitlines() == [
+        f"scene: {run}/consolidate/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
+        "quality: PSNR 23.6 dB (first scene 22.6) on 2 good frames left unrepaired; trained on, "
+        "so unseen views are worse",
+        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); already there: ingest, rva",
+        f"look at: {run}/consolidate/before_after.png",
+        f"next: cleargs export '{run}' -o 'my room.ply'",
+    ]
+
+
+def test_the_time_left_counts_from_the_first_step_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
+    clock = [0.0]
+    monkeypatch.setattr("cleargs.cli.progress.time.monotonic", lambda: clock[0])
+    task = LineTask("G0", 1000)
+    for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
+        clock[0] = now
+        task.update(done=done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left"]
