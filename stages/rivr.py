@@ -55,10 +55,10 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s, making and scoring candidates 2 s, a
     training step 0.3 s (two cores, the embedded models)."""
-    from cleargs.rivr.cost import capture_size
+    from cleargs.capture.cost import capture_size, pace
 
     config = context.config
-    frames, megapixels = capture_size(context.inputs.get("ingest"))
+    frames, megapixels = capture_size(context)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     seconds = megapixels * (
@@ -66,7 +66,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
         + 0.3 * config.rounds * config.distil.steps
     )
     return Estimate(
-        minutes=seconds / 60.0,
+        minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + config.distil.cache_mb / 1024.0,
         disk_gb=0.02 * megapixels * frames * (config.rounds + 1),
     )

@@ -29,6 +29,22 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of the image in ``path``, as it is stored, from its header alone.
+
+    Raises InputError when there is no image.
+    """
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()  # else it is told on stderr at the end
+        raise InputError(f"{path} is not an image that can be read", hint="convert it to JPEG or PNG")
+    spec = source.spec()
+    source.close()
+    return spec.width, spec.height
+
+
 def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
     """The image in ``path`` as float32 sRGB in [0, 1]. Raises InputError like `read_rgb`."""
     return read_rgb(path).astype(np.float32) / np.float32(255)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,6 +76,7 @@ class Planner:
     store: Store
     threads: int
     reporter: Reporter
+    _estimates: dict[tuple[str, tuple[str, ...] | None], Estimate] = field(default_factory=dict, repr=False)
 
     def recipe(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
         """What ``name`` is made from, given the manifests of the stages before it.
@@ -150,17 +151,26 @@ class Planner:
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
-    def estimate(self, name: str) -> Estimate:
-        """Rough cost of ``name``, from its settings and what exists of its inputs, older ones included."""
+    def estimate(self, name: str, done: Mapping[str, Manifest] | None = None) -> Estimate:
+        """Rough cost of ``name``, from its settings, the finished stages before it (without ``done``: those
+        that the run shows), and what the others expect."""
+        known = (name, None if done is None else tuple(done))
+        if known in self._estimates:
+            return self._estimates[known]
         stage = self.dag.load(name)
-        inputs = {
-            upstream: (self.run.folder / upstream).resolve()
-            for upstream in stage.INPUTS
-            if linked_manifest(self.run.folder, upstream) is not None
-        }
+        inputs, expected = {}, {}
+        for upstream in stage.INPUTS:
+            if done is not None and upstream in done:
+                inputs[upstream] = self.store.folder(upstream, done[upstream].key)
+            elif done is None and linked_manifest(self.run.folder, upstream) is not None:
+                inputs[upstream] = (self.run.folder / upstream).resolve()
+            else:
+                expected[upstream] = self.estimate(upstream, done)
         nowhere = self.store.root / "work" / "estimate"
         out, checkpoints = nowhere / "out", nowhere / "checkpoints"
-        return stage.estimate(self.context(name, inputs, self._externals(name), out, checkpoints))
+        context = self.context(name, inputs, self._externals(name), out, checkpoints)
+        self._estimates[known] = stage.estimate(replace(context, expected=expected))
+        return self._estimates[known]
 
     def context(
         self,
@@ -197,18 +207,18 @@ class Planner:
             if waits_for:
                 self.external_digests(name)
                 reason = f"waits for {', '.join(waits_for)}"
-                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
+                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name, done)))
                 continue
             recipe = self.recipe(name, done)
             entry = self.store.find(name, recipe.key)
             usable = entry.usable if entry is not None else None
             if name in force:
-                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name), recipe))
+                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name, done), recipe))
             elif usable is None:
                 reasons = self.reasons(recipe, entry)
-                plans.append(StagePlan(name, "miss", reasons, self.estimate(name), recipe))
+                plans.append(StagePlan(name, "miss", reasons, self.estimate(name, done), recipe))
             elif usable.missing:
-                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name), recipe))
+                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), recipe))
             else:
                 done[name] = usable
                 plans.append(StagePlan(name, "hit", (), None, recipe, usable))
@@ -242,8 +252,9 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
     """Raise StoreError when the disk of ``store`` has less free space than the stages to run will fill."""
     needed = sum(plan.estimate.disk_gb for plan in plans if plan.estimate is not None)
     place = next(folder for folder in (store, *store.parents) if folder.exists())
-    free = shutil.disk_usage(place).free / 1e9
-    if needed > free:
+    disk = shutil.disk_usage(place)
+    free = disk.free / 1e9
+    if disk.total and needed > free:  # a place without a disk (/proc) is told of when it is written to
         raise StoreError(
             f"the run needs about {needed:.1f} GB of disk, {free:.1f} GB are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",

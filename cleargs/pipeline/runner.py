@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -21,7 +21,7 @@ from cleargs.pipeline.manifest import (
     versions,
     write_manifest,
 )
-from cleargs.pipeline.plan import Planner, Recipe, check_disk, cost_line, redo_lines
+from cleargs.pipeline.plan import Planner, Recipe, StagePlan, check_disk, cost_line, redo_lines
 from cleargs.pipeline.run_file import RUN_FILE, Run, noted_place, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
@@ -75,9 +75,21 @@ class Runner:
                     outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
+                if name == self.dag.names[0] and outcome.how == "made":
+                    self._revise(plans[1:], done)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
         return outcomes
+
+    def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
+        """Say what the stages to come cost, now that the capture is known."""
+        costs = [
+            replace(plan, estimate=self.planner.estimate(plan.stage, done))
+            for plan in plans
+            if plan.estimate is not None
+        ]
+        if line := cost_line(costs):
+            self.reporter.info(f"now {line}")
 
     def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> Outcome:
         """Bring one stage to a finished folder, from finished stages before it.

@@ -67,7 +67,7 @@ def run_round(
             if row is None:
                 rendered = render(view)
                 row, image = repair(number, view, exr, rendered, restore(view, rendered), rules)
-                write_exr(out / exr, image)
+                write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
             task.update(done=len(rows), note=_tally(rows))
     return rows

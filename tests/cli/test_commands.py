@@ -101,6 +101,24 @@ def test_run_says_what_it_will_redo_before_it_begins(shell: Shell) -> None:
     assert lines[2].startswith("expected about") and lines[3].startswith("square: starts")
 
 
+def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
+    _, _, err = shell.run("--set", "count.limit=3")
+    first, revised = (line for line in err.splitlines() if "expected about" in line)
+    assert first == (
+        "expected about 6.4 min: count 0.1 min 0.1 GB, disk 0.0 GB; square 6.0 min 0.1 GB, disk 0.0 GB; "
+        "total 0.3 min 0.1 GB, disk 0.0 GB"
+    )
+    assert revised.startswith("now expected about 3.3 min: square 3.0 min")
+    assert err.index(revised) > err.index("count: starts")
+
+
+def test_a_place_that_is_no_disk_is_named(shell: Shell) -> None:
+    code, _, err = shell("run", str(shell.bench.capture), "-o", "/proc/x", "--workflow", shell.recipe)
+    assert (
+        code == 1 and "cannot write /proc/x" in err and "GB" not in err.splitlines()[0].partition("error")[2]
+    )
+
+
 def test_an_existing_run_keeps_its_store(shell: Shell, tmp_path: Path) -> None:
     shell.run("--store", str(tmp_path / "shared"))
     shell.bench.work_done()

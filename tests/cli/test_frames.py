@@ -55,10 +55,8 @@ def test_the_worst_cue_of_both_kinds() -> None:
 
 
 def test_repairs_stand_beside_their_frames() -> None:
-    def chosen(
-        number: int, layer: str, reason: str = "primary score", accepted: bool = True
-    ) -> dict[str, Any]:
-        return {"frame_id": 3, "round": number, "chosen": layer, "reason": reason, "accepted": accepted}
+    def chosen(number: int, layer: str, why: str = "primary score", accepted: bool = True) -> dict[str, Any]:
+        return {"frame_id": 3, "round": number, "chosen": layer, "reason": why, "accepted": accepted}
 
     frames = [row("strong", 0.9, 0.1)]
 
