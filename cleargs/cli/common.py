@@ -59,7 +59,14 @@ def work_options(command: F) -> F:
 
 def threads_or_all(threads: int | None) -> int:
     """The given number of threads, or that of the cores which this process may use."""
-    return threads or len(os.sched_getaffinity(0))
+    return threads or usable_cores()
+
+
+def usable_cores() -> int:
+    """The CPU cores that this process may use, as far as the system says."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def resolve_device(choice: DeviceChoice, say: Callable[[str], None] | None = None) -> Device:

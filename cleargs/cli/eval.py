@@ -15,6 +15,7 @@ from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import file_digest
 from cleargs.pipeline.freshness import require_fresh
+from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:
@@ -204,6 +205,11 @@ def eval(
         for line in filter(None, (_seen_before(report), warning)):
             click.echo(line)
         _print(report, per_image, output)
+        if run is not None and not align_colour and _exposure_counts(run):
+            click.echo(
+                "the exposure of each reference counts in these figures: --align-colour leaves it out, as "
+                "the training did"
+            )
 
 
 def _older(run: Path, path: Path) -> Report:
@@ -218,6 +224,12 @@ def _older(run: Path, path: Path) -> Report:
     digests = {subject: file_digest(scene) for subject, scene in scenes.items() if scene.is_file()}
     kept = (evaluation for evaluation in found if evaluation.scene == digests.get(evaluation.subject))
     return Report(evaluations=tuple(kept))
+
+
+def _exposure_counts(run: Path) -> bool:
+    """Whether the scene was trained with exposure compensation, which an evaluation leaves out."""
+    g0 = linked_manifest(run, "g0")
+    return g0 is not None and bool(g0.summary.get("exposure"))
 
 
 def _seen_before(report: Report) -> str:

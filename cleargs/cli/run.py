@@ -104,6 +104,12 @@ def run(
     """
     if not source.exists():
         raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
+    if (source / RUN_FILE).is_file():
+        noted = noted_place(source).source
+        raise InputError(
+            f"{source} is a run, not a capture",
+            hint=f"give the capture that it was made from{f': {noted}' if noted else ''}",
+        )
     folder = folder.absolute()
     kept = None if reset or workflow is not None else _kept(dag, folder)
     config = load_config(dag, workflow or "default" if kept is None else kept, overrides, seed)

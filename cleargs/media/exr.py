@@ -1,9 +1,9 @@
 """EXR files of several named RGB layers: scene-linear, Rec.709 primaries, half floats, zip.
 
 Layer ``render`` is the channels ``render.R``, ``render.G``, ``render.B``. OpenEXR stores channels in
-alphabetical order, so they are found by name. One of the layers may be there again as the plain channels R, G, B,
-which programs show that know nothing of layers. Equal layers and attributes give equal bytes: no date is
-stored.
+alphabetical order, so they are found by name. One of the layers may be there again as the plain channels R,
+G, B, which programs show that know nothing of layers. Equal layers and attributes give equal bytes: no date
+is stored.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def from_layer(layer: Layer) -> Image:
 def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> None:
     """Write the layers (all of one size) and attributes to ``path``, atomically.
 
-    The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError when the disk is full or not writable.
+    The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError when the disk is full
+    or not writable.
     """
     plain = [] if shown is None else [image.layers[shown]]
     pixels = np.concatenate([*plain, *image.layers.values()], axis=2)

@@ -16,6 +16,8 @@ from cleargs.files import write_bytes
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 """File endings (lower case) taken for images."""
 
+_OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
+
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -56,6 +58,20 @@ def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     return np.where(grey > 127, np.uint8(255), np.uint8(0))
 
 
+def read_alpha(path: Path) -> NDArray[np.uint8] | None:  # [H, W]
+    """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
+
+    None where it is opaque all over. Raises InputError like `read_rgb`.
+    """
+    if path.suffix.lower() in _OPAQUE:
+        return None
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        return None
+    opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
+    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
+
+
 def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
     """Write an RGB image atomically in the format of its ending. Floats are sRGB, clipped to [0, 1].
 
@@ -75,7 +91,7 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
+def _decode(path: Path, flags: int) -> NDArray[Any]:
     """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
@@ -95,7 +111,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
         raise InputError(
             f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"
         )
-    return np.asarray(image, np.uint8)
+    return np.asarray(image)
 
 
 def _encode(path: Path, image: NDArray[np.uint8]) -> None:

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 from toy import Bench
 
+from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.outcome import print_outcomes
 from cleargs.cli.progress import LineTask
@@ -114,9 +115,7 @@ def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
 
 def test_a_place_that_is_no_disk_is_named(shell: Shell) -> None:
     code, _, err = shell("run", str(shell.bench.capture), "-o", "/proc/x", "--workflow", shell.recipe)
-    assert (
-        code == 1 and "cannot write /proc/x" in err and "GB" not in err.splitlines()[0].partition("error")[2]
-    )
+    assert code == 1 and "error: cannot write /proc/x" in err and "are free" not in err
 
 
 def test_an_existing_run_keeps_its_store(shell: Shell, tmp_path: Path) -> None:
@@ -428,3 +427,25 @@ def test_the_time_left_counts_from_the_first_step_on(
         task.update(done=done)
     lines = capsys.readouterr().err.splitlines()
     assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left"]
+
+
+def test_a_gpu_that_is_not_used_is_told_of(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("cleargs.cli.common.cuda_obstacle", lambda: None)
+    assert "--device cuda" in shell.run()[2]
+    assert "--device cuda" not in shell.run("--device", "cpu")[2]
+
+
+def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("os.cpu_count", lambda: 6)
+    assert threads_or_all(None) == 6
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert threads_or_all(None) == 1
+
+
+def test_a_run_is_no_capture(shell: Shell) -> None:
+    shell.run()
+    code, _, err = shell("run", str(shell.bench.folder), "-o", str(shell.bench.root / "other"))
+    assert code == 2 and "is a run, not a capture" in err and str(shell.bench.capture) in err
