@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -13,7 +14,7 @@ from cleargs.cli.summary import describe_table, sampled_rows
 from cleargs.cli.words import headlines, in_words, text_of
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import Reasons, require_fresh, stale_stages
+from cleargs.pipeline.freshness import Reasons, stale_stages
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import read_run_file
 
@@ -89,7 +90,12 @@ def show(
     if manifest is None:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs explain {run}")
     if plot:
-        require_fresh(dag, run, ("ingest", "rva"))
+        for name in ("ingest", "rva"):
+            if name in stale:
+                raise InputError(
+                    f"{name} is stale: {'; '.join(stale[name])}",
+                    hint=f"see cleargs explain {quote(str(run))}",
+                )
         picture = _plot(run, output or run / PLOT)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
@@ -127,7 +133,7 @@ def show(
         if wanted and table.num_rows:
             _print_rows(console, table, wanted)
     if not columns:
-        console.print(f"\nevery column: cleargs show {run} {stage} --columns", markup=False)
+        console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns", markup=False)
 
 
 def _plot(run: Path, picture: Path) -> Path:

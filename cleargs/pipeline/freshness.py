@@ -1,7 +1,7 @@
 """Whether what a run shows was made with the run's settings and inputs: one answer for all who read results.
 
 Stale is a finished stage that was made with other settings, another seed, other files of the capture or other
-model weights than the run has now, or from a stage that is stale or not there. A newer version of the program
+model weights than the run has now, or from a stage that is stale or not there; and one without its manifest. A newer version of the program
 or of a library makes nothing stale: `cleargs explain` says what a run would make again for that reason.
 """
 
@@ -31,7 +31,8 @@ def stale_stages(dag: Dag, run: Run) -> dict[str, Reasons]:
     with DigestMemo(run.store / "digests.sqlite") as memo:
         planner = Planner(dag, run, Store(run.store, memo), 1, SilentReporter())
         made = {name: found for name in dag.names if (found := linked_manifest(run.folder, name)) is not None}
-        stale: dict[str, Reasons] = {}
+        unknown = [name for name in dag.names if name not in made and (run.folder / name).exists()]
+        stale: dict[str, Reasons] = dict.fromkeys(unknown, ("its manifest is missing or damaged",))
         for name, manifest in made.items():
             upstream = dag.load(name).INPUTS
             absent = [before for before in upstream if before not in made]

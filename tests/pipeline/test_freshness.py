@@ -77,3 +77,11 @@ def test_a_stage_without_what_it_was_made_from(bench: Bench) -> None:
     bench.run()
     (bench.folder / "count").unlink()
     assert stale(bench)["square"] == ("it was made from count, which is not there",)
+
+
+def test_results_without_their_manifest(bench: Bench) -> None:
+    bench.run()
+    (bench.folder / "total" / "manifest.json").write_text("{")
+    assert stale(bench) == {"total": ("its manifest is missing or damaged",)}
+    with pytest.raises(InputError, match="total is stale"):
+        require_fresh(bench.dag, bench.folder, ("total",))
