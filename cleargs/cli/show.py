@@ -92,10 +92,8 @@ def show(
     if plot:
         for name in ("ingest", "rva"):
             if name in stale:
-                raise InputError(
-                    f"{name} is stale: {'; '.join(stale[name])}",
-                    hint=f"see cleargs explain {quote(str(run))}",
-                )
+                reasons = "; ".join(stale[name])
+                raise InputError(f"{name} is stale: {reasons}", hint=f"see cleargs explain {quote(str(run))}")
         picture = _plot(run, output or run / PLOT)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})

@@ -1,8 +1,9 @@
 """Whether what a run shows was made with the run's settings and inputs: one answer for all who read results.
 
 Stale is a finished stage that was made with other settings, another seed, other files of the capture or other
-model weights than the run has now, or from a stage that is stale or not there; and one without its manifest. A newer version of the program
-or of a library makes nothing stale: `cleargs explain` says what a run would make again for that reason.
+model weights than the run has now, or from a stage that is stale or not there; and one without its manifest.
+A newer version of the program or of a library makes nothing stale: `cleargs explain` says what a run would
+make again for that reason.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def stale_stages(dag: Dag, run: Run) -> dict[str, Reasons]:
             absent = [before for before in upstream if before not in made]
             reasons = [] if absent else _changes(planner, manifest, made)
             reasons += [f"it was made from {before}, which is not there" for before in absent]
-            reasons += [f"it was made from stale {before}" for before in upstream if before in stale]
+            old = [before for before in upstream if before in stale]
+            reasons += [f"it was made from stale {', '.join(old)}"] if old else []
             if reasons:
                 stale[name] = tuple(reasons)
     return stale

@@ -206,6 +206,20 @@ def test_show(shell: Shell) -> None:
     )
 
 
+def test_show_calls_stale_what_is_stale(shell: Shell) -> None:
+    shell.run()
+    again(shell, "--set", "square.power=3", "--until", "count")
+    folder = str(shell.bench.folder)
+    code, out, _ = shell("show", folder)
+    assert code == 0 and "square is stale: setting square.power: 2 -> 3" in out
+    rows = [line.split()[:2] for line in out.splitlines()[1:4]]
+    assert rows == [["count", "complete"], ["square", "stale"], ["total", "stale"]]
+    assert json.loads(shell("show", folder, "--json")[1])["square"]["stale"] == [
+        "setting square.power: 2 -> 3"
+    ]
+    assert "square: stale" in shell("show", folder, "square")[1]
+
+
 def test_gc(shell: Shell) -> None:
     shell.run("--set", "square.power=3")
     shell.run()
