@@ -54,12 +54,12 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
         _work_frame(frame, images / name, masks / f"{name}.png")
         for frame, name in zip(capture.frames, names, strict=True)
     ]
-    if any(frame.masked for frame in prepared):
-        for frame in prepared:  # COLMAP leaves out an image that has none where others have
-            mask = masks / f"{frame.image}.png"
+    if any(made.masked for made in prepared):
+        for made in prepared:  # COLMAP leaves out an image that has none where others have
+            mask = masks / f"{made.image}.png"
             if not mask.is_file():
-                write_mask(mask, np.full((frame.height, frame.width), 255, np.uint8))
-    transparent = sum(frame.masked and frame.source.mask is None for frame in prepared)
+                write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
+    transparent = sum(made.masked and made.source.mask is None for made in prepared)
     if transparent:
         reporter.info(
             f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"

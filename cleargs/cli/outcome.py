@@ -71,7 +71,7 @@ def _extent(summaries: Summaries) -> str:
 def _quality(summaries: Summaries) -> str:
     """What is known of how good the last scene is, and of which frames; "" for nothing."""
     held_back = next(
-        (summary["held_back"] for summary in reversed(summaries.values()) if "held_back" in summary), None
+        (summary["held_back"] for summary in reversed([*summaries.values()]) if "held_back" in summary), None
     )
     if held_back is not None:
         before, after, count = held_back["psnr_before"], held_back["psnr_after"], len(held_back["frames"])
