@@ -65,11 +65,11 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """A training step takes about 0.3 s a megapixel on two cores."""
-    from cleargs.rivr.cost import capture_size
+    from cleargs.capture.cost import capture_size, pace
 
-    _, megapixels = capture_size(context.inputs.get("ingest"))
+    _, megapixels = capture_size(context)
     return Estimate(
-        minutes=0.3 * megapixels * context.config.distil.steps / 60.0,
+        minutes=0.3 * megapixels * context.config.distil.steps * pace(context.threads) / 60.0,
         memory_gb=1.0 + context.config.distil.cache_mb / 1024.0,
         disk_gb=0.2,
     )

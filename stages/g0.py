@@ -39,16 +39,13 @@ def preflight(config: G0Config) -> None:
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel (two cores); memory is the image cache and the kernels' buffers."""
-    config, ingest = context.config, context.inputs.get("ingest", Path())
-    megapixels, count = 0.5, 50
-    if (ingest / "frames.parquet").is_file():
-        from cleargs.capture.tables import load_frames
+    from cleargs.capture.cost import capture_size, pace
 
-        frames = load_frames(ingest)
-        count = len(frames)
-        megapixels = max((frame.width * frame.height for frame in frames), default=0) / 1e6
+    config = context.config
+    count, megapixels = capture_size(context)
     seen = config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share
     seconds = config.steps * (_SECONDS_PER_STEP + _SECONDS_PER_MEGAPIXEL * megapixels * seen)
+    seconds *= pace(context.threads)
     memory = 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
 

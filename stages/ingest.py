@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
 
-VERSION = 3
+VERSION = 4
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
@@ -27,21 +28,33 @@ def preflight(config: IngestConfig) -> None:
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
     """From the number of frames, their size, and the number of pairs to match (measured on two cores)."""
-    from cleargs.capture.sources import open_capture
+    from cleargs.capture.prepare import reduced_size
+    from cleargs.capture.sources import frame_size, open_capture
 
     config = context.config
     capture = open_capture(context.source, config)
     count = len(capture.frames)
+    width, height = frame_size(capture) or (1920, 1080)
+
+    def megapixels_at(long_side: int) -> float:
+        return math.prod(reduced_size(width, height, long_side)) / 1e6
+
     distant = count * (2 * config.overlap + config.loop_candidates)
     pairs = count * (count - 1) / 2 if count < config.exhaustive_below else distant
-    megapixels = 0.65 * (max(config.feature_size, config.max_size) / 1000) ** 2
+    megapixels = megapixels_at(max(config.feature_size, config.max_size))
     found_anew = capture.model is None
     # Seconds of one core: a frame's features, a pair's matches, a frame's share of the mapping.
     parallel = (2.0 * megapixels * count + 0.07 * pairs) if found_anew else 0.0
     alone = count * (0.4 * megapixels + (0.0 if capture.posed else 0.5))
     seconds = parallel / max(1, context.threads) + alone
     disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if found_anew else 0.0)
-    return Estimate(minutes=seconds / 60, memory_gb=0.4 + 0.001 * count, disk_gb=disk)
+    return Estimate(
+        minutes=seconds / 60,
+        memory_gb=0.4 + 0.001 * count,
+        disk_gb=disk,
+        frames=count,
+        megapixels=megapixels_at(config.max_size),
+    )
 
 
 def run(context: StageContext[IngestConfig]) -> StageResult:

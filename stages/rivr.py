@@ -77,10 +77,10 @@ def preflight(config: RivrConfig) -> None:
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
     one), making and scoring candidates 2 s, a training step 0.3 s (two cores). Every group leaves a scene."""
-    from cleargs.rivr.cost import capture_size
+    from cleargs.capture.cost import capture_size, pace
 
     config = context.config
-    frames, megapixels = capture_size(context.inputs.get("ingest"))
+    frames, megapixels = capture_size(context)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
@@ -92,7 +92,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     groups = 1 if config.group is None else -(-frames // config.group)
     scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
-        minutes=seconds / 60.0,
+        minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + config.distil.cache_mb / 1024.0,
         disk_gb=0.02 * megapixels * frames * (config.rounds + 1) + scenes,
     )

@@ -38,10 +38,12 @@ def preflight(config: RvaConfig) -> None:
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
     """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
     config = context.config
-    images = context.inputs.get("ingest", Path()) / "images"
-    frames = sum(1 for _ in images.iterdir()) if images.is_dir() else 0
+    if "ingest" in context.inputs:
+        frames = sum(1 for _ in (context.inputs["ingest"] / "images").iterdir())
+    else:
+        frames = context.expected["ingest"].frames
     if config.evaluator == "statistics":
-        return Estimate(minutes=frames / _FRAMES_PER_MINUTE, memory_gb=0.3, disk_gb=0.001)
+        return Estimate(minutes=frames / (_FRAMES_PER_MINUTE * context.threads), memory_gb=0.3, disk_gb=0.001)
     at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
     folders = externals(config, context.source).values()
     weights = sum(file.stat().st_size for folder in folders for file in folder.glob("*"))

@@ -174,6 +174,9 @@ def test_motion_blur_is_reduced(length: float) -> None:
 def test_missing_file() -> None:
     with pytest.raises(InputError, match="does not exist") as caught:
         load_expert("no/such/model.onnx")
+    with pytest.raises(InputError, match="no restoration expert 'embeded'") as error:
+        expert_path("embeded")
+    assert error.value.hint == "did you mean embedded?"
     assert caught.value.hint
 
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 
@@ -17,6 +21,42 @@ def test_every_package_is_listed() -> None:
     assert sorted(listed) == sorted(
         [".".join(p.parts) for p in own] + ["cleargs.stages", "cleargs.workflows"]
     )
+
+
+def test_every_dependency_is_pinned() -> None:
+    """The lock names all that an installation brings, the dependencies of dependencies too."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    assert all(pin and "*" not in pin for pin in pins.values())
+    missing = needed("cleargs", ("test", "dev")) - {name.lower() for name in pins}
+    assert {name for name in missing if not name.startswith(LEFT_OPEN)} == set()
+
+
+LEFT_OPEN = ("pip", "setuptools", "nvidia-", "cuda-", "triton")
+"""Installers, and what a CUDA build of torch brings."""
+
+
+def needed(distribution: str, extras: tuple[str, ...] = ()) -> set[str]:
+    """All that ``distribution`` with ``extras`` needs here, directly or not, by normal names."""
+    found: set[str] = set()
+    waiting = [(distribution, extras)]
+    seen = set()
+    while waiting:
+        name, wanted = waiting.pop()
+        if (name, wanted) in seen:
+            continue
+        seen.add((name, wanted))
+        try:
+            listed = requires(name) or []
+        except PackageNotFoundError:  # an extra that is not installed
+            continue
+        for text in listed:
+            requirement = Requirement(text)
+            marker = requirement.marker
+            if marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *wanted)):
+                found.add(canonicalize_name(requirement.name))
+                waiting.append((requirement.name, tuple(sorted(requirement.extras))))
+    return found - {"cleargs"}
 
 
 def test_the_splatting_core_needs_no_capture_libraries() -> None:

@@ -41,7 +41,7 @@ class IngestConfig(BaseModel):
         "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"
     )
     shared_camera: bool = Field(
-        True, description="SfM: one camera for all frames; false: a camera a frame, sizes may differ"
+        True, description="SfM: one camera for all frames of a size; false: a camera a frame"
     )
     feature_size: int = Field(
         960, ge=64, description="long side at which features are found, px; never enlarged, at least max_size"

@@ -14,7 +14,7 @@ from cleargs.capture.cameras import Camera
 from cleargs.capture.sources import Capture, SourceFrame
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import read_alpha, read_mask, read_rgb, write_mask, write_rgb
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 
@@ -36,8 +36,8 @@ class WorkFrame:
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
-    """Write ``folder/images/%06d.png`` and, where there are masks, ``folder/masks/%06d.png.png`` (as COLMAP
-    names them).
+    """Write ``folder/images/%06d.png`` and, where something is masked or transparent,
+    ``folder/masks/%06d.png.png`` (as COLMAP names them).
 
     Reduced by area averaging in sRGB, never enlarged. Frames that a killed run left whole are not made again.
     Raises InputError for unreadable images and for images that do not have their camera's proportions.
@@ -54,10 +54,21 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
                 if not resumable(images / name, reporter):
                     write_rgb(images / name, reduced(_upright(frame), long_side))
                 task.advance()
-    return [
+    prepared = [
         _work_frame(frame, images / name, masks / f"{name}.png", reporter)
         for frame, name in zip(capture.frames, names, strict=True)
     ]
+    if any(made.masked for made in prepared):
+        for made in prepared:  # COLMAP leaves out an image that has none where others have
+            mask = masks / f"{made.image}.png"
+            if not mask.is_file():
+                write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
+    transparent = sum(made.masked and made.source.mask is None for made in prepared)
+    if transparent:
+        reporter.info(
+            f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
+        )
+    return prepared
 
 
 def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
@@ -136,19 +147,22 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
                 hint="give the images that the poses were made from, or set ingest.poses=sfm",
             )
         camera = camera.resized(width, height)
-    if frame.mask is not None and not resumable(mask, reporter, read_mask):
-        stencil = read_mask(frame.mask)
+    stencil = _stencil(frame)
+    if stencil is not None and not resumable(mask, reporter, read_mask):
         # To whole pixels, a mask of one pixel has any proportions.
         coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
         if coarse or not _alike(stencil.shape[1], stencil.shape[0], rgb):
-            what = (
-                f"is far smaller than {frame.name}"
-                if coarse
-                else f"does not have the proportions of {frame.name}"
-            )
+            what = "is far smaller than it" if coarse else "does not have its proportions"
             raise InputError(
-                f"the mask {frame.mask.name} {what}",
+                f"the mask of {frame.name} {what}",
                 hint="make masks of the size of their images",
             )
         write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))
-    return WorkFrame(frame, image.name, width, height, frame.mask is not None, camera)
+    return WorkFrame(frame, image.name, width, height, stencil is not None, camera)
+
+
+def _stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
+    """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
+    if frame.mask is not None:
+        return read_mask(frame.mask)
+    return None if frame.pts is not None else read_alpha(frame.path)

@@ -129,19 +129,15 @@ class _Job:
 
 
 def _sfm_job(frames: Sequence[WorkFrame], config: IngestConfig) -> _Job:
-    sizes = sorted({(frame.width, frame.height) for frame in frames})
-    if config.shared_camera and len(sizes) > 1:
-        listed = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
-        raise InputError(
-            f"the images have {len(sizes)} sizes ({listed}): they cannot share one camera",
-            hint="keep the images of one camera and orientation, or set ingest.shared_camera=false",
-        )
-    cameras = [_starting_camera(frame, config) for frame in (frames[:1] if config.shared_camera else frames)]
+    """All frames of one size share a camera; without ``shared_camera`` each has its own."""
+    owners = [f"{frame.width}x{frame.height}" if config.shared_camera else frame.image for frame in frames]
+    numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
+    cameras = [_starting_camera(frames[owners.index(owner)], config) for owner in numbers]
     path = frames[0].source.path
     return _Job(
         names=[frame.image for frame in frames],
         cameras=cameras,
-        camera_of=[0 if config.shared_camera else index for index in range(len(frames))],
+        camera_of=[numbers[owner] for owner in owners],
         poses=None,
         exif_image=str(path.resolve()) if frames[0].source.pts is None else None,
         masked=any(frame.masked for frame in frames),

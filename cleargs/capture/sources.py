@@ -19,7 +19,8 @@ from cleargs.capture.model import SparseModel, read_model
 from cleargs.capture.transforms import read_transforms
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
-from cleargs.media.video import Timeline, read_timeline
+from cleargs.media.image import image_size
+from cleargs.media.video import Timeline, read_timeline, video_size
 
 T = TypeVar("T")
 
@@ -84,6 +85,17 @@ def open_capture(source: Path, config: IngestConfig) -> Capture:
             hint="give more images, or raise ingest.fps",
         )
     return capture
+
+
+def frame_size(capture: Capture) -> tuple[int, int] | None:
+    """Width and height of the first frame by its camera or its file's header; None where neither says."""
+    first = capture.frames[0]
+    if first.camera is not None:
+        return first.camera.width, first.camera.height
+    try:
+        return video_size(first.path) if capture.kind == "video" else image_size(first.path)
+    except InputError:
+        return None
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

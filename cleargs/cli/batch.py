@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,9 +14,16 @@ from cleargs.batch.prepare import Preparation
 from cleargs.batch.scenes import Scene, read_scenes
 from cleargs.batch.sheet import SheetError
 from cleargs.batch.status import SceneState, scene_states
-from cleargs.cli.common import DeviceChoice, json_option, print_json, quiet_option, resolve_device
+from cleargs.cli.common import (
+    DeviceChoice,
+    json_option,
+    print_json,
+    quiet_option,
+    resolve_device,
+    usable_cores,
+)
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import StageError
+from cleargs.errors import InputError, StageError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
 from cleargs.progress import Reporter, Task
@@ -81,12 +87,23 @@ def batch(
     dag.until(until)
     place = profile_folder(profile)
     root = batch_folder(sheet, folder)
-    command = engine_command(root, place, cores=cores or len(os.sched_getaffinity(0)), dry_run=dry_run)
+    command = _engine(root, place, cores or usable_cores(), dry_run=dry_run)
     resolved: Device = "cuda" if device == "cuda" and not is_local(place) else resolve_device(device)
     options = ("--allow-partial",) if allow_partial else ()
     preparation = Preparation(dag, root, resolved, until, options)
     scenes = checked_scenes(sheet, preparation)
     return run_batch(preparation, scenes, command, make_reporter(quiet), dry_run=dry_run, as_json=as_json)
+
+
+def _engine(root: BatchFolder, place: Path, cores: int, *, dry_run: bool) -> list[str]:
+    """The call of Snakemake; empty where it is not installed and nothing is to be run."""
+    try:
+        return engine_command(root, place, cores=cores, dry_run=dry_run)
+    except InputError as error:
+        if not dry_run:
+            raise
+        click.echo(f"note: {error}; {error.hint}", err=True)
+        return []
 
 
 def run_batch(
@@ -103,8 +120,7 @@ def run_batch(
     with only_batch(folder) as lock:
         plan = preparation.prepare(scenes, reporter, dry_run=dry_run)
         if dry_run:
-            code = run_engine(command, folder, lock, lambda: None)
-            if code:
+            if command and run_engine(command, folder, lock, lambda: None):
                 raise StageError(
                     "Snakemake cannot plan the batch", hint=f"see the end of {folder.engine_log}"
                 )

@@ -35,6 +35,9 @@ force_help = "Make the stage again, even if its results are there."
 partial_option = click.option(
     "--allow-partial", is_flag=True, help="Go on after a stage that is done only in part."
 )
+stale_option = click.option(
+    "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
+)
 run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
 
 
@@ -56,17 +59,27 @@ def work_options(command: F) -> F:
 
 def threads_or_all(threads: int | None) -> int:
     """The given number of threads, or that of the cores which this process may use."""
-    return threads or len(os.sched_getaffinity(0))
+    return threads or usable_cores()
 
 
-def resolve_device(choice: DeviceChoice) -> Device:
+def usable_cores() -> int:
+    """The CPU cores that this process may use, as far as the system says."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def resolve_device(choice: DeviceChoice, say: Callable[[str], None] | None = None) -> Device:
     """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
 
-    Raises InputError when ``cuda`` is asked for and cannot be had.
+    Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
+    cannot be had.
     """
+    obstacle = None if choice == "cpu" else cuda_obstacle()
     if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
+        if choice == "auto" and obstacle is None and say is not None:
+            say("there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does")
         return "cpu"
-    obstacle = cuda_obstacle()
     if obstacle is not None:
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
     return "cuda"

@@ -15,6 +15,7 @@ from cleargs.cli.common import (
     print_json,
     quiet_option,
     resolve_device,
+    stale_option,
     threads_or_all,
     work_options,
 )
@@ -24,6 +25,7 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.store import STORE_FOLDER
 
@@ -43,10 +45,12 @@ def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tu
 
 
 def _nets(context: click.Context, parameter: click.Parameter, value: str) -> tuple[LpipsNet, ...]:
+    if value in ("both", "none"):
+        return LPIPS_NETS if value == "both" else ()
     wanted = [part.strip() for part in value.split(",")]
     nets = tuple(net for net in LPIPS_NETS if net in wanted)
     if len(nets) != len(wanted):
-        raise click.BadParameter(f"choose among {', '.join(LPIPS_NETS)}")
+        raise click.BadParameter(f"choose among {', '.join(LPIPS_NETS)}, both and none")
     return nets
 
 
@@ -97,6 +101,7 @@ Examples:
     "--workflow", default="default", show_default=True, metavar="NAME|FILE.toml", help="The recipe."
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@stale_option
 @work_options
 @json_option
 @quiet_option
@@ -112,6 +117,7 @@ def compare(
     lpips: tuple[LpipsNet, ...],
     workflow: str,
     overrides: tuple[str, ...],
+    stale: bool,
     device: DeviceChoice,
     threads: int | None,
     as_json: bool,
@@ -138,6 +144,7 @@ def compare(
     for source in sources:
         if not source.exists():
             raise InputError(f"there is no {source}", hint="give captures or run folders")
+    warnings = list(filter(None, (require_fresh(dag, run, dag.names, stale=stale) for run in runs)))
     chosen = find_variants([name.strip() for name in variants.split(",") if name.strip()])
     out = out.absolute()
     reporter = make_reporter(quiet)
@@ -153,7 +160,8 @@ def compare(
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels
     baselines = BASELINES if not runs else found.variants()[:1]
-    text = _head(chosen if not runs else (), seeds, recipe) + markdown(compared.results, labels, baselines)
+    head = "".join(f"{warning}\n\n" for warning in warnings) + _head(() if runs else chosen, seeds, recipe)
+    text = head + markdown(compared.results, labels, baselines)
     write_bytes(out / "comparison.md", text.encode())
     document = compared.document()
     write_json(out / "comparison.json", document)
@@ -173,7 +181,7 @@ def _head(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> 
     """What the tables were made with."""
     from cleargs.pipeline.manifest import versions
 
-    nets = ", ".join(recipe.options.lpips)
+    nets = ", ".join(recipe.options.lpips) or "no network"
     lines = ["# Comparison", "", f"LPIPS v0.1 with {nets}; device {recipe.device}."]
     if variants:
         settings = "".join(f" --set {override}" for override in recipe.overrides)

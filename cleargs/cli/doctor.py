@@ -14,7 +14,7 @@ from typing import Literal
 import click
 
 import cleargs
-from cleargs.cli.common import cuda_obstacle, json_option, print_json
+from cleargs.cli.common import cuda_obstacle, json_option, print_json, usable_cores
 
 LIBRARIES = (
     "torch",
@@ -51,7 +51,7 @@ def doctor(folder: Path, as_json: bool) -> int:
     findings = [
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
-        Finding("cores", "ok", str(len(os.sched_getaffinity(0)))),
+        Finding("cores", "ok", str(usable_cores())),
         _memory(),
         _disk(folder),
         _device(),

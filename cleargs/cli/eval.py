@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.common import json_option, print_json, quiet_option, stale_option, threads_or_all
 from cleargs.cli.progress import make_reporter
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.freshness import require_fresh
+from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:
@@ -49,7 +52,8 @@ Examples:
 
 \b
 DIR holds images/ and transforms.json in the world of the capture. The result of a run is written into
-RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet beside it.
+RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet beside it; those of other
+stages and options stay there as long as their scenes do.
 """
 )
 @click.argument("target", required=False, metavar="[RUN|SCENE.ply]", type=click.Path(path_type=Path))
@@ -107,6 +111,7 @@ RUN/eval/NAME/eval.json (NAME: the folder's name, or holdout) with eval.parquet 
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads; results do not depend on it.")
+@stale_option
 @click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
 @quiet_option
@@ -126,6 +131,7 @@ def eval(
     save_renders: Path | None,
     output: Path | None,
     threads: int | None,
+    stale: bool,
     per_image: bool,
     as_json: bool,
     quiet: bool,
@@ -144,9 +150,11 @@ def eval(
         raise InputError(
             "--poses given needs --reference", hint="held-out frames are rendered at their own poses anyway"
         )
+    warning = "" if run is None else require_fresh(dag, run, (dag.names[0], *scenes), stale=stale)
     nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
     from cleargs.evaluate.evaluate import Report, evaluate_images, evaluate_scene, reference_in, reference_of
+    from cleargs.evaluate.references import views_trained_on
     from cleargs.evaluate.results import write_report
 
     reporter, count = make_reporter(quiet), threads_or_all(threads)
@@ -173,6 +181,9 @@ def eval(
         )
         for subject, scene in scenes.items()
     ]
+    for place, found in enumerate(evaluations):
+        trained = None if run is None else views_trained_on(run, found.subject, reference)
+        evaluations[place] = found.model_copy(update={"trained_on": trained})
     if renders is not None:
         evaluations.append(
             evaluate_images(
@@ -183,12 +194,54 @@ def eval(
     if output is None and run is not None and renders is None:
         name = reference.name if poses == "reference" or directory is None else f"{reference.name}-given"
         output = run / "eval" / name / "eval.json"
-    if output is not None:
+        write_report(output, report.beside(_older(run, output)))
+    elif output is not None:
         write_report(output, report)
     if as_json:
+        if warning:
+            reporter.warn(warning)
         print_json(report.document())
     else:
+        for line in filter(None, (_seen_before(report), warning)):
+            click.echo(line)
         _print(report, per_image, output)
+        if run is not None and not align_colour and _exposure_counts(run):
+            click.echo(
+                "the exposure of each reference counts in these figures: --align-colour leaves it out, as "
+                "the training did"
+            )
+
+
+def _older(run: Path, path: Path) -> Report:
+    """The evaluations in ``path`` of scenes that are still those of ``run``."""
+    from cleargs.evaluate.results import Report, read_report
+
+    try:
+        found = read_report(path).evaluations
+    except InputError:
+        return Report(evaluations=())  # none yet, or damaged
+    scenes = {evaluation.subject: run / evaluation.subject / SCENE for evaluation in found}
+    digests = {subject: file_digest(scene) for subject, scene in scenes.items() if scene.is_file()}
+    kept = (evaluation for evaluation in found if evaluation.scene == digests.get(evaluation.subject))
+    return Report(evaluations=tuple(kept))
+
+
+def _exposure_counts(run: Path) -> bool:
+    """Whether the scene was trained with exposure compensation, which an evaluation leaves out."""
+    g0 = linked_manifest(run, "g0")
+    return g0 is not None and bool(g0.summary.get("exposure"))
+
+
+def _seen_before(report: Report) -> str:
+    """The line that says how many of the views show frames that a scene was trained on; "" for none."""
+    scenes = [found for found in report.evaluations if found.scene is not None]
+    if any(found.trained_on is None for found in scenes):
+        return "note: which frames the scene was trained on is not known"
+    seen = [found for found in scenes if found.trained_on]
+    if not seen:
+        return ""
+    count = f"{seen[0].trained_on} of {len(seen[0].images)}"
+    return f"note: {count} views are of frames that the scene was trained on"
 
 
 def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequence[str]) -> dict[str, Path]:

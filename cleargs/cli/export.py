@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
-from cleargs.cli.common import run_argument
+from cleargs.cli.common import run_argument, stale_option
 from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
 
 SCENE = "scene.ply"
+
+FORMATS = ("ply",)
+"""What can be written, by the ending of the file."""
 
 
 @click.command(
@@ -24,7 +28,12 @@ Examples:
 """
 )
 @run_argument
-@click.option("--format", "kind", type=click.Choice(["ply"]), default="ply", show_default=True)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(FORMATS),
+    help=f"What to write.  [default: by the ending of FILE: .{', .'.join(FORMATS)}]",
+)
 @click.option(
     "--world",
     type=click.Choice(["normalised", "input"]),
@@ -36,13 +45,35 @@ Examples:
 @click.option(
     "-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), help="The new file."
 )
+@click.option("--force", is_flag=True, help="Replace FILE where it exists.")
+@stale_option
 @click.pass_obj
-def export(dag: Dag, run: Path, kind: Literal["ply"], world: str, chosen: str | None, output: Path) -> None:
+def export(
+    dag: Dag,
+    run: Path,
+    kind: str | None,
+    world: str,
+    chosen: str | None,
+    output: Path,
+    force: bool,
+    stale: bool,
+) -> None:
     """Write the scene of RUN to a file."""
-    names = dag.names[::-1] if chosen is None else (dag.check(chosen),)
-    stage = next((name for name in names if (run / name / SCENE).is_file()), None)
+    if kind is None and output.suffix.lower().removeprefix(".") not in FORMATS:
+        raise InputError(
+            f"{output} has no ending that says what to write",
+            hint=f"name it {output.with_suffix(f'.{FORMATS[0]}')}, or give --format {'|'.join(FORMATS)}",
+        )
+    if output.exists() and not force:
+        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+    done = [name for name in dag.names if (run / name / SCENE).is_file()]
+    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage is None:
         raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
+    if stage not in done:
+        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs explain {run}"
+        raise InputError(f"{stage} has no scene in {run}", hint=there)
+    warning = require_fresh(dag, run, (stage,), stale=stale)
     similarity = _similarity(run, dag.names[0]) if world == "input" else None
     from cleargs.splat.ply import read_ply, write_ply
 
@@ -63,6 +94,8 @@ def export(dag: Dag, run: Path, kind: Literal["ply"], world: str, chosen: str | 
     except OSError as error:
         raise disk_error(error, output) from error
     write_ply(output, scene)
+    if warning:
+        click.echo(warning)
     click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {world} world")
 
 

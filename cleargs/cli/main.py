@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "stage": ("cleargs.cli.stage", "Run one stage of a prepared run."),
     "explain": ("cleargs.cli.explain", "Say for each stage whether it is done, and what changed if not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
+    "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
     "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
     "batch-status": ("cleargs.cli.batch_status", "Say how far each scene of a sheet is."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
@@ -48,7 +49,8 @@ Examples:
   cleargs run video.mp4 -o room --set rva.tau_R=0.7
   cleargs show room                          what each stage found
   cleargs explain room                       what the same command would do again, and why
-  cleargs export room --format ply -o room.ply
+  cleargs settings g0                        what a stage can be told
+  cleargs export room -o room.ply
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,

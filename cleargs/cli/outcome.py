@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -15,31 +16,97 @@ from cleargs.text import printable
 
 DONE_IN_PART = 3
 
+Summaries = Mapping[str, Mapping[str, Any]]
+"""Stage -> the figures of its manifest."""
+
 
 def exit_code(outcomes: Sequence[Outcome]) -> int:
     """0, or 3 where something is missing."""
     return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
 
 
+PICTURES = ("before_after.png", "candidates.png")
+"""What to look at, the first that a stage has."""
+
+
 def print_outcomes(outcomes: Sequence[Outcome], run: Path) -> None:
-    """One line a stage, then what is missing (on stderr) or where the results are."""
-    for outcome in outcomes:
-        manifest = outcome.manifest
-        how = f"made in {_duration(manifest.seconds)}" if outcome.how == "made" else "already there"
-        partial = ", in part" if manifest.status == "partial" else ""
-        click.echo(f"{outcome.stage:<12} {how}{partial}")
+    """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
+    the picture to look at, the next command."""
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
         click.echo(f"missing: {printable(missing)}", err=True)
     if last.status == "partial":
         click.echo("hint: the same command tries again; --allow-partial goes on without", err=True)
+    summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
     scene = "scene.ply" in last.files
-    click.echo(f"{'scene' if scene else 'results'}: {run / last.stage / ('scene.ply' if scene else '')}")
-    for outcome in outcomes:
-        for name in outcome.manifest.files:
-            if name.endswith(".parquet"):
-                click.echo(f"table: {run / outcome.stage / name}")
-    click.echo(f"look at them with: cleargs show {run}")
+    partial = ", in part" if last.status == "partial" else ""
+    place = run / last.stage / ("scene.ply" if scene else "")
+    click.echo(f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries)}")
+    if quality := _quality(summaries):
+        click.echo(f"quality: {quality}")
+    click.echo(f"time: {_times(outcomes)}")
+    pictures = [
+        run / outcome.stage / name
+        for outcome in reversed(outcomes)
+        for name in PICTURES
+        if name in outcome.manifest.files
+    ]
+    if pictures:
+        click.echo(f"look at: {pictures[0]}")
+    click.echo(f"next: {_next(summaries, run, scene)}")
+
+
+def _extent(summaries: Summaries) -> str:
+    """How large the result is: frames with a pose, and how many of them were repaired."""
+    ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
+    words = []
+    if "registered" in ingest and "frames" in ingest:
+        words.append(f"{ingest['registered']} of {ingest['frames']} frames placed")
+    if "roles" in summaries.get("rva", {}):
+        words.append(f"{summaries['rva']['roles']['strong']} strong")
+    if "repairs" in consolidate:
+        words.append(f"{consolidate['repairs']} repaired")
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _quality(summaries: Summaries) -> str:
+    """What is known of how good the last scene is, and of which frames; "" for nothing."""
+    held_back = next(
+        (summary["held_back"] for summary in reversed([*summaries.values()]) if "held_back" in summary), None
+    )
+    if held_back is not None:
+        before, after, count = held_back["psnr_before"], held_back["psnr_after"], len(held_back["frames"])
+        frames = "a good frame" if count == 1 else f"{count} good frames"
+        text = (
+            f"PSNR {after:.1f} dB (first scene {before:.1f}) on {frames} left unrepaired; trained on, "
+            "so unseen views are worse"
+        )
+        return f"{text}. Rejected: {held_back['harm']}" if held_back["harm"] else text
+    trained = summaries.get("g0", {}).get("psnr_active")
+    return f"training PSNR {trained:.1f} dB over {summaries['g0']['views']} frames" if trained else ""
+
+
+def _times(outcomes: Sequence[Outcome]) -> str:
+    """How long this call worked, stage by stage, and what it found."""
+    made = [outcome for outcome in outcomes if outcome.how == "made"]
+    found = [outcome.stage for outcome in outcomes if outcome.how == "found"]
+    words = []
+    if made:
+        stages = ", ".join(f"{outcome.stage} {duration(outcome.manifest.seconds)}" for outcome in made)
+        words.append(f"{duration(sum(outcome.manifest.seconds for outcome in made))} ({stages})")
+    if found:
+        words.append(f"already there: {', '.join(found)}")
+    return "; ".join(words)
+
+
+def _next(summaries: Summaries, run: Path, scene: bool) -> str:
+    """The command to give next."""
+    if not scene:
+        stage = " rva" if list(summaries)[-1] == "rva" else ""
+        return f"cleargs show {quote(str(run))}{stage}"
+    if summaries.get("ingest", {}).get("test"):
+        return f"cleargs eval {quote(str(run))}"
+    return f"cleargs export {quote(str(run))} -o {quote(f'{run.name}.ply')}"
 
 
 def outcome_json(outcome: Outcome) -> dict[str, Any]:
@@ -86,5 +153,6 @@ def _plan_json(plan: StagePlan) -> dict[str, Any]:
     }
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Seconds, or minutes where there are many."""
     return f"{seconds:.1f} s" if seconds < 120 else f"{seconds / 60:.1f} min"

@@ -58,14 +58,19 @@ class LineReporter(QuietReporter):
 
 
 class LineTask:
-    """Counted work that says every few seconds how far it is."""
+    """Counted work that says every few seconds how far it is.
+
+    The time left is told from the pace since the first step was done: what comes before it (compiling
+    kernels, reading a checkpoint) says nothing of those to come.
+    """
 
     def __init__(self, label: str, total: int | None) -> None:
         self.label = label
         self.total = total
         self.done = 0
         self.note = ""
-        self._begin = self._said = time.monotonic()
+        self._said = time.monotonic()
+        self._first: tuple[float, int] | None = None
 
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
@@ -74,16 +79,19 @@ class LineTask:
         self.done = self.done if done is None else done
         self.note = self.note if note is None else printable(note)
         now = time.monotonic()
+        if self._first is None and self.done:
+            self._first = now, self.done
         if now - self._said >= LINE_EVERY:
             self._said = now
-            click.echo(self._text(now - self._begin), err=True)
+            click.echo(self._text(now), err=True)
 
-    def _text(self, elapsed: float) -> str:
+    def _text(self, now: float) -> str:
         words = [f"{self.label}: {self.done}" + (f"/{self.total}" if self.total else "")]
         if self.note:
             words.append(self.note)
-        if self.total and self.done:
-            words.append(f"{elapsed * (self.total - self.done) / self.done:.0f} s left")
+        begin, first = self._first or (now, self.done)
+        if self.total and self.done > first:
+            words.append(f"{(now - begin) * (self.total - self.done) / (self.done - first):.0f} s left")
         return ", ".join(words)
 
 

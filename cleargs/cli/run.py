@@ -20,11 +20,12 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import InputError
-from cleargs.pipeline.config import load_config
+from cleargs.errors import ConfigError, InputError
+from cleargs.pipeline.config import Config, Document, check_document, load_config
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.keys import settings as settings_in
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RUN_FILE, Run, kept_settings, noted_place
 from cleargs.pipeline.runner import Runner, check_same_input
 from cleargs.pipeline.store import STORE_FOLDER
 
@@ -37,6 +38,7 @@ Examples:
   cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
   cleargs run photos/ -o room --dry-run                   what would be done, why, and the cost
   cleargs run photos/ -o room --until rva                 stop before training
+  cleargs run photos/ -o room --reset                     with the recipe's settings again
 """
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path))
@@ -51,13 +53,19 @@ Examples:
 )
 @click.option(
     "--workflow",
-    default="default",
-    show_default=True,
     metavar="NAME|FILE.toml",
-    help="The recipe: default, smoke, paper, paper-open, or a TOML file of your own.",
+    help="The recipe: default, smoke, paper, paper-open, or a TOML file of your own.  [default: default; an "
+    "existing run keeps its settings]",
 )
-@click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="STAGE.FIELD=VALUE",
+    help="Change one setting (cleargs settings lists them).",
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all randomness.  [default: 0]")
+@click.option("--reset", is_flag=True, help="Forget the settings of an existing run: start from the recipe.")
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
 @click.option(
     "--force", multiple=True, metavar="STAGE", help="Make the stage again, even if its results are there."
@@ -73,9 +81,10 @@ def run(
     dag: Dag,
     source: Path,
     folder: Path,
-    workflow: str,
+    workflow: str | None,
     overrides: tuple[str, ...],
     seed: int | None,
+    reset: bool,
     until: str | None,
     force: tuple[str, ...],
     dry_run: bool,
@@ -90,16 +99,28 @@ def run(
 
     INPUT is a video, an image folder, a COLMAP project (images/ and sparse/0), or a folder with
     transforms.json or poses_bounds.npy. Results that are there already are not made again; an interrupted
-    run goes on.
+    run goes on. An existing run keeps its settings (RUN/run.toml) unless --set, --workflow or --reset say
+    otherwise.
     """
     if not source.exists():
         raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
-    config = load_config(dag, workflow, overrides, seed)
+    if (source / RUN_FILE).is_file():
+        noted = noted_place(source).source
+        raise InputError(
+            f"{source} is a run, not a capture",
+            hint=f"give the capture that it was made from{f': {noted}' if noted else ''}",
+        )
     folder = folder.absolute()
-    root = (store or folder / STORE_FOLDER).absolute()
-    settings = Run(folder, source.absolute(), config, root, resolve_device(device))
-    dag.until(until)
+    kept = None if reset or workflow is not None else _kept(dag, folder)
+    config = load_config(dag, workflow or "default" if kept is None else kept, overrides, seed)
+    before = noted_place(folder)
+    root = (store or before.store or folder / STORE_FOLDER).absolute()
     reporter = make_reporter(quiet)
+    chosen = resolve_device(before.device or device if device == "auto" else device, reporter.info)
+    settings = Run(folder, source.absolute(), config, root, chosen)
+    dag.until(until)
+    if kept is not None and (line := _own_settings(dag, check_document(dag, kept))):
+        reporter.info(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
     with opened_store(root) as opened:
         check_same_input(settings, dag, opened)
         if dry_run:
@@ -113,3 +134,23 @@ def run(
     else:
         print_outcomes(outcomes, folder)
     return exit_code(outcomes)
+
+
+def _kept(dag: Dag, folder: Path) -> Document | None:
+    """The settings of the run in ``folder``; None without one. Raises ConfigError when they are damaged."""
+    try:
+        kept = kept_settings(folder)
+        if kept is not None:
+            check_document(dag, kept)
+    except ConfigError as error:
+        raise ConfigError(
+            f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
+        ) from error
+    return kept
+
+
+def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:
+    """The first few settings that are not the default, in one line; "" where there are none."""
+    usual = dict(settings_in(check_document(dag, {}).document()))
+    own = [f"{name}={value}" for name, value in settings_in(config.document()) if usual.get(name) != value]
+    return ", ".join(own[:most]) + (f" and {len(own) - most} more" if len(own) > most else "")

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from shlex import quote
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from cleargs.cli.common import json_option, print_json, run_argument
+from cleargs.cli.frames import COLUMNS, frame_rows, short_name
 from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.cli.words import headlines, in_words, text_of
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import tree_digest
+from cleargs.pipeline.freshness import Reasons, stale_stages
 from cleargs.pipeline.manifest import Manifest, linked_manifest
-from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.run_file import read_run_file
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+WIDEST = 8
+"""A table of more columns is shown with its rows beside each other."""
 
 PLOT = "rva-plot.png"
 """The picture of ``--plot`` in the run's folder, unless another is named."""
@@ -26,9 +32,13 @@ PLOT = "rva-plot.png"
     epilog="""\b
 Examples:
   cleargs show room                 all stages: state, time, size, figures
-  cleargs show room rva             roles, weights and scores, column by column
-  cleargs show room g0 --rows 12    rows of each table, evenly spread
+  cleargs show room rva             what became of every frame, and why
+  cleargs show room rva --columns   what the tables hold, column by column
+  cleargs show room g0 --rows 5     rows of each table, evenly spread
   cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
+
+\b
+A stage is stale when it was made with other settings or inputs than the run has now.
 """
 )
 @run_argument
@@ -36,6 +46,7 @@ Examples:
 @click.option(
     "--rows", type=click.IntRange(min=0), help="How many rows of each table.  [default: 8 of step tables]"
 )
+@click.option("--columns", is_flag=True, help="Describe the tables column by column.")
 @click.option(
     "--plot",
     is_flag=True,
@@ -54,6 +65,7 @@ def show(
     run: Path,
     stage: str | None,
     rows: int | None,
+    columns: bool,
     plot: bool,
     output: Path | None,
     as_json: bool,
@@ -65,21 +77,24 @@ def show(
         raise InputError(
             "--output names the PNG of --plot", hint=f"cleargs show {run} rva --plot -o FILE.png"
         )
-    if not (run / RUN_FILE).is_file():
-        raise InputError(f"{run} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`")
+    stale = stale_stages(dag, read_run_file(run, dag))
     if stage is None:
         manifests = {name: linked_manifest(run, name) for name in dag.names}
         if as_json:
-            print_json({name: _facts(manifest) for name, manifest in manifests.items()})
+            print_json({name: _facts(manifest, stale.get(name)) for name, manifest in manifests.items()})
         else:
-            _print_run(manifests)
+            _print_run(manifests, stale)
         return
     dag.check(stage)
     manifest = linked_manifest(run, stage)
     if manifest is None:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs explain {run}")
     if plot:
-        picture = _plot(run, manifest, output or run / PLOT)
+        for name in ("ingest", "rva"):
+            if name in stale:
+                reasons = "; ".join(stale[name])
+                raise InputError(f"{name} is stale: {reasons}", hint=f"see cleargs explain {quote(str(run))}")
+        picture = _plot(run, output or run / PLOT)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
         else:
@@ -90,33 +105,39 @@ def show(
         for name in sorted(manifest.files)
         if name.endswith(".parquet") and "/" not in name
     }
+    frames = None
+    if stage == "rva":
+        rivr = run / "rivr" / "selection.parquet"
+        repairs = _read(rivr).to_pylist() if rivr.is_file() and "rivr" not in stale else None
+        frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
     if as_json:
         shown = {
             name: {"rows": table.num_rows, "columns": describe_table(table)} for name, table in tables.items()
         }
-        print_json({"stage": stage, **(_facts(manifest) or {}), "tables": shown})
+        facts = {"stage": stage, **(_facts(manifest, stale.get(stage)) or {}), "tables": shown}
+        print_json(facts if frames is None else {**facts, "frames": frames})
         return
     console = _console()
-    _print_facts(console, manifest)
+    _print_facts(console, manifest, stale.get(stage))
+    if frames is not None and not columns and rows is None:
+        _print_frames(console, frames)
+        return
     for name, table in tables.items():
-        _print_columns(console, name, table)
-        wanted = rows if rows is not None else 8 if "step" in table.column_names else 0
+        wanted = rows if rows is not None else 8 if "step" in table.column_names and not columns else 0
+        if columns:
+            _print_columns(console, name, table)
+        elif wanted and table.num_rows:
+            console.print(f"\n{name}: {table.num_rows} rows", markup=False)
         if wanted and table.num_rows:
             _print_rows(console, table, wanted)
+    if not columns:
+        console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns", markup=False)
 
 
-def _plot(run: Path, rva: Manifest, picture: Path) -> Path:
+def _plot(run: Path, picture: Path) -> Path:
     """Draw RUN/rva with the poses and images that it was made from. Raises InputError, StoreError."""
     from cleargs.report.allocation import load_allocation, plot_allocation
 
-    made_from, ingest = rva.parts.inputs["ingest"], linked_manifest(run, "ingest")
-    if ingest is None or any(
-        tree_digest(ingest.under(name)) != made_from[name] for name in ("frames.parquet", "images")
-    ):
-        raise InputError(
-            f"rva was made from another ingest than the one in {run}",
-            hint=f"run it again: cleargs stage rva {run}",
-        )
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_allocation(picture, load_allocation(run / "rva", run / "ingest"), run.resolve().name)
     return picture
@@ -135,11 +156,12 @@ def _read(path: Path) -> Any:
         ) from error
 
 
-def _facts(manifest: Manifest | None) -> dict[str, Any] | None:
+def _facts(manifest: Manifest | None, stale: Reasons | None) -> dict[str, Any] | None:
     if manifest is None:
         return None
     return {
         "status": manifest.status,
+        "stale": list(stale or ()),
         "missing": [*manifest.inherited, *manifest.missing],
         "key": manifest.key,
         "digest": manifest.digest,
@@ -162,7 +184,7 @@ def _console() -> Console:
     return Console(highlight=False)
 
 
-def _print_run(manifests: dict[str, Manifest | None]) -> None:
+def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons]) -> None:
     from rich.table import Table
 
     table = Table("stage", "state", "seconds", "MB", "files", "figures", box=None, header_style="bold")
@@ -170,27 +192,43 @@ def _print_run(manifests: dict[str, Manifest | None]) -> None:
         if manifest is None:
             table.add_row(name, "not done", "", "", "", "")
             continue
-        figures = ", ".join(
-            f"{label} {_text(value)}" for label, value in manifest.summary.items() if _is_figure(value)
-        )
-        size = f"{manifest.bytes / 1e6:.1f}"
-        table.add_row(
-            name, manifest.status, f"{manifest.seconds:.1f}", size, str(len(manifest.files)), figures
-        )
-    _console().print(table)
+        state = "stale" if name in stale else manifest.status
+        cells = (f"{manifest.seconds:.1f}", f"{manifest.bytes / 1e6:.1f}", str(len(manifest.files)))
+        table.add_row(name, state, *cells, headlines(manifest.summary))
+    console = _console()
+    console.print(table)
+    for name, reasons in stale.items():
+        console.print(f"{name} is stale: {'; '.join(reasons)}", markup=False)
 
 
-def _print_facts(console: Console, manifest: Manifest) -> None:
+def _print_facts(console: Console, manifest: Manifest, stale: Reasons | None) -> None:
     from rich.table import Table
 
-    table = Table(
-        box=None, show_header=False, title=f"{manifest.stage}: {manifest.status}", title_justify="left"
-    )
+    state = "stale" if stale else manifest.status
+    table = Table(box=None, show_header=False, title=f"{manifest.stage}: {state}", title_justify="left")
+    for reason in stale or ():
+        table.add_row("stale", reason)
     for missing in (*manifest.inherited, *manifest.missing):
         table.add_row("missing", missing)
-    for label, value in _flat(manifest.summary):
-        table.add_row(label, _text(value))
+    for label, text in in_words(manifest.summary):
+        table.add_row(label, text)
     table.add_row("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}")
+    console.print(table)
+
+
+def _print_frames(console: Console, frames: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", padding=(0, 1, 0, 0), pad_edge=False)
+    numbers = ("frame", "weight", "R", "B")
+    for name in COLUMNS:
+        if frames and name in frames[0]:
+            justify: Literal["right", "left"] = "right" if name in numbers else "left"
+            table.add_column(name, justify=justify, no_wrap=name != "reason", overflow="fold")
+    for row in frames:
+        values = (row | {"name": short_name(row["name"])}).values()
+        table.add_row(*(f"{value:.2f}" if isinstance(value, float) else text_of(value) for value in values))
+    console.print()
     console.print(table)
 
 
@@ -215,9 +253,16 @@ def _print_rows(console: Console, data: Any, wanted: int) -> None:
     from rich.table import Table
 
     names = data.column_names
-    table = Table(*names, box=None, header_style="bold")
-    for row in sampled_rows(data, wanted):
-        table.add_row(*(_text(row[name]) for name in names))
+    rows = sampled_rows(data, wanted)
+    if len(names) <= WIDEST:
+        table = Table(*names, box=None, header_style="bold")
+        for row in rows:
+            table.add_row(*(text_of(row[name]) for name in names))
+    else:
+        table = Table(box=None, show_header=False)
+        table.add_column(no_wrap=True)
+        for name in names:
+            table.add_row(name, *(text_of(row[name]) for row in rows))
     console.print(table)
 
 
@@ -225,30 +270,7 @@ def _describe(facts: dict[str, Any]) -> str:
     if "counts" in facts:
         words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
     elif "median" in facts:
-        words = f"{_text(facts['min'])} .. {_text(facts['median'])} .. {_text(facts['max'])}"
+        words = f"{text_of(facts['min'])} .. {text_of(facts['median'])} .. {text_of(facts['max'])}"
     else:
         words = f"{facts['distinct']} different"
     return f"{words}, {facts['nulls']} empty" if facts["nulls"] else words
-
-
-def _flat(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested figures as one list of ("outer.inner", value); the items of lists of tables count from 1."""
-    if isinstance(value, dict):
-        pairs = list(value.items())
-    elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
-        pairs = [(str(number), item) for number, item in enumerate(value, 1)]
-    else:
-        return [(prefix, value)]
-    return [row for label, item in pairs for row in _flat(item, f"{prefix}.{label}" if prefix else label)]
-
-
-def _is_figure(value: Any) -> bool:
-    return isinstance(value, (int, float, str)) and len(str(value)) <= 24
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value[:16]) + (" ..." if len(value) > 16 else "")
-    return "" if value is None else str(value)

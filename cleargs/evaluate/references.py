@@ -19,12 +19,14 @@ from cleargs.capture.tables import Frame, load_frames
 from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.capture.world import Similarity
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.evaluate.results import Alignment, PosesFrom
+from cleargs.formation.colour import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
+from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.manifest import linked_manifest
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
@@ -34,6 +36,10 @@ T = TypeVar("T")
 
 MIN_SIDE = 32
 """Pixels that the learned metrics need on each side."""
+
+SAME_VIEW = 0.05
+"""Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
+their axes than this in radians: pose noise is smaller, and the next view of a set mostly farther."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +169,33 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         views.append(ReferenceView(stem, view.camera, partial(_load, ingest / frame.image, mask, size, None)))
     views.sort(key=lambda view: natural_key(view.name))
     return Reference("holdout", tuple(views), "given", Alignment(world="scene", matched=len(views)))
+
+
+def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
+    """How many views of ``reference`` show frames that the scene of ``stage`` was trained on.
+
+    These have the stem and about the pose of one. None where nothing is known of them. The frames are the
+    rows of the scene's exposure table, as long as RUN/ingest still has the images that it was made from.
+    """
+    made, ingest = linked_manifest(run, stage), linked_manifest(run, "ingest")
+    if made is None or ingest is None:
+        return None
+    if made.parts.inputs.get("ingest", {}).get("images") != tree_digest(ingest.under("images")):
+        return None
+    try:
+        trained = {int(number) for number in read_exposure(run / stage / "exposure.parquet").frame_ids}
+    except StoreError:
+        return None
+    own = {_stem(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}
+    return sum(view.name in own and _about_there(view.camera, own[view.name]) for view in reference.views)
+
+
+def _about_there(camera: Camera, frame: Frame) -> bool:
+    pose = _own_pose(frame)
+    near = np.linalg.norm(camera.centre - pose.centre) < SAME_VIEW
+    return bool(near) and rotation_between(camera.world_to_camera[:3, :3], pose.rotation) < np.degrees(
+        SAME_VIEW
+    )
 
 
 # -- a folder ----------------------------------------------------------------------------------------------

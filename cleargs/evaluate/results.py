@@ -82,6 +82,11 @@ class Evaluation(_Record):
     means: dict[str, float | None] = Field(description="Metric -> mean over the images.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
     weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
+    trained_on: int | None = Field(
+        None,
+        ge=0,
+        description="How many of the images show frames that the scene was trained on; null: not known.",
+    )
     versions: dict[str, str]
     images: tuple[ImageResult, ...]
 
@@ -91,6 +96,17 @@ class Report(_Record):
 
     schema_version: Literal[1] = 1
     evaluations: tuple[Evaluation, ...]
+
+    def beside(self, older: Report) -> Report:
+        """These evaluations, then those of ``older`` on the same references that none of these replaces."""
+        here = {(found.subject, found.poses, found.options) for found in self.evaluations}
+        splits = {found.split for found in self.evaluations}
+        kept = [
+            found
+            for found in older.evaluations
+            if found.split in splits and (found.subject, found.poses, found.options) not in here
+        ]
+        return Report(evaluations=(*self.evaluations, *kept))
 
     def document(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -120,7 +136,8 @@ def write_report(path: Path, report: Report) -> None:
     except OSError as error:
         raise disk_error(error, path) from error
     write_json(path, report.document())
-    schema = table_schema(report.evaluations[0].options.metrics)
+    metrics = dict.fromkeys(metric for found in report.evaluations for metric in found.options.metrics)
+    schema = table_schema(tuple(metrics))
     write_table(path.with_suffix(".parquet"), pa.Table.from_pylist(_rows(report), schema), schema)
 
 
@@ -139,6 +156,9 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
     return pa.schema(
         [
             column("subject", pa.string(), "stage, or name of the scene file or of the folder of images"),
+            column(
+                "adjusted", pa.string(), "what was fitted to the reference first: colours, poses, or nothing"
+            ),
             column("name", pa.string(), "stem of the reference's file"),
             column("width", pa.int32(), "px"),
             column("height", pa.int32(), "px"),
@@ -166,9 +186,12 @@ def meaning(metric: str) -> str:
 
 
 def _rows(report: Report) -> list[dict[str, Any]]:
+    metrics = [metric for evaluation in report.evaluations for metric in evaluation.options.metrics]
     return [
         {
+            **dict.fromkeys(metrics),
             "subject": evaluation.subject,
+            "adjusted": _adjusted(evaluation.options),
             **image.model_dump(include={"name", "width", "height", "prediction", "reference"}),
             **image.values,
             "colour": None if image.colour is None else [x for row in image.colour for x in row],
@@ -178,3 +201,9 @@ def _rows(report: Report) -> list[dict[str, Any]]:
         for evaluation in report.evaluations
         for image in evaluation.images
     ]
+
+
+def _adjusted(options: EvalOptions) -> str:
+    fitted = ["colours"] if options.align_colour else []
+    fitted += [f"poses in {options.refine_poses} steps"] if options.refine_poses else []
+    return ", ".join(fitted) or "nothing"

@@ -1,8 +1,9 @@
 """EXR files of several named RGB layers: scene-linear, Rec.709 primaries, half floats, zip.
 
 Layer ``render`` is the channels ``render.R``, ``render.G``, ``render.B``. OpenEXR stores channels in
-alphabetical order, so they are found by name. Equal layers and attributes give equal bytes: no date is
-stored.
+alphabetical order, so they are found by name. One of the layers may be there again as the plain channels R,
+G, B, which programs show that know nothing of layers. Equal layers and attributes give equal bytes: no date
+is stored.
 """
 
 from __future__ import annotations
@@ -49,15 +50,18 @@ def from_layer(layer: Layer) -> Image:
     return srgb_from_linear(layer.astype(np.float32))
 
 
-def write_exr(path: Path, image: LayeredImage) -> None:
+def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> None:
     """Write the layers (all of one size) and attributes to ``path``, atomically.
 
-    Raises StoreError when the disk is full or not writable.
+    The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError when the disk is full
+    or not writable.
     """
-    pixels = np.concatenate(list(image.layers.values()), axis=2)
+    plain = [] if shown is None else [image.layers[shown]]
+    pixels = np.concatenate([*plain, *image.layers.values()], axis=2)
     height, width, channels = pixels.shape
     spec = ImageSpec(width, height, channels, HALF)
-    spec.channelnames = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
+    layered = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
+    spec.channelnames = (*_CHANNELS[: 3 * len(plain)], *layered)
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", "lin_rec709")
     spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
@@ -72,7 +76,7 @@ def write_exr(path: Path, image: LayeredImage) -> None:
 
 
 def read_exr(path: Path, prefix: str = "") -> LayeredImage:
-    """Read every RGB layer of ``path``, and the attributes whose name begins with ``prefix``.
+    """Read every named RGB layer of ``path``, and the attributes whose name begins with ``prefix``.
 
     Raises StoreError when the file is missing, damaged, or has a channel outside an RGB layer.
     """
@@ -99,7 +103,8 @@ def _read(source: ImageInput, prefix: str) -> LayeredImage:
     if pixels is None:
         raise ValueError(_first_line(source.geterror()))
     place = {name: k for k, name in enumerate(spec.channelnames)}
-    names = dict.fromkeys(name.rpartition(".")[0] for name in spec.channelnames)
+    named = (name for name in spec.channelnames if name not in _CHANNELS)  # those are one of the layers again
+    names = dict.fromkeys(name.rpartition(".")[0] for name in named)
     layers = {
         name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
         for name in names

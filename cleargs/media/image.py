@@ -14,8 +14,11 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
-from cleargs.media.header import PNG, image_size
+from cleargs.media.header import PNG
+from cleargs.media.header import image_size as stated_size
 from cleargs.untrusted import cause, read_bytes
+
+_OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -28,6 +31,22 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of the image in ``path``, as it is stored, from its header alone.
+
+    Raises InputError when there is no image.
+    """
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()  # else it is told on stderr at the end
+        raise InputError(f"{path} is not an image that can be read", hint="convert it to JPEG or PNG")
+    spec = source.spec()
+    source.close()
+    return spec.width, spec.height
+
+
 def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
     """The image in ``path`` as float32 sRGB in [0, 1]. Raises InputError like `read_rgb`."""
     return read_rgb(path).astype(np.float32) / np.float32(255)
@@ -37,6 +56,20 @@ def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`."""
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
     return np.where(grey > 127, np.uint8(255), np.uint8(0))
+
+
+def read_alpha(path: Path) -> NDArray[np.uint8] | None:  # [H, W]
+    """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
+
+    None where it is opaque all over. Raises InputError like `read_rgb`.
+    """
+    if path.suffix.lower() in _OPAQUE:
+        return None
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        return None
+    opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
+    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
 
 
 def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
@@ -58,7 +91,7 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
+def _decode(path: Path, flags: int) -> NDArray[Any]:
     """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
     try:
         content = read_bytes(path)
@@ -69,7 +102,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
         ) from error
     if not content:
         raise InputError(f"{path} is empty (zero bytes)", hint="remove the file, or copy it again")
-    image, size = None, image_size(content)
+    image, size = None, stated_size(content)
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         raise InputError(
             f"{path} has {size[0]}x{size[1]} pixels; at most {MAX_PIXELS} are read", hint="reduce the image"
@@ -82,7 +115,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
         raise InputError(
             f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"
         )
-    return np.asarray(image, np.uint8)
+    return np.asarray(image)
 
 
 def _encode(path: Path, image: NDArray[np.uint8]) -> None:

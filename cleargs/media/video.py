@@ -77,6 +77,12 @@ def read_timeline(path: Path) -> Timeline:
         return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
 
 
+def video_size(path: Path) -> tuple[int, int]:
+    """Width and height of the frames, from the header of ``path``. Raises InputError like `read_timeline`."""
+    with _open(path) as (_, stream):
+        return stream.codec_context.width, stream.codec_context.height
+
+
 def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
 

@@ -7,6 +7,7 @@ Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embed
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +18,7 @@ from cleargs.errors import InputError, StageError
 from cleargs.models.batches import in_batches
 from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.onnx import Device, OnnxModel
+from cleargs.models.registry import load_registry
 from cleargs.models.tiling import Image, apply_tiled, map_tiled
 
 EMBEDDED = "embedded"
@@ -118,13 +120,21 @@ class OnnxExpert:
 
 def expert_path(spec: str) -> Path:
     """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, the name of an expert in the
-    registry is the installed one, anything else is a path.
+    registry is the installed one, a name with an ending or a folder is a path.
 
-    Raises InputError when an expert of the registry is not installed.
+    Raises InputError for any other name, and when an expert of the registry is not installed.
     """
     if spec == EMBEDDED:
         return Path(str(files("cleargs.models"))).absolute() / "weights" / "restorer.onnx"
-    return installed_file(spec, "expert") or Path(spec).absolute()
+    path = installed_file(spec, "expert") or Path(spec).absolute()
+    if path.name == spec and not (path.suffix or path.exists()):
+        names = [EMBEDDED, *(model.name for model in load_registry() if model.role == "expert")]
+        near = get_close_matches(spec, names, n=1)
+        raise InputError(
+            f"there is no restoration expert {spec!r}",
+            hint=f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}, or give an ONNX file",
+        )
+    return path
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:

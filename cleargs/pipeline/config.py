@@ -7,33 +7,25 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.settings import allowed, inner_model, suggestion
 from cleargs.untrusted import FAULTS, MAX_NESTING, cause, read_text, shallow
 
 RECIPES = "cleargs.workflows"
 """The package that holds the recipes known by name."""
 
 MAX_SEED = 2**63 - 1
-
-KIND_WORDS: Mapping[Any, str] = {
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    str: "text",
-}
-"""How the types of settings are called in an error."""
 
 Document = dict[str, Any]
 
@@ -58,13 +50,17 @@ class Config:
 
 
 def load_config(
-    dag: Dag, recipe: str = "default", overrides: Sequence[str] = (), seed: int | None = None
+    dag: Dag,
+    recipe: str | Document = "default",
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
 ) -> Config:
-    """The configuration of ``recipe`` (a name or a TOML file), each ``a.b=value`` of ``overrides`` on top.
+    """The configuration of ``recipe`` (a name, a TOML file, or a document) with each ``a.b=value`` of
+    ``overrides`` on top.
 
     Raises ConfigError: unknown recipe, TOML that cannot be read, unknown setting, value out of range.
     """
-    document = read_recipe(recipe)
+    document = read_recipe(recipe) if isinstance(recipe, str) else recipe
     for text in overrides:
         document = merge(document, parse_override(text))
     if seed is not None:
@@ -195,39 +191,26 @@ def _setting_error(
     if not parts:
         return ConfigError(f"{section}: {message}", hint=f"change the settings of [{section}]")
     # A validator of ours says more than the type does.
-    allowed = _allowed(field) if field is not None and first["type"] != "value_error" else ""
-    hint = f"allowed: {allowed}" if allowed else message[:1].lower() + message[1:]
+    range_ = allowed(field) if field is not None and first["type"] != "value_error" else ""
+    hint = f"allowed: {range_}" if range_ else message[:1].lower() + message[1:]
     return ConfigError(f"{name} = {first['input']!r} cannot be used", hint=hint)
 
 
 def _unknown(
     name: str, prefix: str, siblings: Iterable[str], models: Mapping[str, type[BaseModel]]
 ) -> ConfigError:
-    """The error for a name that is no setting, with the nearest right one: a sibling, or one further away."""
+    """The error for a name that is no setting, with the one that was probably meant."""
     siblings = list(siblings)
-    near = [prefix + found for found in get_close_matches(name, siblings, n=1)]
-    if not near:
-        everything = [f"{section}.{field}" for section, model in models.items() for field in _names(model)]
-        by_last = {full.rpartition(".")[2]: full for full in reversed(everything)}
-        near = [by_last[found] for found in get_close_matches(name, by_last, n=1)]
-    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(prefix + known for known in siblings)}"
-    return ConfigError(f"there is no setting {prefix}{name}", hint=hint)
+    hint = suggestion(name, prefix, siblings, models)
+    known = f"known: {', '.join(prefix + known for known in siblings)}; see cleargs settings"
+    return ConfigError(f"there is no setting {prefix}{name}", hint=hint or known)
 
 
 def _first_name(model: type[BaseModel], parts: Sequence[str]) -> str:
     """The first setting of the table at ``parts`` below ``model``."""
     _, field = _locate(model, parts)
-    inner = model if field is None else _inner_model(field) or model
+    inner = model if field is None else inner_model(field) or model
     return next(iter(inner.model_fields))
-
-
-def _names(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    for name, field in model.model_fields.items():
-        inner = _inner_model(field)
-        if inner is None:
-            yield prefix + name
-        else:
-            yield from _names(inner, f"{prefix}{name}.")
 
 
 def _locate(model: type[BaseModel], parts: Sequence[str]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
@@ -239,34 +222,5 @@ def _locate(model: type[BaseModel], parts: Sequence[str]) -> tuple[type[BaseMode
             break
         field = owner.model_fields.get(part)
         if part != parts[-1]:
-            owner = _inner_model(field) if field is not None else None
+            owner = inner_model(field) if field is not None else None
     return owner, field
-
-
-def _inner_model(field: FieldInfo) -> type[BaseModel] | None:
-    for kind in (field.annotation, *get_args(field.annotation)):
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            return kind
-    return None
-
-
-def _allowed(field: FieldInfo) -> str:
-    """What a field takes, in words: its choices, or its type and range."""
-    kinds: list[Any] = [field.annotation]
-    if get_origin(field.annotation) in (Union, UnionType):
-        kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
-    words = []
-    for kind in kinds:
-        if get_origin(kind) is Literal:
-            words += [str(choice) for choice in get_args(kind)]
-        else:
-            words.append(KIND_WORDS.get(kind, ""))
-    if not all(words):
-        return ""
-    limits = []
-    for attribute, word in (("ge", "at least"), ("gt", "more than"), ("le", "at most"), ("lt", "less than")):
-        for item in field.metadata:
-            if getattr(item, attribute, None) is not None:
-                limits.append(f"{word} {getattr(item, attribute)}")
-    text = " or ".join(words)
-    return f"{text}, {' and '.join(limits)}" if limits else text

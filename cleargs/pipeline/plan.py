@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,9 @@ from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, External, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
+
+NOT_MADE = "not made yet"
+"""Why the results of a stage are not there that the run never had."""
 
 Origins = dict[str, dict[str, str]]
 
@@ -73,6 +76,7 @@ class Planner:
     store: Store
     threads: int
     reporter: Reporter
+    _estimates: dict[tuple[str, tuple[str, ...] | None], Estimate] = field(default_factory=dict, repr=False)
 
     def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
         """What ``name`` is made from, given the manifests of the stages before it.
@@ -81,16 +85,8 @@ class Planner:
         capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
-        origins: Origins = {}
-        inputs: dict[str, dict[str, str | None]] = {}
-        for upstream, paths in stage.INPUTS.items():
-            inputs[upstream] = {}
-            for path in paths:
-                files = done[upstream].under(path)
-                origins[f"{upstream}/{path}"] = files
-                inputs[upstream][path] = tree_digest(files) if files else None
-        external_files = dict(stage.externals(config, self.run.source))
-        digests = self.external_digests(external_files, afresh=afresh)
+        inputs, origins = self.inputs(name, done)
+        digests = self.external_digests(name, afresh=afresh)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
@@ -113,12 +109,31 @@ class Planner:
                 )
             )
         )
-        return Recipe(parts, origins, external_files, folders, inherited)
+        return Recipe(parts, origins, self._externals(name), folders, inherited)
 
-    def external_digests(
-        self, places: Mapping[str, External], *, afresh: bool = False
-    ) -> dict[str, dict[str, str]]:
-        """Role -> relative path -> digest. Raises InputError when one cannot be read or holds the run."""
+    def inputs(
+        self, name: str, done: Mapping[str, Manifest]
+    ) -> tuple[dict[str, dict[str, str | None]], Origins]:
+        """Digests of what ``name`` reads of the stages before it, and those of the single files."""
+        origins: Origins = {}
+        inputs: dict[str, dict[str, str | None]] = {}
+        for upstream, paths in self.dag.load(name).INPUTS.items():
+            inputs[upstream] = {}
+            for path in paths:
+                files = done[upstream].under(path)
+                origins[f"{upstream}/{path}"] = files
+                inputs[upstream][path] = tree_digest(files) if files else None
+        return inputs, origins
+
+    def _externals(self, name: str) -> Mapping[str, External]:
+        return self.dag.load(name).externals(self.run.config.sections[name], self.run.source)
+
+    def external_digests(self, name: str, *, afresh: bool = False) -> dict[str, dict[str, str]]:
+        """Role -> relative path -> digest of what ``name`` reads outside the store.
+
+        With ``afresh`` every file is read. Raises InputError when one cannot be read or holds the run.
+        """
+        places = self._externals(name)
         hint = "choose a folder beside the input with -o"
         for folder in (self.run.folder, self.run.source, self.store.root):
             require_utf8(folder)
@@ -135,22 +150,30 @@ class Planner:
             return (f"damaged: {entry.damage}",)
         before = linked_manifest(self.run.folder, recipe.parts.stage)
         if before is None:
-            return ("not made yet",)
+            return (NOT_MADE,)
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
-    def estimate(self, name: str) -> Estimate:
-        """Rough cost of ``name``, from its settings and what exists of its inputs, older ones included."""
+    def estimate(self, name: str, done: Mapping[str, Manifest] | None = None) -> Estimate:
+        """Rough cost of ``name``, from its settings, the finished stages before it (without ``done``: those
+        that the run shows), and what the others expect."""
+        known = (name, None if done is None else tuple(done))
+        if known in self._estimates:
+            return self._estimates[known]
         stage = self.dag.load(name)
-        inputs = {
-            upstream: (self.run.folder / upstream).resolve()
-            for upstream in stage.INPUTS
-            if linked_manifest(self.run.folder, upstream) is not None
-        }
+        inputs, expected = {}, {}
+        for upstream in stage.INPUTS:
+            if done is not None and upstream in done:
+                inputs[upstream] = self.store.folder(upstream, done[upstream].key)
+            elif done is None and linked_manifest(self.run.folder, upstream) is not None:
+                inputs[upstream] = (self.run.folder / upstream).resolve()
+            else:
+                expected[upstream] = self.estimate(upstream, done)
         nowhere = self.store.root / "work" / "estimate"
-        config = self.run.config.sections[name]
-        externals = stage.externals(config, self.run.source)
-        return stage.estimate(self.context(name, inputs, externals, nowhere / "out", nowhere / "checkpoints"))
+        out, checkpoints = nowhere / "out", nowhere / "checkpoints"
+        context = self.context(name, inputs, self._externals(name), out, checkpoints)
+        self._estimates[known] = stage.estimate(replace(context, expected=expected))
+        return self._estimates[known]
 
     def context(
         self,
@@ -185,25 +208,35 @@ class Planner:
         for name in self.dag.until(until):
             waits_for = [upstream for upstream in self.dag.load(name).INPUTS if upstream not in done]
             if waits_for:
-                stage = self.dag.load(name)
-                self.external_digests(stage.externals(self.run.config.sections[name], self.run.source))
+                self.external_digests(name)
                 reason = f"waits for {', '.join(waits_for)}"
-                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name)))
+                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name, done)))
                 continue
             recipe = self.recipe(name, done)
             entry = self.store.find(name, recipe.key)
             usable = entry.usable if entry is not None else None
             if name in force:
-                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name), recipe))
+                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name, done), recipe))
             elif usable is None:
                 reasons = self.reasons(recipe, entry)
-                plans.append(StagePlan(name, "miss", reasons, self.estimate(name), recipe))
+                plans.append(StagePlan(name, "miss", reasons, self.estimate(name, done), recipe))
             elif usable.missing:
-                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name), recipe))
+                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), recipe))
             else:
                 done[name] = usable
                 plans.append(StagePlan(name, "hit", (), None, recipe, usable))
         return plans
+
+
+def redo_lines(plans: list[StagePlan]) -> list[str]:
+    """What of an existing run would be made again, and why; none where nothing is there yet."""
+    lines = [
+        f"{plan.stage} is made again: {'; '.join(plan.reasons)}"
+        for plan in plans
+        if plan.state in ("miss", "partial") and plan.reasons != (NOT_MADE,)
+    ]
+    after = [plan.stage for plan in plans if plan.state == "waits"]
+    return [*lines, f"then {', '.join(after)}"] if lines and after else lines
 
 
 def cost_line(plans: list[StagePlan]) -> str:
@@ -222,8 +255,9 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
     """Raise StoreError when the disk of ``store`` has less free space than the stages to run will fill."""
     needed = sum(plan.estimate.disk_gb for plan in plans if plan.estimate is not None)
     place = next(folder for folder in (store, *store.parents) if folder.exists())
-    free = shutil.disk_usage(place).free / 1e9
-    if needed > free:
+    disk = shutil.disk_usage(place)
+    free = disk.free / 1e9
+    if disk.total and needed > free:  # a place without a disk (/proc) is told of when it is written to
         raise StoreError(
             f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",

@@ -6,16 +6,18 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from textwrap import wrap
+from typing import Any, Literal, TypeGuard, cast
 
 import tomli_w
 
 from cleargs.errors import ConfigError, InputError, StageError
 from cleargs.files import disk_error, write_bytes
-from cleargs.pipeline.config import Config, check_document, read_toml
+from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import key_config
+from cleargs.pipeline.keys import key_config, settings
 from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.settings import Setting, settings_of
 from cleargs.pipeline.store import STORE_FOLDER
 from cleargs.untrusted import MAX_TEXT_BYTES, read_bytes
 
@@ -25,9 +27,12 @@ LOCK = ".lock"
 """Held by whoever works in the run folder."""
 
 HEADER = """\
-# The full configuration of this run, as `cleargs run` resolved it; stage, explain and show read it.
-# To change a setting, call `cleargs run` again with another --workflow or --set.
+# The full configuration of this run, as `cleargs run` resolved it: all commands on the run read it, and the
+# settings stay until `cleargs run` is told others (--set, --workflow, or --reset to start from the recipe).
 """
+
+WIDTH = 110
+"""Of the comments, characters."""
 
 Device = Literal["cpu", "cuda"]
 
@@ -122,19 +127,74 @@ def _results_alike(run: Run, dag: Dag) -> bool:
 
 
 def _text(run: Run) -> str:
-    document = {"input": str(run.source), "device": run.device}
+    document: Document = {"input": str(run.source), "device": run.device}
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
-    return HEADER + tomli_w.dumps({**document, **run.config.document()})
+    return HEADER + tomli_w.dumps({**document, "seed": run.config.seed}) + _commented(run.config)
 
 
-def noted_source(folder: Path) -> Path | None:
-    """The capture of the run in ``folder``; None when there is no run, or its file is damaged."""
-    try:
-        source = read_toml(folder / RUN_FILE).get("input")
-    except ConfigError:
+def _commented(config: Config) -> str:
+    """All settings as TOML, each below its meaning, range and default; unset ones as a comment."""
+    tables: dict[str, list[str]] = {}
+    for section, model in config.sections.items():
+        values = dict(settings(model.model_dump(mode="json")))
+        for setting in settings_of(section, type(model)):
+            value = values[setting.name.removeprefix(f"{section}.")]
+            lines = tables.setdefault(setting.table, [])
+            lines += wrap(_comment(setting), WIDTH, initial_indent="# ", subsequent_indent="# ")
+            lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
+    return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
+
+
+def _comment(setting: Setting) -> str:
+    facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
+    return f"{setting.meaning} ({facts})" if setting.meaning else facts
+
+
+def _toml_line(name: str, value: Any) -> str:
+    # tomli_w spreads lists over lines.
+    if isinstance(value, list):
+        items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
+        return f"{name} = [{', '.join(items)}]"
+    return tomli_w.dumps({name: value}).rstrip()
+
+
+def kept_settings(folder: Path) -> Document | None:
+    """The settings in the ``run.toml`` of ``folder``, unchecked; None when there is no run.
+
+    Raises ConfigError when the file is damaged.
+    """
+    if not (folder / RUN_FILE).is_file():
         return None
-    return Path(source) if isinstance(source, str) and "\0" not in source else None
+    document = read_toml(folder / RUN_FILE)
+    return {name: value for name, value in document.items() if name not in ("input", "device", "store")}
+
+
+@dataclass(frozen=True)
+class Place:
+    """What the ``run.toml`` of an earlier call says beside its settings; None for what it does not say."""
+
+    source: Path | None = None
+    store: Path | None = None
+    device: Device | None = None
+
+
+def noted_place(folder: Path) -> Place:
+    """Where the run in ``folder`` was made; an empty answer when there is no run, or its file is damaged."""
+    try:
+        document = read_toml(folder / RUN_FILE)
+    except ConfigError:
+        return Place()
+    source, store, device = (document.get(name) for name in ("input", "store", "device"))
+    return Place(
+        Path(source) if _is_path(source) else None,
+        Path(store) if _is_path(store) else None,
+        device if device in ("cpu", "cuda") else None,
+    )
+
+
+def _is_path(value: Any) -> TypeGuard[str]:
+    return isinstance(value, str) and "\0" not in value
 
 
 def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -24,8 +24,8 @@ from cleargs.pipeline.manifest import (
     versions,
     write_manifest,
 )
-from cleargs.pipeline.plan import Planner, Recipe, StagePlan, check_disk, cost_line
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_source
+from cleargs.pipeline.plan import Planner, Recipe, StagePlan, check_disk, cost_line, redo_lines
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_place
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
@@ -67,9 +67,9 @@ class Runner:
             if plan.state != "hit":
                 self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
-        line = cost_line(plans)
-        if line:
-            self.reporter.info(line)
+        for line in (*redo_lines(plans), cost_line(plans)):
+            if line:
+                self.reporter.info(line)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
         same_input = partial(check_same_input, self.run, self.dag, self.store)
@@ -85,9 +85,21 @@ class Runner:
                     outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
+                if name == self.dag.names[0] and outcome.how == "made":
+                    self._revise(plans[1:], done)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
         return outcomes
+
+    def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
+        """Say what the stages to come cost, now that the capture is known."""
+        costs = [
+            replace(plan, estimate=self.planner.estimate(plan.stage, done))
+            for plan in plans
+            if plan.estimate is not None
+        ]
+        if line := cost_line(costs):
+            self.reporter.info(f"now {line}")
 
     def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> Outcome:
         """Bring one stage to a finished folder, from finished stages before it.
@@ -193,11 +205,17 @@ class Runner:
             self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
-        result = stage.run(context)
-        seconds = time.monotonic() - clock
+        earlier = work.seconds
+        try:
+            result = stage.run(context)
+        except BaseException:  # an interruption too: what it had done counts when it goes on
+            work.note_seconds(earlier + time.monotonic() - clock)
+            raise
+        seconds = earlier + time.monotonic() - clock
         cost = {"seconds": seconds, "cpu_seconds": usage.cpu_seconds, "peak_memory_gb": usage.peak_memory_gb}
-        now = self.planner.external_digests(recipe.externals)
-        if any(recipe.origins[role] != digests for role, digests in now.items()):
+        if any(
+            recipe.origins[role] != digests for role, digests in self.planner.external_digests(name).items()
+        ):
             self.store.discard(work.folder)
             raise StageError(
                 f"the input changed while {name} was reading it", hint="the same command starts it again"
@@ -268,7 +286,7 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
 
     A capture that moved is the same when its content is.
     """
-    before = noted_source(run.folder)
+    before = noted_place(run.folder).source
     if before is None or before == run.source:
         return
     first = dag.names[0]

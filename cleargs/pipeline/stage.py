@@ -40,6 +40,8 @@ class StageContext(Generic[C]):
     device: Literal["cpu", "cuda"]
     threads: int
     reporter: Reporter
+    expected: Mapping[str, Estimate] = field(default_factory=dict)
+    """When a cost is estimated: what the upstream stages expect that are not in ``inputs`` yet."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,10 @@ class Estimate:
     minutes: float
     memory_gb: float
     disk_gb: float
+    frames: int = 0
+    """Frames that the stage will publish; 0 where it publishes none."""
+    megapixels: float = 0.0
+    """Of one of them."""
 
 
 class Stage(Protocol):

@@ -44,6 +44,9 @@ from cleargs.untrusted import FAULTS, read_text
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""
 
+SECONDS = "seconds"
+"""File in a work folder: how long the tries before took."""
+
 WAIT = 0.5
 """Seconds between two looks whether another writer is done."""
 
@@ -85,6 +88,19 @@ class Work:
     def checkpoints(self) -> Path:
         """In-stage state, never published."""
         return self.folder / "checkpoints"
+
+    @property
+    def seconds(self) -> float:
+        """What earlier tries of the same work took, as far as they could say."""
+        try:
+            return float((self.folder / SECONDS).read_text(encoding="ascii"))
+        except (OSError, ValueError):
+            return 0.0
+
+    def note_seconds(self, seconds: float) -> None:
+        """Keep the time that all tries took so far; a disk that is full loses it."""
+        with suppress(OSError):
+            (self.folder / SECONDS).write_text(f"{seconds:.3f}", encoding="ascii")
 
 
 class Store:

@@ -24,7 +24,8 @@ PLOTTED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
     """Write a PNG of the differences to the first variant: a row a metric, a panel a set of views; a point a
-    variant and column, with the 95 % interval of the paired difference where there are several samples."""
+    variant and column, with the 95 % interval of the paired difference where there are several samples. Of a
+    single variant the values themselves are shown."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -52,22 +53,31 @@ def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None
 
 
 def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> None:
-    columns, (baseline, *others) = cells.columns(views), cells.variants()
-    for number, variant in enumerate(others):
-        found = [cells.difference(views, column, variant, baseline, metric) for column in columns]
+    columns, variants = cells.columns(views), cells.variants()
+    baseline, *others = variants
+    for number, variant in enumerate(others or variants):
+        found = [
+            cells.difference(views, column, variant, baseline, metric)
+            if others
+            else cells.spread(views, column, variant, metric)
+            for column in columns
+        ]
         shown = [(place, value) for place, value in enumerate(found) if value is not None]
         panel.errorbar(
-            [place + (number - (len(others) - 1) / 2) * 0.1 for place, _ in shown],
+            [place + (number - (max(1, len(others)) - 1) / 2) * 0.1 for place, _ in shown],
             [value.mean for _, value in shown],
             [value.half_width or 0.0 for _, value in shown],
             fmt="o",
             markersize=4,
             label=labels[variant],
         )
-    panel.axhline(0.0, color="black", linewidth=0.8)
+    if others:
+        panel.axhline(0.0, color="black", linewidth=0.8)
     panel.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
     panel.set_xlim(-0.6, len(columns) - 0.4)
-    panel.set_ylabel(f"{metric_title(metric)}, minus {labels[baseline]}", fontsize=8)
+    panel.set_ylabel(
+        f"{metric_title(metric)}, minus {labels[baseline]}" if others else metric_title(metric), fontsize=8
+    )
     panel.set_title(TITLES[views].split(",")[0], fontsize=9)
     panel.grid(axis="y", alpha=0.3)
 

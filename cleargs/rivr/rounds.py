@@ -82,7 +82,7 @@ def run_round(
                 rendered = render(view)
                 restoration = restore(view, rendered)
                 row, image = repair(number, view, exr, rendered, restoration, explain(view), rules)
-                write_exr(out / exr, image)
+                write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
             task.update(done=len(rows), note=_tally(rows))
     return rows

@@ -359,18 +359,24 @@ def _all_finite(tensors: Collection[Tensor]) -> bool:
 
 
 class _Progress:
-    """Iterations a second, PSNR and Gaussians, for the progress bar alone (which adds the time left)."""
+    """Iterations a second, PSNR and Gaussians, for the progress bar alone (which adds the time left).
+
+    The rate counts from the first call on: the steps before it may have waited for kernels to be compiled.
+    """
 
     def __init__(self, task: Task, trainer: Trainer) -> None:
         self._task, self._trainer = task, trainer
-        self._start, self._first = time.perf_counter(), trainer.done
+        self._begin: tuple[float, int] | None = None
 
     def show(self) -> None:
-        trainer, elapsed = self._trainer, time.perf_counter() - self._start
-        rate = (trainer.done - self._first) / max(elapsed, 1e-9)
-        count = trainer.scene.gaussians.num
-        note = f"{rate:.1f} it/s, PSNR {trainer.last_psnr:.2f} dB, {count} Gaussians"
-        self._task.update(done=trainer.done, note=note)
+        trainer, now = self._trainer, time.perf_counter()
+        words = [f"training PSNR {trainer.last_psnr:.2f} dB", f"{trainer.scene.gaussians.num} Gaussians"]
+        if self._begin is None:
+            self._begin = now, trainer.done
+        else:
+            start, first = self._begin
+            words.insert(0, f"{(trainer.done - first) / max(now - start, 1e-9):.1f} it/s")
+        self._task.update(done=trainer.done, note=", ".join(words))
 
 
 def _meter(config: TrainConfig, device: torch.device) -> Meter | None:

@@ -66,6 +66,19 @@ def test_no_engine_is_said_with_its_remedy(
     assert "not installed" in cause and "make cluster" in remedy
 
 
+def test_a_sheet_is_checked_without_an_engine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CLEARGS_SNAKEMAKE", raising=False)
+    monkeypatch.setattr("sys.prefix", str(tmp_path / "venv"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    (tmp_path / "hall.mp4").touch()
+    (tmp_path / "sheet.csv").write_text("name,input\nhall,hall.mp4\n")
+    assert invoke(["batch", str(tmp_path / "sheet.csv"), "--dry-run"]) == 0
+    streams = capsys.readouterr()
+    assert "1 scenes, 5 stages to do" in streams.out and "note: Snakemake" in streams.err
+
+
 @pytest.mark.parametrize("named", ["", "nowhere"])
 def test_an_engine_that_is_no_program_is_said_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, named: str

@@ -25,9 +25,13 @@ PLANES = ((4.0, -3.0, -2.5, 6.0), (3.0, -1.4, -0.9, 1.5), (2.5, 0.3, -0.3, 1.3))
 
 @dataclass
 class RecordingReporter(SilentReporter):
-    """Keeps the warnings."""
+    """Keeps the warnings and the remarks."""
 
     warnings: list[str] = field(default_factory=list)
+    infos: list[str] = field(default_factory=list)
+
+    def info(self, text: str) -> None:
+        self.infos.append(text)
 
     def warn(self, text: str) -> None:
         self.warnings.append(text)
@@ -38,6 +42,7 @@ class Ingested:
     out: Path
     result: StageResult
     warnings: list[str]
+    infos: list[str]
 
 
 Ingest = Callable[..., Ingested]
@@ -67,7 +72,7 @@ def ingest(tmp_path: Path) -> Ingest:
             reporter=reporter,
         )
         stage = importlib.import_module("cleargs.stages.ingest")
-        return Ingested(out, stage.run(context), reporter.warnings)
+        return Ingested(out, stage.run(context), reporter.warnings, reporter.infos)
 
     return run
 

@@ -89,14 +89,6 @@ def test_zero_byte_and_broken_images(images: Path, ingest: Ingest) -> None:
         ingest(images, "two")
 
 
-def test_mixed_sizes(images: Path, ingest: Ingest) -> None:
-    picture = cv2.imread(str(images / "view4.png"))
-    cv2.imwrite(str(images / "view4.png"), cv2.resize(picture, (WIDTH // 2, HEIGHT // 2)))
-    with pytest.raises(InputError, match="2 sizes") as caught:
-        ingest(images)
-    assert "ingest.shared_camera=false" in caught.value.hint
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_images(images: Path, count: int) -> None:
     for path in sorted(images.iterdir())[count:]:

@@ -263,6 +263,42 @@ def test_test_frames_give_no_colour(posed: Path, ingest: Ingest) -> None:
     assert np.array_equal(points.rgb, np.rint(sums / counts[:, None]).astype(np.uint8))
 
 
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
+def test_transparency_is_a_mask(posed: Path, ingest: Ingest, depth: type[np.unsignedinteger]) -> None:
+    for index in range(3):
+        path = posed / "images" / f"{index:03d}.png"
+        picture = cv2.imread(str(path)).astype(depth) * (1 if depth is np.uint8 else 257)
+        most = np.iinfo(depth).max
+        alpha = np.full((HEIGHT, WIDTH, 1), most if index == 2 else 0, depth)
+        alpha[:, WIDTH // 2 :] = most
+        cv2.imwrite(str(path), np.concatenate([picture, alpha], axis=2))
+    done = ingest(posed, depth.__name__)
+    frames = load_frames(done.out)
+    assert [frame.mask is not None for frame in frames] == [True, True] + [False] * 8, "2 is opaque all over"
+    published = cv2.imread(str(done.out / str(frames[0].mask)), cv2.IMREAD_UNCHANGED)
+    assert (published[:, : WIDTH // 2] == 0).all() and (published[:, WIDTH // 2 :] == 255).all()
+    assert any(line.startswith("2 of 10 images are transparent") for line in done.infos)
+
+
+def test_images_of_one_size_share_a_camera(images: Path, ingest: Ingest) -> None:
+    """A folder of two sizes was refused; with a camera a frame only a few could be placed."""
+    for index in range(0, 10, 2):
+        path = images / f"view{index}.png"
+        small = cv2.resize(
+            cv2.imread(str(path)), (3 * WIDTH // 4, 3 * HEIGHT // 4), interpolation=cv2.INTER_AREA
+        )
+        cv2.imwrite(str(path), small)
+    done = ingest(images, camera_model="SIMPLE_PINHOLE")
+    frames = load_frames(done.out)
+    assert done.result.summary["registered"] == 10
+    assert {(frame.width, frame.height, frame.fx) for frame in frames[::2]} == {
+        (frames[0].width, frames[0].height, frames[0].fx)
+    }
+    assert len({frame.fx for frame in frames}) == 2
+    # The same lens: their focal lengths are as their sizes, as nearly as ten small images tell (3 %).
+    assert frames[0].fx / frames[1].fx == pytest.approx(0.75, rel=0.03)
+
+
 def test_masks_follow_their_images(posed: Path, ingest: Ingest) -> None:
     (posed / "masks").mkdir()
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)

@@ -8,13 +8,20 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Literal
 
 import pyarrow as pa
 import pytest
 from toy import Bench
 
+from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
+from cleargs.cli.outcome import print_outcomes
+from cleargs.cli.progress import LineTask
 from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.pipeline.keys import KeyParts
+from cleargs.pipeline.manifest import FileRecord, Manifest
+from cleargs.pipeline.runner import Outcome
 from cleargs.tables import column
 
 
@@ -54,10 +61,97 @@ def shell(
 def test_run_twice(shell: Shell) -> None:
     code, out, err = shell.run()
     assert code == 0
-    assert "total        made in" in out and "results:" in out
+    assert out.startswith(f"results: {shell.bench.folder}/total\n") and "time: " in out
+    assert f"next: cleargs show {shell.bench.folder}\n" in out
     assert "expected about" in err and "square: starts (not made yet)" in err
     code, out, err = shell.run()
-    assert code == 0 and out.count("already there") == 3 and err == ""
+    assert code == 0 and "already there: count, square, total\n" in out and err == ""
+
+
+def again(shell: Shell, *arguments: str) -> tuple[int, str, str]:
+    """``cleargs run`` on the same folder without any settings."""
+    return shell("run", str(shell.bench.capture), "-o", str(shell.bench.folder), *arguments)
+
+
+def test_an_existing_run_keeps_its_settings_and_says_so(shell: Shell) -> None:
+    shell.run("--set", "square.power=3", "--seed", "5")
+    shell.bench.work_done()
+    code, _, err = again(shell)
+    assert code == 0 and shell.bench.work_done() == []
+    assert "square.power=3" in err and "seed=5" in err and "--reset" in err
+    again(shell, "--set", "count.limit=4")
+    assert (shell.bench.folder / "total" / "total.txt").read_text() == "plain 36.0 5", "0 + 1 + 8 + 27"
+    assert shell("explain", str(shell.bench.folder))[1].count("hit") == 3
+
+
+def test_reset_and_workflow_start_from_the_recipe(shell: Shell) -> None:
+    shell.run("--set", "square.power=3")
+    shell.run("--set", "total.offset=1")
+    total = shell.bench.folder / "total" / "total.txt"
+    assert total.read_text() == "plain 56.0 0", "an explicit recipe forgets the power"
+    code, _, err = again(shell, "--reset", "--workflow", shell.recipe)
+    assert code == 0 and total.read_text() == "plain 55.0 0" and "--reset" not in err
+
+
+def test_run_says_what_it_will_redo_before_it_begins(shell: Shell) -> None:
+    assert "made again" not in shell.run()[2]
+    _, _, err = again(shell, "--set", "square.power=3")
+    lines = err.splitlines()
+    assert lines[0] == "square is made again: setting square.power: 2 -> 3"
+    assert lines[1] == "then total"
+    assert lines[2].startswith("expected about") and lines[3].startswith("square: starts")
+
+
+def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
+    _, _, err = shell.run("--set", "count.limit=3")
+    first, revised = (line for line in err.splitlines() if "expected about" in line)
+    assert first == (
+        "expected about 6.4 min: count 0.1 min 0.1 GB, disk 0.0 GB; square 6.0 min 0.1 GB, disk 0.0 GB; "
+        "total 0.3 min 0.1 GB, disk 0.0 GB"
+    )
+    assert revised.startswith("now expected about 3.3 min: square 3.0 min")
+    assert err.index(revised) > err.index("count: starts")
+
+
+def test_a_place_that_is_no_disk_is_named(shell: Shell) -> None:
+    code, _, err = shell("run", str(shell.bench.capture), "-o", "/proc/x", "--workflow", shell.recipe)
+    assert code == 1 and "error: cannot write /proc/x" in err and "are free" not in err
+
+
+def test_an_existing_run_keeps_its_store(shell: Shell, tmp_path: Path) -> None:
+    shell.run("--store", str(tmp_path / "shared"))
+    shell.bench.work_done()
+    assert again(shell)[0] == 0 and shell.bench.work_done() == []
+    assert not shell.bench.store.exists()
+
+
+def test_settings_that_cannot_be_kept(shell: Shell) -> None:
+    shell.run()
+    for text in ("[half", "[square]\npowre = 3\n"):
+        (shell.bench.folder / "run.toml").write_text(text)
+        code, _, err = again(shell)
+        assert code == 2 and "--reset" in err.splitlines()[-1]
+
+
+def test_settings_lists_what_the_models_say(shell: Shell) -> None:
+    found = json.loads(shell("settings", "count", "--json")[1])
+    assert found[0] == {
+        "name": "count.limit",
+        "default": 100,
+        "allowed": "a whole number, at least 1 and at most 1000",
+        "meaning": "at most so many numbers",
+    }
+    assert [setting["name"] for setting in found][-1] == "count.inner.depth"
+    code, out, _ = shell("settings")
+    assert code == 0 and "at most so many numbers" in out and "power" in out and "offset" in out
+    assert shell("settings", "cuont")[2].endswith("hint: did you mean count?\n")
+
+
+def test_the_page_of_settings_is_current(capsys: pytest.CaptureFixture[str]) -> None:
+    """Made anew by: cleargs settings --markdown > docs/settings.md"""
+    assert invoke(["settings", "--markdown"]) == 0
+    page = Path(__file__).parents[2] / "docs" / "settings.md"
+    assert capsys.readouterr().out == page.read_text(encoding="utf-8")
 
 
 def test_run_json_is_json_and_nothing_else(shell: Shell) -> None:
@@ -112,6 +206,20 @@ def test_show(shell: Shell) -> None:
     )
 
 
+def test_show_calls_stale_what_is_stale(shell: Shell) -> None:
+    shell.run()
+    again(shell, "--set", "square.power=3", "--until", "count")
+    folder = str(shell.bench.folder)
+    code, out, _ = shell("show", folder)
+    assert code == 0 and "square is stale: setting square.power: 2 -> 3" in out
+    rows = [line.split()[:2] for line in out.splitlines()[1:4]]
+    assert rows == [["count", "complete"], ["square", "stale"], ["total", "stale"]]
+    assert json.loads(shell("show", folder, "--json")[1])["square"]["stale"] == [
+        "setting square.power: 2 -> 3"
+    ]
+    assert "square: stale" in shell("show", folder, "square")[1]
+
+
 def test_gc(shell: Shell) -> None:
     shell.run("--set", "square.power=3")
     shell.run()
@@ -120,7 +228,7 @@ def test_gc(shell: Shell) -> None:
     assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
     shell("gc", folder)
     assert not any(Path(item["folder"]).exists() for item in garbage)
-    assert shell.run()[1].count("already there") == 3
+    assert "already there: count, square, total" in shell.run()[1]
 
 
 def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -140,7 +248,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
         (["run", ".", "-o", "r", "--workflow", "fast"], 2, "there is no workflow 'fast'", "choose default"),
         (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
         (["explain", "nowhere"], 2, "is no run", "cleargs run INPUT"),
-        (["show", "nowhere"], 2, "is no run", "cleargs run -o"),
+        (["show", "nowhere"], 2, "is no run", "cleargs run INPUT"),
         (["gc"], 2, "neither a run nor a store", "--store"),
         (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "the stages are count, square, total"),
     ],
@@ -158,7 +266,7 @@ def test_damaged_run_file_is_written_anew(shell: Shell) -> None:
     (shell.bench.folder / "run.toml").write_text("[half")
     assert shell("explain", str(shell.bench.folder))[0] == 2
     code, out, _ = shell.run()
-    assert code == 0 and out.count("already there") == 3
+    assert code == 0 and "already there: count, square, total" in out
     assert shell("explain", str(shell.bench.folder))[0] == 0
 
 
@@ -276,3 +384,82 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     )
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
+
+
+def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def outcome(stage: str, how: Literal["found", "made"], files: list[str], **summary: object) -> Outcome:
+        parts = KeyParts(
+            stage=stage, version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
+        )
+        manifest = Manifest(
+            stage=stage,
+            key="",
+            status="complete",
+            missing=(),
+            inherited=(),
+            parts=parts,
+            origins={},
+            files={name: FileRecord(size=1, digest="") for name in files},
+            digest="",
+            versions={},
+            started="",
+            seconds=90.0,
+            device="cpu",
+            summary=summary,
+        )
+        return Outcome(stage, how, manifest, tmp_path)
+
+    held_back = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
+    outcomes = [
+        outcome("ingest", "found", [], frames=24, registered=22, test=0),
+        outcome("rva", "found", [], roles={"strong": 7}),
+        outcome("g0", "made", ["scene.ply"], psnr_active=24.0, views=22),
+        outcome("rivr", "made", ["scene.ply", "candidates.png"], held_back=held_back),
+        outcome("consolidate", "made", ["scene.ply", "before_after.png"], repairs=11, held_back=held_back),
+    ]
+    run = tmp_path / "my room"
+    print_outcomes(outcomes, run)
+    assert capsys.readouterr().out.splitlines() == [
+        f"scene: {run}/consolidate/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
+        "quality: PSNR 23.6 dB (first scene 22.6) on 2 good frames left unrepaired; trained on, "
+        "so unseen views are worse",
+        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); already there: ingest, rva",
+        f"look at: {run}/consolidate/before_after.png",
+        f"next: cleargs export '{run}' -o 'my room.ply'",
+    ]
+
+
+def test_the_time_left_counts_from_the_first_step_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
+    clock = [0.0]
+    monkeypatch.setattr("cleargs.cli.progress.time.monotonic", lambda: clock[0])
+    task = LineTask("G0", 1000)
+    for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
+        clock[0] = now
+        task.update(done=done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left"]
+
+
+def test_a_gpu_that_is_not_used_is_told_of(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("cleargs.cli.common.cuda_obstacle", lambda: None)
+    assert "--device cuda" in shell.run()[2]
+    assert "--device cuda" not in shell.run("--device", "cpu")[2]
+
+
+def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("os.cpu_count", lambda: 6)
+    assert threads_or_all(None) == 6
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert threads_or_all(None) == 1
+
+
+def test_a_run_is_no_capture(shell: Shell) -> None:
+    shell.run()
+    code, _, err = shell("run", str(shell.bench.folder), "-o", str(shell.bench.root / "other"))
+    assert code == 2 and "is a run, not a capture" in err and str(shell.bench.capture) in err

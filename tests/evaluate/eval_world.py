@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,12 +15,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Pose
-from cleargs.capture.tables import FRAMES
+from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.capture.world import Similarity
 from cleargs.evaluate.evaluate import EvalOptions
+from cleargs.formation.colour import Exposure, write_exposure
 from cleargs.media.image import to_uint8, write_mask, write_rgb
-from cleargs.pipeline.keys import KeyParts
-from cleargs.pipeline.manifest import Manifest, write_manifest
+from cleargs.pipeline.config import check_document
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.digest import DigestMemo, file_digest
+from cleargs.pipeline.keys import KeyParts, key_config
+from cleargs.pipeline.manifest import FileRecord, Manifest, linked_manifest, published_files, write_manifest
+from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
+from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
@@ -134,7 +141,6 @@ def write_run(
     """A run as far as evaluation reads it: ingest, and the scene of g0."""
     ingest = folder / "ingest"
     (ingest / "images").mkdir(parents=True)
-    (folder / "run.toml").write_text("")
     rows = []
     for index, view in enumerate(views):
         image = f"images/{index:06d}.png"
@@ -160,29 +166,61 @@ def write_run(
             }
         )
     write_table(ingest / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
+    config = check_document(installed(), {})
+    write_run_file(Run(folder.absolute(), folder.absolute() / "capture", config, folder / ".store", "cpu"))
+    note_finished(folder, "ingest", {"poses": poses, "similarity": WORLD.to_json()})
+    (folder / "rva").mkdir()
+    note_finished(folder, "rva")
+    add_scene(folder, "g0", scene)
+    return folder
+
+
+def add_scene(folder: Path, stage: str, scene: Scene) -> None:
+    """RUN/<stage> with a scene that was trained on the training frames."""
+    (folder / stage).mkdir()
+    write_ply(folder / stage / "scene.ply", scene)
+    train = [frame.frame_id for frame in load_frames(folder / "ingest") if frame.split == "train"]
+    write_exposure(folder / stage / "exposure.parquet", Exposure.identity(train))
+    note_finished(folder, stage)
+
+
+def note_finished(folder: Path, stage: str, summary: Mapping[str, Any] | None = None) -> None:
+    """The manifest of RUN/<stage>: made with the run's settings from what lies before it."""
+    run = read_run_file(folder, installed())
+    made = {name: found for name in installed().names if (found := linked_manifest(folder, name)) is not None}
+    planner = Planner(installed(), run, Store(run.store, DigestMemo(folder / "memo")), 1, SilentReporter())
+    inputs, origins = planner.inputs(stage, made)
     parts = KeyParts(
-        stage="ingest", version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
+        stage=stage,
+        version=1,
+        config=key_config(run.config.sections[stage]),
+        inputs=inputs,
+        externals={},
+        seed=0,
+        device="cpu",
+        libraries={},
     )
+    files = {
+        name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
+        for name, file in published_files(folder / stage).items()
+    }
     manifest = Manifest(
-        stage="ingest",
+        stage=stage,
         key=parts.key,
         status="complete",
         missing=(),
         inherited=(),
         parts=parts,
-        origins={},
-        files={},
+        origins=origins,
+        files=files,
         digest="",
         versions={},
         started="",
         seconds=0.0,
         device="cpu",
-        summary={"poses": poses, "similarity": WORLD.to_json()},
+        summary=dict(summary or {}),
     )
-    write_manifest(ingest, manifest)
-    (folder / "g0").mkdir()
-    write_ply(folder / "g0" / "scene.ply", scene)
-    return folder
+    write_manifest(folder / stage, manifest)
 
 
 def turned(camera: Camera, degrees: float) -> Camera:

@@ -8,12 +8,25 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from eval_world import WORLD, cameras, make_scene, picture, turned, write_reference, write_run
+from eval_world import (
+    WORLD,
+    add_scene,
+    cameras,
+    make_scene,
+    note_finished,
+    picture,
+    turned,
+    write_reference,
+    write_run,
+)
 
+from cleargs.capture.tables import FRAMES
 from cleargs.cli.main import invoke
 from cleargs.media.image import write_rgb
-from cleargs.splat.ply import write_ply
+from cleargs.tables import write_table
 
 Shell = Callable[..., tuple[int, str, str]]
 
@@ -33,8 +46,7 @@ def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     run = write_run(tmp_path / "run", make_scene(), cameras(), test=[2])
-    (run / "rivr").mkdir()
-    write_ply(run / "rivr" / "scene.ply", make_scene(seed=1))
+    add_scene(run, "rivr", make_scene(seed=1))
     return run
 
 
@@ -99,6 +111,57 @@ def test_metrics_that_are_not_installed(
     assert code == 0 and "lpips_alex: not installed: run `cleargs models install lpips` once" in out
     document = json.loads((run / "eval" / "truth" / "eval.json").read_text())["evaluations"][0]
     assert document["means"]["lpips_alex"] is None and document["means"]["clarity-net"] is not None
+
+
+def test_a_stale_scene_is_scored_only_on_demand_and_then_says_what_it_was_trained_on(
+    shell: Shell, run: Path, truth: Path
+) -> None:
+    # Other frames are held out than those that the scene of g0 was not trained on.
+    frames = pq.read_table(run / "ingest" / "frames.parquet").to_pylist()
+    for row in frames:
+        row["split"] = "test" if row["frame_id"] in (2, 4) else "train"
+    write_table(run / "ingest" / "frames.parquet", pa.Table.from_pylist(frames, FRAMES), FRAMES)
+    note_finished(run, "ingest", {"poses": "input", "similarity": WORLD.to_json()})
+    fails(shell(run, "--stage", "g0", *FAST), "g0 is stale: input ingest/frames.parquet changed")
+    code, out, _ = shell(run, "--stage", "g0", "--stale", *FAST)
+    first, second = out.splitlines()[:2]
+    assert code == 0 and first == "note: 1 of 2 views are of frames that the scene was trained on"
+    assert second.startswith("g0 is stale: ")
+    found = json.loads((run / "eval" / "holdout" / "eval.json").read_text())["evaluations"][0]
+    assert found["trained_on"] == 1
+
+
+def test_views_of_frames_that_were_trained_on_are_told_from_others(
+    shell: Shell, run: Path, truth: Path, tmp_path: Path
+) -> None:
+    _, out, _ = shell(run, "--reference", truth, *FAST)
+    assert out.startswith("note: 5 of 6 views are of frames that the scene was trained on\n")
+    # Equal stems at other poses are other views.
+    novel = write_reference(tmp_path / "novel", make_scene(), [turned(view, 4.0) for view in cameras()])
+    _, out, _ = shell(run, "--reference", novel, *FAST)
+    assert "trained on" not in out
+    _, out, _ = shell(run / "g0" / "scene.ply", "--reference", truth, *FAST)
+    assert out.startswith("note: which frames the scene was trained on is not known\n")
+
+
+def test_an_evaluation_stays_beside_those_of_other_stages_and_options(
+    shell: Shell, run: Path, truth: Path
+) -> None:
+    def noted() -> list[tuple[str, bool]]:
+        document = json.loads((run / "eval" / "truth" / "eval.json").read_text())
+        return [(found["subject"], found["options"]["align_colour"]) for found in document["evaluations"]]
+
+    shell(run, "--reference", truth, "--stage", "g0", *FAST)
+    shell(run, "--reference", truth, "--stage", "rivr", *FAST)
+    shell(run, "--reference", truth, "--stage", "g0", "--align-colour", *FAST)
+    shell(run, "--reference", truth, "--stage", "g0", *FAST)
+    assert noted() == [("g0", False), ("g0", True), ("rivr", False)]
+    rows = pq.read_table(run / "eval" / "truth" / "eval.parquet").to_pylist()
+    assert [row["adjusted"] for row in rows[::6]] == ["nothing", "colours", "nothing"]
+    shutil.rmtree(run / "rivr")  # made anew with other settings: its old figures are no longer its own
+    add_scene(run, "rivr", make_scene(seed=2))
+    shell(run, "--reference", truth, "--stage", "g0", *FAST)
+    assert noted() == [("g0", False), ("g0", True)]
 
 
 # -- bad input ---------------------------------------------------------------------------------------------

@@ -49,6 +49,23 @@ def test_other_readers_find_half_channels_by_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(green, image.layers["restored"][..., 1])
 
 
+def test_the_shown_layer_is_what_programs_without_layers_find(tmp_path: Path) -> None:
+    image = layered()
+    write_exr(tmp_path / "a.exr", image, shown="fused")
+    write_exr(tmp_path / "b.exr", image, shown="fused")
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+    source = ImageInput.open(str(tmp_path / "a.exr"))
+    names, pixels = list(source.spec().channelnames), source.read_image(HALF)
+    source.close()
+    for channel in range(3):
+        plain = pixels[..., names.index("RGB"[channel])]
+        np.testing.assert_array_equal(plain, image.layers["fused"][..., channel])
+    back = read_exr(tmp_path / "a.exr", "cleargs:")
+    assert set(back.layers) == set(NAMES), "the plain channels are no layer of their own"
+    for name in NAMES:
+        np.testing.assert_array_equal(back.layers[name], image.layers[name])
+
+
 def test_equal_content_gives_equal_bytes_and_no_date(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", layered())
     write_exr(tmp_path / "b.exr", layered())

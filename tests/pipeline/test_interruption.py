@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from toy import Bench
 
+from cleargs.pipeline.manifest import read_manifest
+
 PROGRAM = Path(__file__).with_name("toy.py")
 
 
@@ -85,8 +87,12 @@ def test_interrupted_run_says_so_and_goes_on(bench: Bench, number: signal.Signal
     assert process.returncode == 130
     assert "the same command goes on" in errors and "Traceback" not in errors
     bench.work_done()
+    (noted,) = (bench.store / "work").glob("*/seconds")
+    before = float(noted.read_text())
+    assert before > 0.0
     bench.run()
     assert "square 0.txt" not in bench.work_done()
+    assert read_manifest(bench.folder / "square").seconds >= before, "the time before the interruption counts"
 
 
 def test_two_runs_of_different_inputs_in_one_folder(bench: Bench) -> None:

@@ -19,9 +19,10 @@ from cleargs.pipeline.config import (
     read_toml,
     recipe_names,
 )
-from cleargs.pipeline.dag import Dag, installed
+from cleargs.pipeline.dag import Dag, installed, load_stage
 from cleargs.pipeline.keys import key_config
-from cleargs.pipeline.run_file import read_run_file, write_run_file
+from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
+from cleargs.pipeline.settings import SYNONYMS, names_of, settings_of
 
 
 @pytest.fixture
@@ -92,6 +93,50 @@ def test_errors_teach(dag: Dag, text: str, cause: str, hint: str) -> None:
     assert cause in str(error.value)
     assert hint in error.value.hint
     assert error.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("g0.iterations=3000", "did you mean g0.steps?"),
+        ("iterations=3000", "did you mean g0.steps?"),
+        ("consolidate.iterations=30", "did you mean consolidate.distil.steps?"),
+        ("rivr.steps=30", "did you mean rivr.distil.steps?"),
+        ("ingest.resolution=640", "did you mean ingest.max_size?"),
+        ("g0.max_gaussians=3", "did you mean g0.budget?"),
+        ("random_seed=3", "did you mean seed?"),
+        ("g0.threads=3", "that is an option: --threads"),
+    ],
+)
+def test_a_name_from_elsewhere_suggests_by_meaning(text: str, hint: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_document(installed(), parse_override(text))
+    assert error.value.hint == hint
+
+
+def test_every_synonym_leads_to_a_setting() -> None:
+    names = {
+        full.rpartition(".")[2] for name in installed().names for full in names_of(load_stage(name).CONFIG)
+    }
+    assert set(SYNONYMS.values()) <= names | {"seed"}
+    assert not SYNONYMS.keys() & {"steps", "max_size", "budget"}
+
+
+def test_every_setting_has_a_meaning_and_a_range() -> None:
+    for name in installed().names:
+        for setting in settings_of(name, load_stage(name).CONFIG):
+            assert setting.meaning and setting.allowed, setting.name
+
+
+def test_run_file_tells_what_each_setting_means(bench: Bench) -> None:
+    document = check_document(installed(), {"ingest": {"holdout": "every:8"}})
+    write_run_file(Run(bench.folder, bench.capture, document, bench.store, "cpu"))
+    text = (bench.folder / "run.toml").read_text()
+    comment = "# at most so many frames, evenly in time (a whole number, at least 3; default 150)"
+    assert f"{comment}\nmax_frames = 150\n" in text
+    assert 'holdout = "every:8"' in text
+    assert "default unset)\n# fps =\n" in text, "a setting without a value is there too"
+    assert read_run_file(bench.folder, installed()).config == document
 
 
 def test_recipe_file_then_overrides_then_seed(dag: Dag, tmp_path: Path) -> None:

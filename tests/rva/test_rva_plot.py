@@ -87,5 +87,5 @@ def test_scores_of_another_ingest_are_not_drawn_over_this_one(shell: Shell, name
     link.unlink()
     link.symlink_to(other)
     code, _, err = shell.plot("--plot")
-    assert code == 2 and "another ingest" in err and "cleargs stage rva" in err
+    assert code == 2 and "rva is stale: input ingest/" in err and "cleargs explain" in err
     assert not (shell.folder / "rva-plot.png").exists()

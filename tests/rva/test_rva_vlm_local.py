@@ -129,11 +129,11 @@ def test_the_weights_are_part_of_the_key(
     assert run(tmp_path / "a", model_dir) == 0
     capsys.readouterr()
     assert run(tmp_path / "a", copy) == 0
-    assert "rva          already there" in capsys.readouterr().out, "the same model elsewhere"
+    assert "already there: ingest, rva" in capsys.readouterr().out, "the same model elsewhere"
     config = copy / "generation_config.json"
     config.write_text(config.read_text() + "\n")
     assert run(tmp_path / "a", copy) == 0
-    assert "rva          made in" in capsys.readouterr().out
+    assert "(rva " in capsys.readouterr().out
 
 
 def test_a_reply_cut_off_is_no_score(

@@ -1,0 +1,65 @@
+"""What a run is expected to cost, before anything of it exists."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cleargs.errors import InputError
+from cleargs.media.image import image_size
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.stage import Estimate
+from cleargs.pipeline.store import Store
+from cleargs.progress import SilentReporter
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(20):
+        cv2.imwrite(str(folder / f"{number}.jpg"), np.zeros((600, 800, 3), np.uint8))
+    return folder
+
+
+def costs(source: Path, *overrides: str, threads: int = 2) -> dict[str, Estimate]:
+    run = Run(source.parent / "run", source, load_config(installed(), "default", overrides), source, "cpu")
+    with DigestMemo(source.parent / "memo") as memo:
+        planner = Planner(installed(), run, Store(source, memo), threads, SilentReporter())
+        return {plan.stage: plan.estimate for plan in planner.plan() if plan.estimate is not None}
+
+
+def test_size_and_number_of_frames_come_from_the_files(photos: Path) -> None:
+    plain = costs(photos)
+    assert plain["ingest"].frames == 20 and plain["ingest"].megapixels == 0.48
+    small = costs(photos, "ingest.max_size=400")
+    assert small["ingest"].megapixels == 0.12
+    # Of the trainings a share stays that each step costs, whatever its pixels.
+    assert 0.2 < small["rivr"].minutes / plain["rivr"].minutes < 0.3
+    assert small["rivr"].disk_gb == pytest.approx(plain["rivr"].disk_gb / 4)
+    assert small["g0"].minutes < plain["g0"].minutes
+    few = costs(photos, "ingest.max_frames=10")
+    assert few["ingest"].frames == 10 and few["rivr"].minutes < plain["rivr"].minutes
+
+
+def test_threads_count(photos: Path) -> None:
+    one, two, eight = (costs(photos, threads=threads) for threads in (1, 2, 8))
+    for stage in ("ingest", "g0", "rivr", "consolidate"):
+        assert one[stage].minutes > two[stage].minutes > eight[stage].minutes > two[stage].minutes / 4
+
+
+def test_the_size_of_an_image_is_read_from_its_header(photos: Path) -> None:
+    assert image_size(photos / "3.jpg") == (800, 600)
+    data = (photos / "3.jpg").read_bytes()
+    (photos / "cut.jpg").write_bytes(data[: len(data) // 2])
+    assert image_size(photos / "cut.jpg") == (800, 600), "the pixels are not looked at"
+    (photos / "none.jpg").write_bytes(b"no image")
+    with pytest.raises(InputError, match="not an image"):
+        image_size(photos / "none.jpg")

@@ -1,0 +1,69 @@
+"""``cleargs export``: what it refuses, and what it writes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
+
+from eval_world import add_scene, cameras, make_scene, write_run
+
+from cleargs.cli.main import invoke
+from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.splat.ply import read_ply
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run", make_scene(count=20), cameras())
+
+
+def export(run: Path, output: Path, *more: str) -> int:
+    return invoke(["export", str(run), "-o", str(output), *more])
+
+
+def test_the_ending_says_what_is_written(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("x.splat", "x", "x.ply.gz"):
+        assert export(run, tmp_path / name) == 2 and not (tmp_path / name).exists()
+        cause, remedy = capsys.readouterr().err.splitlines()
+        assert "no ending that says what to write" in cause and ".ply" in remedy
+    assert export(run, tmp_path / "x.splat", "--format", "ply") == 0, "told explicitly"
+    assert export(run, tmp_path / "x.PLY") == 0
+    assert read_ply(tmp_path / "x.PLY").gaussians.num == 20
+
+
+def test_an_existing_file_stays_without_force(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.ply").write_text("mine")
+    assert export(run, tmp_path / "mine.ply") == 2 and (tmp_path / "mine.ply").read_text() == "mine"
+    assert "exists already" in capsys.readouterr().err
+    assert export(run, tmp_path / "mine.ply", "--force") == 0
+    assert read_ply(tmp_path / "mine.ply").gaussians.num == 20
+
+
+def test_a_stage_without_a_scene_is_named(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(run, tmp_path / "x.ply", "--stage", "rva") == 2
+    cause, remedy = capsys.readouterr().err.splitlines()
+    assert "rva has no scene" in cause and "g0" in remedy
+
+
+def test_a_stale_scene_is_written_only_on_demand(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_scene(run, "rivr", make_scene(count=30))
+    text = (run / RUN_FILE).read_text()
+    (run / RUN_FILE).write_text(text.replace("tau_R = 0.7\n", "tau_R = 0.95\n"))
+    assert export(run, tmp_path / "x.ply") == 2 and not (tmp_path / "x.ply").exists()
+    cause, remedy = capsys.readouterr().err.splitlines()
+    assert "rivr is stale" in cause and "--stale" in remedy
+    assert export(run, tmp_path / "x.ply", "--stale") == 0
+    assert capsys.readouterr().out.startswith("rivr is stale: ")
+    assert read_ply(tmp_path / "x.ply").gaussians.num == 30
