@@ -11,6 +11,7 @@ import gzip
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,7 +86,7 @@ def camera_of(frame: Frame) -> Camera:
     )
 
 
-def viewer_pose(camera: Camera) -> dict[str, object]:
+def viewer_pose(camera: Camera) -> dict[str, Any]:
     """``camera`` as the viewer takes it: position, target, and the field of view of the longer side, degrees."""
     forward = camera.world_to_camera[2, :3]
     side, focal = (
