@@ -24,7 +24,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
     "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
     "batch-status": ("cleargs.cli.batch_status", "Say how far each scene of a sheet is."),
-    "report": ("cleargs.cli.report", "Write a page that shows a run: the scene in 3D, every frame, what it took."),
+    "report": (
+        "cleargs.cli.report",
+        "Write a page that shows a run: the scene in 3D, and every frame.",
+    ),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),

@@ -17,7 +17,7 @@ from cleargs.tables import read_table
 WIDTH, HEIGHT = 640, 220
 """Of a curve's drawing area, in units of its SVG."""
 
-_POINTS = 240  # of a curve: more than a screen shows apart
+_POINTS = 120  # of a curve
 _LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
 
 
@@ -46,7 +46,7 @@ class Curve:
 
 
 def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
-    """Loss, PSNR and Gaussians over the steps of the stages that trained, on real frames. Raises StoreError."""
+    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError."""
     tables, parts, offset = [], [], 0
     for stage in stages:
         path = run / stage / "train.parquet"
@@ -86,7 +86,7 @@ def _curve(
     digits: int,
 ) -> Curve:
     """Medians of equal stretches: a step shows one view, and views differ more than steps do."""
-    stretches = np.array_split(np.arange(len(steps)), min(_POINTS, max(1, len(steps) // 4)))
+    stretches = np.array_split(np.arange(len(steps)), min(_POINTS, max(1, len(steps) // 6)))
     x = np.array([steps[part].mean() for part in stretches]) / max(total - 1, 1) * WIDTH
     y = np.array([np.median(values[part]) for part in stretches])
     ticks = _nice(float(y.min()), float(y.max()))

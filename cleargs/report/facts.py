@@ -53,7 +53,7 @@ def stage_rows(
     plans: Mapping[str, StagePlan],
     last: Mapping[str, str],
 ) -> list[StageRow]:
-    """One row for every stage of the run; ``last``: stage -> ``made`` or ``found``, as the last run had it."""
+    """One row for every stage; ``last``: stage -> ``made`` or ``found``, as the last run had it."""
     total = sum(manifest.seconds for manifest in manifests.values()) or 1.0
     rows = []
     for name in names:
@@ -92,7 +92,7 @@ def _changes(model: BaseModel, default: BaseModel) -> Iterator[tuple[str, Any, A
 
 
 def command(run: Run, dag: Dag) -> str:
-    """The ``cleargs run`` that makes this run, from the folder that holds it: the nearest recipe, the rest set."""
+    """The ``cleargs run`` that makes this run, called beside its folder: the nearest recipe, the rest set."""
     wanted = _flat(run.config.document())
     candidates = []
     for recipe in ("default", *(name for name in recipe_names() if name != "default")):

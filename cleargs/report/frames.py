@@ -73,8 +73,8 @@ class FrameRow:
         if self.selection is None:
             return ""
         scores = scores_of(self.selection, "primary")
-        best = ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
-        return f"{self.selection.reason} ({self.selection.primary_metric}: {best})"
+        found = ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
+        return f"{self.selection.reason}; {self.selection.primary_metric}: {found}"
 
 
 def scores_of(selection: Selection, role: str) -> dict[str, float]:
@@ -84,7 +84,7 @@ def scores_of(selection: Selection, role: str) -> dict[str, float]:
 
 
 def load_rows(run: Path, final: str | None) -> list[FrameRow]:
-    """The frames of ``run`` in trajectory order; ``final`` is the stage of the scene shown. Raises StoreError."""
+    """The frames of ``run`` in their order; ``final`` is the stage of the scene shown. Raises StoreError."""
     judged = _judged(run)
     selections = _selections(run)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None

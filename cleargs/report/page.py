@@ -6,7 +6,7 @@ import json
 import secrets
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,13 @@ from markupsafe import Markup
 import cleargs
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
-from cleargs.files import PARTIAL_SUFFIX, disk_error, write_bytes, write_json
-from cleargs.pipeline.manifest import Manifest, linked_manifest, plain_json
+from cleargs.files import PARTIAL_SUFFIX, disk_error, write_bytes
+from cleargs.pipeline.manifest import Manifest, plain_json
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
 from cleargs.report.frames import FrameRow, formation_meanings, load_rows, scores_of
 from cleargs.report.pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
+from cleargs.report.record import FOLDER, PAGE, LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.scene import (
     Renderer,
     camera_of,
@@ -37,8 +38,6 @@ from cleargs.splat.compensation import read_exposure
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 
-FOLDER, PAGE, RECORD = "report", "index.html", "report.json"
-
 RENDERED = 40
 """Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
 
@@ -46,14 +45,11 @@ _STILL = 960  # px, long side of the pictures that stand for the viewers
 _SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
 _SCENES = ("g0", "rivr", "consolidate")
 
-
-@dataclass(frozen=True)
-class LastRun:
-    """What the last ``cleargs run`` did, which no manifest says."""
-
-    stages: Mapping[str, str]
-    """Stage -> made or found."""
-    peak_memory_gb: float
+TITLES = {
+    "before": ("Before", "trained on the frames as filmed"),
+    "after": ("After", "trained on with repaired views"),
+}
+"""The two scenes, and what each is."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +58,7 @@ class SceneView:
 
     key: str
     title: str
+    what: str
     stage: str
     gaussians: int
     still: Picture
@@ -84,13 +81,12 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs explain {run}")
-    last = last or _noted(run)
+    last = last or noted(run)
     folder = run / f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{FOLDER}"
     try:
         folder.mkdir()
         _fill(folder, planner, manifests, last)
-        record = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
-        write_json(folder / RECORD, record)
+        write_record(folder, manifests, last)
         old = folder.with_name(f"{folder.name}.old")
         if (run / FOLDER).exists():
             (run / FOLDER).rename(old)
@@ -100,37 +96,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
         raise disk_error(error, run / FOLDER) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return run / FOLDER / PAGE
-
-
-def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
-    """The manifests that the run shows now, in the order of the stages."""
-    found = {name: linked_manifest(run, name) for name in names}
-    return {name: manifest for name, manifest in found.items() if manifest is not None}
-
-
-def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
-    """Whether the report of ``run`` is of these results, and of this version of ClearGS."""
-    return (run / FOLDER / PAGE).is_file() and _record(run).get("made_from") == _made_from(manifests)
-
-
-def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
-    return {"cleargs": cleargs.__version__, **{name: manifest.key for name, manifest in manifests.items()}}
-
-
-def _record(run: Path) -> dict[str, Any]:
-    try:
-        record = json.loads((run / FOLDER / RECORD).read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return record if isinstance(record, dict) else {}
-
-
-def _noted(run: Path) -> LastRun | None:
-    try:
-        return LastRun(**_record(run)["last_run"])
-    except (KeyError, TypeError):
-        return None
+    return page_of(run)
 
 
 def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
@@ -155,7 +121,9 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     viewer = write_viewer(folder) if scenes else ""
     plans = _plans(planner)
     stale = {
-        name: "; ".join(plan.reasons) for name, plan in plans.items() if plan.state != "hit" and name in manifests
+        name: "; ".join(plan.reasons)
+        for name, plan in plans.items()
+        if plan.state != "hit" and name in manifests
     }
     html = (
         _environment()
@@ -175,7 +143,7 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
             stages=facts.stage_rows(planner.dag.names, manifests, plans, last.stages if last else {}),
             total=words.duration(sum(manifest.seconds for manifest in manifests.values())),
             memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
-            device=next(reversed(manifests.values())).device,
+            device=list(manifests.values())[-1].device,
             started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
             settings=facts.changed_settings(planner.run.config),
             versions=facts.versions(manifests),
@@ -218,12 +186,11 @@ def json_in_html(value: Any) -> Markup:
 def _scenes(
     folder: Path, run: Path, trained: Sequence[str], rows: Sequence[FrameRow]
 ) -> tuple[list[SceneView], Renderer | None]:
-    """Write the first scene and the last, each with a still at the opening pose; and what renders the last."""
+    """Write the first and the last scene, each with a still of the opening view; and what renders the last."""
     placed = _placed(rows)
     if not trained or not placed:
         return [], None
-    titles = {"before": "Before: trained on the raw frames", "after": "After: with repaired views"}
-    chosen = dict(zip(titles, (trained[0], trained[-1]), strict=True))
+    chosen = {"before": trained[0], "after": trained[-1]}
     views: list[SceneView] = []
     renderer = None
     start = placed[opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])]
@@ -238,7 +205,7 @@ def _scenes(
         views.append(
             SceneView(
                 key,
-                titles[key],
+                *TITLES[key],
                 stage,
                 scene.gaussians.num,
                 still,
@@ -308,7 +275,10 @@ def _frame_data(
         if selection is None
         else {
             metric: scores_of(selection, role)
-            for role, metric in (("primary", selection.primary_metric), ("tiebreak", selection.tiebreak_metric))
+            for role, metric in (
+                ("primary", selection.primary_metric),
+                ("tiebreak", selection.tiebreak_metric),
+            )
         }
     )
     found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
@@ -344,7 +314,8 @@ def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dic
     off = {"enabled": False}
     return {
         "scenes": [
-            {"key": scene.key, "antialias": scene.antialias, "background": scene.background} for scene in scenes
+            {"key": scene.key, "antialias": scene.antialias, "background": scene.background}
+            for scene in scenes
         ],
         "start": start * _SECONDS_A_FRAME,
         "settings": {

@@ -1,4 +1,4 @@
-"""The pictures of a report's frames: what was filmed, what the scene shows there, and the repairs, as JPEGs."""
+"""The pictures of a report's frames, as JPEGs: what was filmed, what the scene shows there, the repairs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LAYERS = {
     "deblurred": "Motion undone",
     "restored": "Restored",
     "fused": "Fused",
-    "render": "Scene before the repair",
+    "render": "Scene, before",
     "final": "Final scene",
 }
 """Layers in the order shown -> what the page calls them."""

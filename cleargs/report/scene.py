@@ -1,7 +1,7 @@
 """The scenes of a report: packed for the browser, the poses its viewers know, and a still in their place.
 
-The viewer is PlayCanvas's. It turns every PLY by 180 degrees about z, so that our y down becomes its y up; poses
-are turned alike. Its cameras have no roll, so a still that stands for a viewer is rendered by `level_camera`.
+The viewer is PlayCanvas's. It turns every PLY by 180 degrees about z, so that our y down becomes its y up;
+poses are turned alike. Its cameras have no roll: a still that stands for a viewer is that of `level_camera`.
 """
 
 from __future__ import annotations
@@ -87,11 +87,9 @@ def camera_of(frame: Frame) -> Camera:
 
 
 def viewer_pose(camera: Camera) -> dict[str, Any]:
-    """``camera`` as the viewer takes it: position, target, and the field of view of the longer side, degrees."""
+    """``camera`` as the viewer takes it: position, target, field of view of the longer side in degrees."""
     forward = camera.world_to_camera[2, :3]
-    side, focal = (
-        (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
-    )
+    side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
     return {
         "position": (camera.centre * _TURN).tolist(),
         "target": ((camera.centre + forward) * _TURN).tolist(),
@@ -107,9 +105,7 @@ def level_camera(camera: Camera, width: int, height: int) -> Camera:
     pose = np.eye(4)
     pose[:3, :3] = [right, np.cross(forward, right), forward]
     pose[:3, 3] = -pose[:3, :3] @ camera.centre
-    side, focal = (
-        (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
-    )
+    side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
     focal *= max(width, height) / side
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 

@@ -1,7 +1,7 @@
 """Fetches the 3D viewer that reports carry: ``python -m cleargs.report.vendor`` in a checkout, with npm.
 
-SuperSplat Viewer (PlayCanvas, MIT) is one JavaScript module. It is kept compressed, as the reports hold it, with
-its licence and its version beside it. What npm hands out must have the digest below.
+SuperSplat Viewer (PlayCanvas, MIT) is one JavaScript module. It is kept compressed, as the reports hold it,
+with its licence and its version beside it. What npm hands out must have the digest below.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SOURCE_MAP = b"\n//# sourceMappingURL="
 
 
 def main() -> None:
-    """Replace the viewer in this checkout by ``VERSION``. Raises ValueError when the package is another one."""
+    """Replace the viewer in this checkout by ``VERSION``. Raises ValueError when npm hands out another one."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["npm", "pack", f"{PACKAGE}@{VERSION}", "--ignore-scripts", "--silent"]
         subprocess.run(command, cwd=folder, check=True)

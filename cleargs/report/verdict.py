@@ -122,10 +122,16 @@ def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Ite
         yield Figure(f"{active}", "frames train the scene", f"as much as {effective:.1f} whole ones together")
     psnr = _figure(manifests, "g0", "psnr_strong")
     if psnr is not None:
-        yield Figure(decibel(psnr), "on trusted frames", "PSNR of the first scene, on frames it was trained on")
+        yield Figure(
+            decibel(psnr), "on trusted frames", "PSNR of the first scene, on frames it was trained on"
+        )
     repairs = _figure(manifests, "consolidate", "repairs")
     if repairs is not None:
-        yield Figure(str(repairs), "repaired views" if repairs != 1 else "repaired view", "carried into the final scene")
+        yield Figure(
+            str(repairs),
+            "repaired views" if repairs != 1 else "repaired view",
+            "carried into the final scene",
+        )
 
 
 def _warnings(
@@ -177,7 +183,8 @@ def _allocation_warnings(
             "No frame counts as reliable",
             "The best of them stand in. Thresholds nearer to this capture tell good frames from bad ones.",
             tuple(
-                f"rva.{name}={getattr(rva, name, 0.5) + step:.2f}" for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
+                f"rva.{name}={getattr(rva, name, 0.5) + step:.2f}"
+                for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
             ),
         )
     uncovered = _figure(manifests, "rva", "bins_uncovered_before") or 0
@@ -211,7 +218,10 @@ def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterat
         yield Caution(
             f"The first scene reaches {decibel(psnr)} on the frames it trusts",
             "A longer training, or larger images, bring out finer detail.",
-            (f"g0.steps={2 * steps}", f"ingest.max_size={getattr(config.sections['ingest'], 'max_size', 960) * 3 // 2}"),
+            (
+                f"g0.steps={2 * steps}",
+                f"ingest.max_size={getattr(config.sections['ingest'], 'max_size', 960) * 3 // 2}",
+            ),
         )
     spread = _figure(manifests, "g0", "exposure_spread")
     threshold = getattr(config.sections.get("g0"), "exposure_threshold", 0.05)
@@ -230,7 +240,10 @@ def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterat
                 (f"{stage}.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
             )
     rounds = _figure(manifests, "rivr", "rounds") or []
-    refused, made = sum(r.get("repairs_refused", 0) for r in rounds), sum(sum(r["chosen"].values()) for r in rounds)
+    refused, made = (
+        sum(r.get("repairs_refused", 0) for r in rounds),
+        sum(sum(r["chosen"].values()) for r in rounds),
+    )
     if made and 2 * refused > made:
         yield Caution(
             f"{refused} of {made} repairs were refused",

@@ -120,9 +120,9 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
     packed = np.zeros(len(values), np.uint32)
     for column, width in enumerate(bits):
         top = 2**width - 1
-        packed = (packed << np.uint32(width)) | np.clip(np.floor(values[:, column] * top + 0.5), 0, top).astype(
-            np.uint32
-        )
+        packed = (packed << np.uint32(width)) | np.clip(
+            np.floor(values[:, column] * top + 0.5), 0, top
+        ).astype(np.uint32)
     return packed
 
 

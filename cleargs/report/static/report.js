@@ -50,6 +50,11 @@ let current = 0;
 
 const number = (value) => (typeof value === "number" ? value.toFixed(Math.abs(value) < 10 ? 2 : 1) : String(value));
 
+const NAMES = {
+  R: "R, reliable appearance", B: "B, risk of degradation", G: "G, worth of its place", C: "C, coverage gained",
+  D: "D, new directions", O: "O, seen already", Z: "Z, middle of its stretch",
+};
+
 const pairs = (title, entries) => {
   if (entries.length === 0) return [];
   const section = make("section");
@@ -67,7 +72,7 @@ const cues = (frame) => {
   const entries = Object.entries(frame.cues);
   if (entries.length === 0) return [];
   const section = make("section");
-  section.append(make("h3", "What is wrong with it, from 0 to 1"));
+  section.append(make("h3", "Cues: how bad, from 0 to 1"));
   for (const [name, value] of entries) {
     const line = make("div", undefined, "cue");
     const bar = make("i");
@@ -103,6 +108,25 @@ const showLayers = (frame) => {
     picture.alt = `Frame ${frame.id}: ${label}`;
     one(`#tag-${side}`).textContent = label;
   }
+  fillContact(frame);
+};
+
+// Every layer in small; choosing one lays it on the right.
+const fillContact = (frame) => {
+  one("#contact").replaceChildren(...Object.entries(frame.layers).map(([name, path]) => {
+    const button = Object.assign(make("button"), { type: "button" });
+    button.setAttribute("aria-pressed", String(name === rightChoice.value));
+    const label = report.layers[name] + (name === frame.chosen ? " (chosen)" : "");
+    button.append(Object.assign(make("img"), { src: path, alt: "" }), label);
+    button.addEventListener("click", () => choose("right", name));
+    return button;
+  }));
+};
+
+const choose = (side, name) => {
+  chosenLayers[side] = name;
+  (side === "left" ? leftChoice : rightChoice).value = name;
+  showLayers(report.frames[current]);
 };
 
 const inspect = (index) => {
@@ -117,7 +141,7 @@ const inspect = (index) => {
   showLayers(frame);
   one("#stand").hidden = frame.time === null || !report.viewer;
   one("#details").replaceChildren(
-    ...decision(frame), ...cues(frame), ...pairs("Scores of the allocation", Object.entries(frame.figures)),
+    ...decision(frame), ...cues(frame), ...pairs("Scores of the allocation", Object.entries(frame.figures).map(([name, value]) => [NAMES[name] ?? name, value])),
     ...pairs("Found", Object.entries(frame.found)),
     ...pairs("Image formation", frame.formation.map(({ name, value, meaning }) => [name, value, meaning])));
   if (!inspector.open) inspector.showModal();
@@ -134,9 +158,6 @@ inspector.addEventListener("keydown", (event) => {
   if (event.key === "ArrowRight") inspect(current + 1);
 });
 for (const [side, choice] of [["left", leftChoice], ["right", rightChoice]]) {
-  choice.addEventListener("change", () => {
-    chosenLayers[side] = choice.value;
-    showLayers(report.frames[current]);
-  });
+  choice.addEventListener("change", () => choose(side, choice.value));
 }
 slider.addEventListener("input", () => one(".overlay").style.setProperty("--cut", `${slider.value}%`));
