@@ -186,7 +186,7 @@ def json_in_html(value: Any) -> Markup:
 def _scenes(
     folder: Path, run: Path, trained: Sequence[str], rows: Sequence[FrameRow]
 ) -> tuple[list[SceneView], Renderer | None]:
-    """Write the first and the last scene, each with a still of the opening view; and what renders the last."""
+    """Write the first and the last scene, each with a still; and what renders the last."""
     placed = _placed(rows)
     if not trained or not placed:
         return [], None

@@ -23,7 +23,7 @@ _SOURCE_MAP = b"\n//# sourceMappingURL="
 
 
 def main() -> None:
-    """Replace the viewer in this checkout by ``VERSION``. Raises ValueError when npm hands out another one."""
+    """Replace the viewer in this checkout by ``VERSION``. Raises ValueError for an unexpected package."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["npm", "pack", f"{PACKAGE}@{VERSION}", "--ignore-scripts", "--silent"]
         subprocess.run(command, cwd=folder, check=True)

@@ -55,7 +55,7 @@ class Verdict:
 def judge(
     manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
 ) -> Verdict:
-    """The verdict on a run whose ``manifests`` are those linked now; ``stale``: stage -> what changed since."""
+    """The verdict on a run that shows these ``manifests``; ``stale``: stage -> what changed since."""
     warnings = tuple(_warnings(manifests, rows, config, stale))
     tone, headline = _headline(manifests)
     return Verdict(tone, headline, _text(manifests, rows), tuple(_figures(manifests, rows)), warnings)
@@ -67,6 +67,10 @@ def _figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
     for name in path:
         value = value.get(name) if isinstance(value, Mapping) else None
     return value
+
+
+def _setting(config: Config, section: str, name: str) -> Any:
+    return getattr(config.sections[section], name)
 
 
 def _headline(manifests: Mapping[str, Manifest]) -> tuple[Tone, str]:
@@ -108,8 +112,8 @@ def _harm(manifests: Mapping[str, Manifest]) -> str | None:
     change = after - before
     kind = "more" if change >= 0 else "less"
     return (
-        f"after the repairs, the scene explains the frames kept aside for this check {abs(change):.1f} dB {kind} "
-        f"exactly ({decibel(before)} before, {decibel(after)} now)"
+        "after the repairs, the scene explains the frames kept aside for this check "
+        f"{abs(change):.1f} dB {kind} exactly ({decibel(before)} before, {decibel(after)} now)"
     )
 
 
@@ -139,8 +143,9 @@ def _warnings(
 ) -> Iterator[Caution]:
     for stage, reason in stale.items():
         yield Caution(f"{stage} is not from today's settings and input", reason, ())
-    for missing in next(reversed(manifests.values())).inherited if manifests else ():
-        yield Caution("The run is done only in part", missing, ())
+    for manifest in manifests.values():
+        for missing in manifest.missing:
+            yield Caution(f"{manifest.stage} is done only in part", missing, ())
     yield from _capture_warnings(manifests, rows, config)
     yield from _allocation_warnings(manifests, rows, config)
     yield from _scene_warnings(manifests, config)
@@ -156,7 +161,7 @@ def _capture_warnings(
             "They share too few points with their neighbours: too blurred, or too far apart.",
             (
                 f"ingest.max_frames={2 * len(rows)}",
-                f"ingest.overlap={2 * getattr(config.sections['ingest'], 'overlap', 10)}",
+                f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}",
             ),
         )
     available = _figure(manifests, "ingest", "frames_available") or 0
@@ -177,13 +182,12 @@ def _capture_warnings(
 def _allocation_warnings(
     manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
 ) -> Iterator[Caution]:
-    rva = config.sections.get("rva")
     if _figure(manifests, "rva", "stand_in"):
         yield Caution(
             "No frame counts as reliable",
             "The best of them stand in. Thresholds nearer to this capture tell good frames from bad ones.",
             tuple(
-                f"rva.{name}={getattr(rva, name, 0.5) + step:.2f}"
+                f"rva.{name}={_setting(config, 'rva', name) + step:.2f}"
                 for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
             ),
         )
@@ -191,7 +195,7 @@ def _allocation_warnings(
     if uncovered:
         yield Caution(
             f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
-            "Weak frames were taken back there, at low weight; the scene is softer along it. Slow down there.",
+            "Weak frames were taken back there, at low weight, and the scene is softer. Film slower there.",
             (),
         )
     placed = [row for row in rows if row.frame.registered and row.weight is not None]
@@ -200,7 +204,7 @@ def _allocation_warnings(
         yield Caution(
             f"{unused} of {len(placed)} placed frames are unused",
             "A lower threshold of reliability lets more of them in.",
-            (f"rva.tau_R={max(0.0, getattr(rva, 'tau_R', 0.5) - 0.1):.2f}",),
+            (f"rva.tau_R={max(0.0, _setting(config, 'rva', 'tau_R') - 0.1):.2f}",),
         )
     blurred = [row for row in rows if (row.blur_px or 0.0) > SOFT_PX]
     if len(blurred) > len(rows) / 2:
@@ -213,18 +217,18 @@ def _allocation_warnings(
 
 def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterator[Caution]:
     psnr = _figure(manifests, "g0", "psnr_strong")
-    steps = getattr(config.sections.get("g0"), "steps", 0)
-    if psnr is not None and psnr < CLOSE_DB and steps:
+    steps = _setting(config, "g0", "steps")
+    if psnr is not None and psnr < CLOSE_DB:
         yield Caution(
             f"The first scene reaches {decibel(psnr)} on the frames it trusts",
             "A longer training, or larger images, bring out finer detail.",
             (
                 f"g0.steps={2 * steps}",
-                f"ingest.max_size={getattr(config.sections['ingest'], 'max_size', 960) * 3 // 2}",
+                f"ingest.max_size={_setting(config, 'ingest', 'max_size') * 3 // 2}",
             ),
         )
     spread = _figure(manifests, "g0", "exposure_spread")
-    threshold = getattr(config.sections.get("g0"), "exposure_threshold", 0.05)
+    threshold = _setting(config, "g0", "exposure_threshold")
     if spread is not None and spread > threshold and not _figure(manifests, "g0", "exposure"):
         yield Caution(
             f"Exposure differs by {100 * spread:.0f} % between frames",
@@ -240,13 +244,12 @@ def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterat
                 (f"{stage}.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
             )
     rounds = _figure(manifests, "rivr", "rounds") or []
-    refused, made = (
-        sum(r.get("repairs_refused", 0) for r in rounds),
-        sum(sum(r["chosen"].values()) for r in rounds),
-    )
+    refused = sum(found["repairs_refused"] for found in rounds)
+    made = sum(sum(found["chosen"].values()) for found in rounds)
     if made and 2 * refused > made:
         yield Caution(
             f"{refused} of {made} repairs were refused",
-            "They agree with neither the frame nor the render: the repair model does not suit this capture. `cleargs models list` names others.",
+            "They agree with neither the frame nor the render: the repair model does not suit this capture. "
+            "`cleargs models list` names others.",
             ("rivr.expert=NAME",),
         )

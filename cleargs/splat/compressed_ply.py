@@ -1,9 +1,9 @@
 """``.compressed.ply``, PlayCanvas's quantised PLY: 16 bytes a Gaussian, and one a spherical-harmonics number.
 
 Gaussians stand in chunks of 256. A chunk keeps the range of its positions, log scales and colours in float32;
-a Gaussian keeps where in these ranges it lies (11, 10 and 11 bits; colours 8), the three smaller numbers of its
-quaternion (10 bits each, and 2 that say which was left out) and its opacity (8 bits). Numbers of the spherical
-harmonics above degree 0 are 8 bits from -4 to 4. Source: splat-transform's ``write-compressed-ply.ts``.
+a Gaussian keeps where in these ranges it lies (11, 10 and 11 bits; colours 8), the three smaller numbers of
+its quaternion (10 bits each, and 2 that say which was left out) and its opacity (8 bits). Numbers of the
+spherical harmonics above degree 0 are 8 bits from -4 to 4. Source: the writer of splat-transform.
 """
 
 from __future__ import annotations
@@ -120,9 +120,8 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
     packed = np.zeros(len(values), np.uint32)
     for column, width in enumerate(bits):
         top = 2**width - 1
-        packed = (packed << np.uint32(width)) | np.clip(
-            np.floor(values[:, column] * top + 0.5), 0, top
-        ).astype(np.uint32)
+        steps = np.clip(np.floor(values[:, column] * top + 0.5), 0, top)
+        packed = (packed << np.uint32(width)) | steps.astype(np.uint32)
     return packed
 
 
@@ -133,4 +132,5 @@ def _pack_rotation(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     smaller = np.take_along_axis(unit, others, axis=1) * np.sqrt(0.5) + 0.5
-    return (largest.astype(np.uint32) << np.uint32(30)) | _pack(smaller, (10, 10, 10))
+    packed: NDArray[np.uint32] = (largest.astype(np.uint32) << np.uint32(30)) | _pack(smaller, (10, 10, 10))
+    return packed
