@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
@@ -21,10 +21,17 @@ SCENE = "scene.ply"
 Examples:
   cleargs export room -o room.ply                  the world that all tables of the run share
   cleargs export room --world input -o room.ply    the world of the capture's own poses
+  cleargs export room -o room.compressed.ply       a quarter of the size: SuperSplat, Spark, Brush
+  cleargs export room -o room.spz                  a tenth of the size; room.glb and room.usdc as well
+  cleargs export room -o room.ply --sh-degree 3    for the viewer of the Inria code
 """
 )
 @run_argument
-@click.option("--format", "kind", type=click.Choice(["ply"]), default="ply", show_default=True)
+@click.option(
+    "--sh-degree",
+    type=click.IntRange(0, 3),
+    help="Pad the spherical harmonics with zeros up to this degree.  [default: as trained]",
+)
 @click.option(
     "--world",
     type=click.Choice(["normalised", "input"]),
@@ -34,44 +41,73 @@ Examples:
 )
 @click.option("--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]")
 @click.option(
-    "-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), help="The new file."
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The new file; its ending says what to write: .ply .compressed.ply .spz .glb .usdc",
 )
+@click.option("--force", is_flag=True, help="Replace the file where it exists.")
 @click.pass_obj
-def export(dag: Dag, run: Path, kind: Literal["ply"], world: str, chosen: str | None, output: Path) -> None:
-    """Write the scene of RUN to a file."""
+def export(
+    dag: Dag,
+    run: Path,
+    sh_degree: int | None,
+    world: str,
+    chosen: str | None,
+    output: Path,
+    force: bool,
+) -> None:
+    """Write the scene of RUN to a file, its cameras beside it (FILE.cameras.json)."""
+    from cleargs.splat.formats import format_of, padded, write_scene
+
+    kind = format_of(output)
+    cameras = output.with_name(f"{output.name[: -len(kind) - 1]}.cameras.json")
+    for file in (output, cameras):
+        if file.exists() and not force:
+            raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     names = dag.names[::-1] if chosen is None else (dag.check(chosen),)
     stage = next((name for name in names if (run / name / SCENE).is_file()), None)
     if stage is None:
         raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
-    similarity = _similarity(run, dag.names[0]) if world == "input" else None
-    from cleargs.splat.ply import read_ply, write_ply
+    similarity = _similarity(run, dag.names[0]) if world == "input" else {}
+    from cleargs.capture.tables import load_frames
+    from cleargs.files import write_json
+    from cleargs.splat.cameras_json import cameras_json
+    from cleargs.splat.export import transform_scene
+    from cleargs.splat.ply import read_ply
+    from cleargs.splat.views import view_of
 
     scene = read_ply(run / stage / SCENE)
-    if similarity is not None:
-        import numpy as np
-
-        from cleargs.splat.export import transform_scene
-
-        scene = transform_scene(
-            scene,
-            scale=float(similarity["scale"]),
-            rotation=np.array(similarity["rotation"], dtype=np.float64),
-            translation=np.array(similarity["translation"], dtype=np.float64),
-        )
+    if sh_degree is not None:
+        scene = padded(scene, sh_degree)
+    if similarity:
+        scene = transform_scene(scene, **similarity)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(error, output) from error
-    write_ply(output, scene)
+    write_scene(output, scene, kind)
+    ingest = run / dag.names[0]
+    posed = [frame for frame in load_frames(ingest) if frame.registered]
+    named = [(frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed]
+    write_json(cameras, cameras_json(named, **similarity))
     click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {world} world")
 
 
 def _similarity(run: Path, first: str) -> dict[str, Any]:
-    """The similarity from the normalised world back to the input's, as the first stage noted it."""
+    """The similarity from the normalised world back to the input's, as the first stage noted it: scale,
+    rotation [3, 3], translation [3]."""
     manifest = linked_manifest(run, first)
     found = manifest.summary.get("similarity") if manifest is not None else None
     if not isinstance(found, dict):
         raise InputError(
             f"{run / first} does not say how it was normalised", hint="run that stage with --force"
         )
-    return found
+    import numpy as np
+
+    return {
+        "scale": float(found["scale"]),
+        "rotation": np.array(found["rotation"], dtype=np.float64),
+        "translation": np.array(found["translation"], dtype=np.float64),
+    }

@@ -25,6 +25,7 @@ from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
+from cleargs.splat.views import view_of
 
 BYTES = 10_000_000
 """Most that a scene may take in a report; SH degrees that do not fit are left out."""
@@ -72,18 +73,7 @@ def _script(name: str, packed: bytes) -> bytes:
 
 def camera_of(frame: Frame) -> Camera:
     """The camera of a registered frame."""
-    pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-    known = [value for value in pose if value is not None]
-    assert len(known) == 7  # a registered frame has a pose
-    return Camera.from_quaternion(
-        *known,
-        width=frame.width,
-        height=frame.height,
-        fx=frame.fx,
-        fy=frame.fy,
-        cx=frame.cx,
-        cy=frame.cy,
-    )
+    return view_of(frame, Path(), 0.0).camera
 
 
 def viewer_pose(camera: Camera) -> dict[str, Any]:

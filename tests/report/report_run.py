@@ -41,8 +41,9 @@ ROLES = ("strong", "geometric", "auxiliary", "strong", "reactivated", "suppresse
 WEIGHTS = (0.9, 0.6, 0.4, 0.99, 0.1, 0.0, 0.0)
 
 
-def wall(seed: int, gaussians: int = 1500, sh_degree: int = 1) -> Scene:
-    """Opaque coloured blobs at depth 2, a little larger than the view of any camera."""
+def wall(seed: int, gaussians: int = 4000, sh_degree: int = 1) -> Scene:
+    """Opaque coloured blobs at depth 2, wider than the view of any camera. They are small, since large ones
+    that lie close together are drawn in an order that differs between renderers."""
     chance = np.random.default_rng(seed)
 
     def tensor(values: Any) -> torch.Tensor:
@@ -55,7 +56,7 @@ def wall(seed: int, gaussians: int = 1500, sh_degree: int = 1) -> Scene:
     return Scene(
         Gaussians(
             means=tensor(means),
-            log_scales=tensor(np.log(chance.uniform(0.04, 0.16, (gaussians, 3)))),
+            log_scales=tensor(np.log(chance.uniform(0.02, 0.07, (gaussians, 3)))),
             rotations=tensor(chance.normal(size=(gaussians, 4))),
             logit_opacities=tensor(chance.uniform(1.0, 4.0, gaussians)),
             sh=tensor(sh),

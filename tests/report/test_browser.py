@@ -25,9 +25,9 @@ PATIENCE_MS = 240_000  # software WebGL on a busy machine
 ALLOWED = ("file:", "data:", "blob:")
 
 DIFFERENCE = 12.0
-"""Mean absolute difference of a viewer's pixels from ours, in levels of 255. Measured: 5 to 7, nearly all of it
-darkness at the rim of splats: PlayCanvas bends the Gaussian so that it ends at zero where it is cut off. The
-same scene from the next camera, and the other scene from the same camera, differ by more than 30."""
+"""Mean absolute difference of a viewer's pixels from ours, in levels of 255. Measured: 9, nearly all of
+it darkness at the rim of splats: PlayCanvas bends the Gaussian so that it ends at zero where it is cut off.
+The same scene from the next camera, and the other scene from the same camera, by 35 to 42."""
 
 
 class Opened:
@@ -58,17 +58,19 @@ class Opened:
         self.settle()
 
     def settle(self) -> None:
-        """Wait for some frames of both viewers."""
+        """Wait for a few frames of both viewers, and until the panes have faded in."""
         self.page.evaluate(
-            """() => new Promise((resolve) => {
+            """async () => {
                 const {before, after} = window.reportStage;
-                let left = 12;
-                after.app.on('frameend', () => { before.app.renderNextFrame = true; if (--left === 0) resolve(); });
-                const tick = () => { after.app.renderNextFrame = true; if (left > 0) requestAnimationFrame(tick); };
-                tick();
-            })"""
+                for (let frame = 0; frame < 4; frame++) {
+                    for (const {app} of [after, before]) {
+                        app.renderNextFrame = true;
+                        await new Promise((resolve) => app.once('frameend', resolve));
+                    }
+                }
+            }"""
         )
-        self.page.wait_for_timeout(700)  # the panes fade in
+        self.page.wait_for_timeout(600)
 
     def pixels(self, scene: str) -> np.ndarray:
         """What a viewer shows, RGB, as floats."""
@@ -81,12 +83,14 @@ class Opened:
 
     def camera(self, viewer: str) -> np.ndarray:
         """Position and viewing direction of a viewer's camera."""
-        return np.array(
-            self.page.evaluate(
-                f"""() => {{ const camera = window.reportStage.{viewer}.app.root.findByName('camera');
-                const [p, f] = [camera.getPosition(), camera.forward]; return [p.x, p.y, p.z, f.x, f.y, f.z]; }}"""
-            )
+        found = self.page.evaluate(
+            """(name) => {
+                const camera = window.reportStage[name].app.root.findByName('camera');
+                return [camera.getPosition(), camera.forward].flatMap(({x, y, z}) => [x, y, z]);
+            }""",
+            viewer,
         )
+        return np.array(found)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +118,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def wide(browser: Any, run: FinishedRun) -> Iterator[Opened]:
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page = browser.new_page(
+        viewport={"width": 1280, "height": 900}, device_scale_factor=0.5
+    )  # a quarter of the work
     opened = Opened(page, (run.folder / "report/index.html").as_uri())
     opened.scenes()
     yield opened
@@ -142,7 +148,7 @@ def test_both_viewers_show_their_scene_at_the_opening_pose(wide: Opened, run: Fi
     start = 3  # of the frames with the greatest weight, the one in the middle
     for pane, stage, other in (("before", "g0", "consolidate"), ("after", "consolidate", "g0")):
         shown = wide.pixels(pane)
-        assert min(shown.shape[:2]) > 200 and shown.std() > 20
+        assert min(shown.shape[:2]) > 100 and shown.std() > 20
         assert difference(shown, ours(run, stage, start, shown.shape)) < DIFFERENCE
         assert difference(shown, ours(run, other, start, shown.shape)) > 2.5 * DIFFERENCE
         assert difference(shown, ours(run, stage, start + 1, shown.shape)) > 2.5 * DIFFERENCE
@@ -218,10 +224,15 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Opened) -> None:
 
 def test_dark_and_light_keep_their_contrast(wide: Opened, phone: Opened) -> None:
     """WCAG AA, 4.5, for text on the page and on its cards, and 3 for the faint notes."""
-    script = """() => { const of = (name) => { const probe = document.createElement('i');
-        probe.style.color = `var(--${name})`; document.body.append(probe);
-        const rgb = getComputedStyle(probe).color.match(/[\\d.]+/g).slice(0, 3).map(Number); probe.remove(); return rgb; };
-        return Object.fromEntries(['paper', 'card', 'ink', 'soft', 'faint', 'accent'].map((name) => [name, of(name)])); }"""
+    script = """() => {
+        const probe = document.body.appendChild(document.createElement('i'));
+        const rgb = (name) => {
+            probe.style.color = `var(--${name})`;
+            return getComputedStyle(probe).color.match(/[\\d.]+/g).slice(0, 3).map(Number);
+        };
+        return Object.fromEntries(
+            ['paper', 'card', 'ink', 'soft', 'faint', 'accent'].map((name) => [name, rgb(name)]));
+    }"""
     for opened in (wide, phone):
         colours = {name: luminance(rgb) for name, rgb in opened.page.evaluate(script).items()}
         for ground in ("paper", "card"):
