@@ -46,7 +46,8 @@ Examples:
   cleargs run video.mp4 -o room --set rva.tau_R=0.7
   cleargs show room                          what each stage found
   cleargs explain room                       what the same command would do again, and why
-  cleargs export room --format ply -o room.ply
+  cleargs report room                        a page to look at: room/report/index.html
+  cleargs export room -o room.compressed.ply
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,

@@ -17,7 +17,7 @@ from markupsafe import Markup
 import cleargs
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
-from cleargs.files import PARTIAL_SUFFIX, disk_error, write_bytes
+from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.pipeline.manifest import Manifest, plain_json
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
@@ -71,7 +71,7 @@ class SceneView:
 def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     """Write the report of ``planner.run``, in place of an older one; returns its page.
 
-    Without ``last``, what an older report noted of the last run is kept.
+    Without ``last``, what an older report noted of the last run is kept. The folder appears whole.
 
     Raises:
         InputError: when nothing of the run is done yet.
@@ -153,7 +153,7 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
             data=_data(rows, pictures, scenes, formation_meanings(run, final)),
         )
     )
-    write_bytes(folder / PAGE, html.encode())
+    (folder / PAGE).write_bytes(html.encode())
 
 
 def _environment() -> Environment:

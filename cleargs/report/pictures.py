@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.files import write_bytes
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.report.frames import FrameRow
@@ -28,7 +27,7 @@ LAYERS = {
 """Layers in the order shown -> what the page calls them."""
 
 FOLDER = "frames"
-BYTES = 12_000_000
+BYTES = 8_500_000
 """About how much all layers together may take."""
 
 _BYTES_A_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
@@ -110,5 +109,5 @@ def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
         image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
-    write_bytes(report / name, data.tobytes())
+    (report / name).write_bytes(data.tobytes())
     return Picture(name, width, height)

@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame
-from cleargs.files import write_bytes
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
@@ -28,7 +27,7 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.views import view_of
 
 BYTES = 10_000_000
-"""Most that a scene may take in a report; SH degrees that do not fit are left out."""
+"""Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
 
 _TURN = np.array([-1.0, -1.0, 1.0])
 _INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
@@ -55,15 +54,15 @@ def write_scene(path: Path, name: str, scene: Scene) -> int:
     kept = gaussians.select(visible)
     kept = Gaussians(**{**kept.tensors(), "sh": kept.sh[:, : (degree + 1) ** 2].contiguous()})
     packed = gzip.compress(compressed_ply(Scene(kept)), 6, mtime=0)
-    write_bytes(path, _script(name, packed))
+    path.write_bytes(_script(name, packed))
     return degree
 
 
 def write_viewer(folder: Path) -> str:
     """Write the vendored viewer as a script, its licence beside it; returns its name and version."""
     viewer = files("cleargs.report").joinpath("static", "viewer")
-    write_bytes(folder / "viewer.js", _script("viewer", viewer.joinpath("index.js.gz").read_bytes()))
-    write_bytes(folder / "viewer-LICENSE.txt", viewer.joinpath("LICENSE").read_bytes())
+    (folder / "viewer.js").write_bytes(_script("viewer", viewer.joinpath("index.js.gz").read_bytes()))
+    (folder / "viewer-LICENSE.txt").write_bytes(viewer.joinpath("LICENSE").read_bytes())
     return viewer.joinpath("VERSION").read_text(encoding="utf-8").strip()
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +26,9 @@ _C0 = 0.28209479177387814
 def glb(scene: Scene) -> bytes:
     """The bytes of ``scene``, whose y is up as glTF wants it; equal scenes give equal bytes."""
     columns = _columns(scene)
-    data, views, accessors = b"", [], []
+    data = b""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
     for column in columns.values():
         content = column.tobytes()
         views.append(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,13 +49,19 @@ def spz(scene: Scene) -> bytes:
     alphas = _byte(torch.sigmoid(gaussians.logit_opacities).numpy() * 255.0)
     colours = _byte(gaussians.sh.numpy()[:, 0] * (_COLOUR_SCALE * 255.0) + 0.5 * 255.0)
     scales = _byte((gaussians.log_scales.numpy() + 10.0) * 16.0)
-    columns = [positions, alphas, colours, scales, _rotations(gaussians.rotations.numpy())]
+    columns: list[NDArray[Any]] = [
+        positions,
+        alphas,
+        colours,
+        scales,
+        _rotations(gaussians.rotations.numpy()),
+    ]
     if coefficients > 1:
         columns.append(_harmonics(gaussians.sh.numpy()[:, 1:]))
     return gzip.compress(header + b"".join(column.tobytes() for column in columns), 9, mtime=0)
 
 
-def _byte(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
@@ -64,7 +71,7 @@ def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)
     turned = np.take_along_axis(unit, largest[:, None], axis=1)[:, 0] < 0
-    packed = largest.astype(np.uint32)
+    packed: NDArray[np.uint32] = largest.astype(np.uint32)
     for part in range(4):
         magnitude = np.clip(np.floor(511.0 * np.sqrt(2.0) * np.abs(unit[:, part]) + 0.5), 0, 511)
         negative = (unit[:, part] < 0) ^ turned
@@ -74,7 +81,7 @@ def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4
             | magnitude.astype(np.uint32)
         )
         packed = np.where(largest == part, packed, added)
-    return packed.astype("<u4")
+    return packed
 
 
 def _harmonics(sh: NDArray[np.float32]) -> NDArray[np.uint8]:  # [N, K - 1, 3]
