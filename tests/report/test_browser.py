@@ -191,7 +191,7 @@ def test_the_strip_opens_the_layers_under_a_slider(wide: Opened) -> None:
     assert page.locator("#inspector-title").inner_text() == f"Frame 0 · {HOSTILE[0]}"
     assert page.locator("#left").get_attribute("alt") == "Frame 0: As filmed"
     assert page.locator("#right-layer").input_value() == "final"
-    assert page.evaluate(
+    page.wait_for_function(
         "[...document.querySelectorAll('#left, #right')].every((image) => image.naturalWidth > 50)"
     )
     page.locator("#right-layer").select_option("restored")

@@ -9,13 +9,16 @@ from base64 import b64decode
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
+from cleargs.cli.report import report_on
 from cleargs.errors import InputError
 from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report import facts
 from cleargs.report.charts import weight_colour
@@ -141,6 +144,26 @@ def test_a_report_knows_whether_it_is_current(run: FinishedRun, store: Store, pa
     again = write_report(run.planner(store))  # what the last run did is kept
     assert "1.2 GB of memory" in Page(again.read_text()).text and "made anew" in again.read_text()
     assert not [path for path in run.folder.iterdir() if "partial" in path.name]
+
+
+def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    manifests = linked_manifests(run.folder, run.dag.names)
+
+    def outcomes(how: Literal["made", "found"]) -> list[Outcome]:
+        return [Outcome(name, how, manifest, run.folder / name) for name, manifest in manifests.items()]
+
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        planner = run.planner(Store(tmp_path, memo))
+        page = report_on(planner, outcomes("found"))
+        assert page == run.folder / "report/index.html" and "found in the store" in page.read_text()
+        page.write_text("as it was")
+        assert report_on(planner, outcomes("found")) == page and page.read_text() == "as it was"
+        assert report_on(planner, outcomes("made")) == page and "made anew" in page.read_text()
+        (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
+        assert report_on(planner, outcomes("made")) is None  # the run itself has succeeded
+        assert "made anew" in page.read_text()  # the report before stays
+        assert report_on(planner, []) is None
 
 
 def test_a_run_without_a_scene_has_a_report_too(tmp_path: Path) -> None:
