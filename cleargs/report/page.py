@@ -51,6 +51,9 @@ TITLES = {
 }
 """The two scenes, and what each is."""
 
+UNCHANGED = "the same scene: no repair changed it"
+"""What the second is where it has the bytes of the first."""
+
 
 @dataclass(frozen=True)
 class SceneView:
@@ -106,7 +109,7 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     trained = [stage for stage in _SCENES if stage in manifests]
     final = trained[-1] if trained else None
     rows = load_rows(run, final)
-    scenes, renderer = _scenes(folder, run, trained, rows)
+    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, rows)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None
 
     def render(row: FrameRow, side: int) -> Any:
@@ -184,13 +187,16 @@ def json_in_html(value: Any) -> Markup:
 
 
 def _scenes(
-    folder: Path, run: Path, trained: Sequence[str], rows: Sequence[FrameRow]
+    folder: Path, run: Path, trained: Mapping[str, Manifest], rows: Sequence[FrameRow]
 ) -> tuple[list[SceneView], Renderer | None]:
     """Write the first and the last scene, each with a still; and what renders the last."""
     placed = _placed(rows)
     if not trained or not placed:
         return [], None
-    chosen = {"before": trained[0], "after": trained[-1]}
+    stages = list(trained)
+    first, last = stages[0], stages[-1]
+    chosen = {"before": first, "after": last}
+    unchanged = trained[first].files["scene.ply"] == trained[last].files["scene.ply"]
     views: list[SceneView] = []
     renderer = None
     start = placed[opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])]
@@ -205,7 +211,8 @@ def _scenes(
         views.append(
             SceneView(
                 key,
-                *TITLES[key],
+                TITLES[key][0],
+                UNCHANGED if unchanged and key == "after" else TITLES[key][1],
                 stage,
                 scene.gaussians.num,
                 still,

@@ -166,11 +166,14 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
         assert report_on(planner, []) is None
 
 
-def test_a_run_without_a_scene_has_a_report_too(tmp_path: Path) -> None:
+def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    for stage in ("g0", "rivr", "consolidate"):
-        (run.folder / stage / "manifest.json").unlink()
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        for stage in ("rivr", "consolidate"):
+            (run.folder / stage / "manifest.json").unlink()
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+        assert "no repair changed it" in text and "with repaired views" not in text
+        (run.folder / "g0/manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
         assert "no scene is trained yet" in text and 'id="stage"' not in text
         for stage in ("ingest", "rva"):
