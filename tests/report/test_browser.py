@@ -192,7 +192,8 @@ def test_the_strip_opens_the_layers_under_a_slider(wide: Opened) -> None:
     assert page.locator("#left").get_attribute("alt") == "Frame 0: As filmed"
     assert page.locator("#right-layer").input_value() == "final"
     page.wait_for_function(
-        "[...document.querySelectorAll('#left, #right')].every((image) => image.naturalWidth > 50)"
+        "[...document.querySelectorAll('#left, #right')].every((image) => image.naturalWidth > 50)",
+        polling=100,
     )
     page.locator("#right-layer").select_option("restored")
     assert page.locator("#right").get_attribute("src") == "frames/000000-restored.jpg"
