@@ -3,6 +3,7 @@
 # make test-gpu-kernels   the GPU kernels, without a GPU: in Triton's interpreter, and compiled ahead of time
 # make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
 # make test-convert  the tests of those conversions
+# make browser       what the tests of the report in a browser need beside Debian's chromium
 # make cluster       .venv-cluster, the Snakemake that `cleargs batch` uses
 # TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
 
@@ -12,7 +13,7 @@ PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c cons
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test test-gpu-kernels lint convert-env test-convert cluster clean
+.PHONY: demo test test-gpu-kernels lint convert-env test-convert cluster browser clean
 
 demo: .venv/demo.stamp demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
@@ -32,6 +33,8 @@ convert-env: .venv-convert/stamp
 
 test-convert: convert-env
 	.venv-convert/bin/python -m pytest tests/models
+
+browser: .venv/browser.stamp
 
 # An environment of its own: the engine wants numpy and pandas of its own choosing.
 cluster: .venv-cluster/stamp
@@ -55,6 +58,10 @@ demo/capture/transforms.json: | .venv/demo.stamp
 
 .venv/test.stamp: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP) -e '.[test]'
+	touch $@
+
+.venv/browser.stamp: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) -e '.[test,browser]'
 	touch $@
 
 # The Triton that the tests passed with; a CPU build of PyTorch leaves the choice open.

@@ -26,6 +26,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
     "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
     "batch-status": ("cleargs.cli.batch_status", "Say how far each scene of a sheet is."),
+    "report": (
+        "cleargs.cli.report",
+        "Write a page that shows a run: the scene in 3D, and every frame.",
+    ),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
@@ -50,7 +54,8 @@ Examples:
   cleargs show room                          what each stage found
   cleargs explain room                       what the same command would do again, and why
   cleargs settings g0                        what a stage can be told
-  cleargs export room -o room.ply
+  cleargs report room                        a page to look at: room/report/index.html
+  cleargs export room -o room.compressed.ply
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,

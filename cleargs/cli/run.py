@@ -20,6 +20,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
 from cleargs.cli.progress import make_reporter
+from cleargs.cli.report import report_on
 from cleargs.errors import ConfigError, InputError
 from cleargs.pipeline.config import Config, Document, check_document, load_config
 from cleargs.pipeline.dag import Dag
@@ -70,6 +71,12 @@ Examples:
 @click.option(
     "--force", multiple=True, metavar="STAGE", help="Make the stage again, even if its results are there."
 )
+@click.option(
+    "--report/--no-report",
+    "wants_report",
+    default=True,
+    help="Write RUN/report/index.html at the end, as `cleargs report` does.  [default: report]",
+)
 @click.option("--dry-run", is_flag=True, help="Only say what would be done, why, and what it costs.")
 @partial_option
 @work_options
@@ -87,6 +94,7 @@ def run(
     reset: bool,
     until: str | None,
     force: tuple[str, ...],
+    wants_report: bool,
     dry_run: bool,
     allow_partial: bool,
     device: DeviceChoice,
@@ -129,10 +137,13 @@ def run(
             return 0
         runner = Runner(dag, settings, opened, threads_or_all(threads), reporter)
         outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
+        page = report_on(runner.planner, outcomes) if wants_report else None
     if as_json:
         print_json([outcome_json(outcome) for outcome in outcomes])
     else:
         print_outcomes(outcomes, folder)
+        if page is not None:
+            click.echo(f"report: {page}")
     return exit_code(outcomes)
 
 

@@ -1,0 +1,75 @@
+"""``cleargs report``: a run as a page to look at and to hand on."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from cleargs.cli.common import (
+    json_option,
+    opened_store,
+    print_json,
+    quiet_option,
+    run_argument,
+    store_option,
+    threads_or_all,
+)
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import CleargsError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.plan import Planner
+from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.runner import Outcome
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs report room              room/report/index.html: open it in a browser, offline, or send the folder
+"""
+)
+@run_argument
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all cores]")
+@store_option
+@json_option
+@quiet_option
+@click.pass_obj
+def report(dag: Dag, run: Path, threads: int | None, store: Path | None, as_json: bool, quiet: bool) -> None:
+    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
+    from cleargs.report.page import write_report
+
+    settings = read_run_file(run, dag, store=store)
+    with opened_store(settings.store) as opened:
+        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet)))
+    if as_json:
+        print_json({"report": str(page)})
+    else:
+        click.echo(f"report: {page}")
+
+
+def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
+    """The report at the end of a run; None where there is nothing to report on, or it could not be written.
+
+    A report that shows these results already stays.
+    """
+    if not any("frames.parquet" in outcome.manifest.files for outcome in outcomes):
+        return None
+    from cleargs.report.record import LastRun, is_current, linked_manifests, page_of
+
+    run = planner.run.folder
+    if all(outcome.how == "found" for outcome in outcomes) and is_current(
+        run, linked_manifests(run, planner.dag.names)
+    ):
+        return page_of(run)
+    from cleargs.report.page import write_report
+
+    usage = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    last = LastRun({outcome.stage: outcome.how for outcome in outcomes}, round(max(usage) * 1024 / 1e9, 2))
+    try:
+        return write_report(planner, last)
+    except CleargsError as error:  # the run itself has succeeded
+        planner.reporter.warn(f"there is no report: {error}; {error.hint}")
+        return None

@@ -1,0 +1,234 @@
+"""Plain geometry of a report's drawings: SVG paths of curves, and cameras seen from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.report.frames import FrameRow
+from cleargs.report.scene import camera_of
+from cleargs.splat.tables import TRAIN
+from cleargs.tables import read_table
+
+WIDTH, HEIGHT = 640, 220
+"""Of a curve's drawing area, in units of its SVG."""
+
+_POINTS = 120  # of a curve
+_LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A label on an axis, and where it stands."""
+
+    at: float
+    label: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One figure over all steps of all trainings."""
+
+    title: str
+    unit: str
+    path: str
+    """Of an SVG path, in `WIDTH` x `HEIGHT`."""
+    ticks: tuple[Tick, ...]
+    parts: tuple[Tick, ...]
+    """Where each training starts."""
+    steps: int
+    first: str
+    last: str
+
+
+def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
+    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError."""
+    tables, parts, offset = [], [], 0
+    for stage in stages:
+        path = run / stage / "train.parquet"
+        rows = read_table(path, TRAIN) if path.is_file() else None
+        if rows is not None and rows.num_rows:
+            parts.append((offset, stage))
+            tables.append(rows)
+            offset += rows.num_rows
+    if not tables:
+        return []
+
+    def joined(name: str) -> NDArray[np.float64]:
+        return np.concatenate([table[name].to_numpy().astype(np.float64) for table in tables])
+
+    real = np.concatenate([np.array(table["kind"].to_pylist()) == "real" for table in tables])
+    marks = tuple(Tick(start / offset * WIDTH, stage) for start, stage in parts)
+
+    def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> Curve:
+        values = joined(name)
+        known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(offset)
+        return _curve(title, unit, known, values[known], offset, marks, digits)
+
+    return [
+        curve("PSNR of the frames trained on", "dB", "psnr", 1, only_real=True),
+        curve("Loss", "", "loss", 3, only_real=True),
+        curve("Gaussians", "", "n_gaussians", 0, only_real=False),
+    ]
+
+
+def _curve(
+    title: str,
+    unit: str,
+    steps: NDArray[np.int64],
+    values: NDArray[np.float64],
+    total: int,
+    parts: tuple[Tick, ...],
+    digits: int,
+) -> Curve:
+    """Medians of equal stretches: a step shows one view, and views differ more than steps do."""
+    stretches = np.array_split(np.arange(len(steps)), min(_POINTS, max(1, len(steps) // 6)))
+    x = np.array([steps[part].mean() for part in stretches]) / max(total - 1, 1) * WIDTH
+    y = np.array([np.median(values[part]) for part in stretches])
+    ticks = _nice(float(y.min()), float(y.max()))
+    low, high = min(ticks[0], float(y.min())), max(ticks[-1], float(y.max()))
+    span = (high - low) or 1.0
+
+    def height(value: float) -> float:
+        return HEIGHT * (1.0 - (value - low) / span)
+
+    points = [f"{a:.1f},{height(float(b)):.1f}" for a, b in zip(x, y, strict=True)]
+
+    def text(value: float) -> str:
+        return f"{value:,.{digits}f}"
+
+    return Curve(
+        title,
+        unit,
+        "M" + " L".join(points),
+        tuple(Tick(height(tick), f"{tick:,g}") for tick in ticks),
+        parts,
+        total,
+        text(float(y[0])),
+        text(float(y[-1])),
+    )
+
+
+def _nice(low: float, high: float) -> list[float]:
+    """Three to six round numbers that cover low to high."""
+    span = max(high - low, 1e-9 * max(abs(high), 1.0), 1e-9)
+    raw = span / 4
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = power * next(factor for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
+    first, last = np.floor(low / step), np.ceil(high / step)
+    return [round(float(index * step), 10) for index in np.arange(first, last + 1)]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A camera from above."""
+
+    frame_id: int
+    x: float
+    y: float
+    radius: float
+    colour: str
+    tip: tuple[float, float]
+    """End of the line that shows where it looks."""
+    active: bool
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The trajectory from above, in units of its SVG."""
+
+    width: float
+    height: float
+    path: str
+    marks: tuple[Mark, ...]
+
+
+def weight_colour(weight: float) -> str:
+    """Amber (barely used) to teal (fully), which people with any colour vision can tell apart."""
+    red, green, blue = np.rint(_LOW + (_HIGH - _LOW) * min(max(weight, 0.0), 1.0)).astype(int)
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+def plan_of(rows: Sequence[FrameRow]) -> Plan | None:
+    """The cameras of the placed frames from above (x to the right, z up); None without any."""
+    placed = [row for row in rows if row.frame.registered]
+    if not placed:
+        return None
+    cameras = [camera_of(row.frame) for row in placed]
+    centres = np.array([camera.centre[[0, 2]] for camera in cameras]) * [1.0, -1.0]
+    looks = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
+    looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    scale = 520.0 / max(float((high - low).max()), 1e-6)
+    size = (high - low) * scale
+    height = float(np.clip(size[1], 160.0, 420.0))
+    at = (centres - (low + high) / 2.0) * min(scale, height / max(float(high[1] - low[1]), 1e-6))
+    at += np.array([size[0], height]) / 2.0 + 60.0
+    marks = [
+        Mark(
+            row.frame.frame_id,
+            round(float(x), 1),
+            round(float(y), 1),
+            5.0 + 3.0 * (row.weight or 0.0),
+            weight_colour(row.weight or 0.0),
+            (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
+            bool(row.weight),
+        )
+        for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
+    ]
+    path = "M" + " L".join(f"{mark.x},{mark.y}" for mark in marks)
+    return Plan(float(size[0]) + 120.0, height + 120.0, path, tuple(marks))
+
+
+@dataclass(frozen=True)
+class Bars:
+    """One figure a frame."""
+
+    title: str
+    unit: str
+    values: tuple[tuple[int, float], ...]
+    """Frame id and value."""
+    low: float
+    high: float
+    summary: str
+
+
+def fitted_bars(rows: Sequence[FrameRow]) -> list[Bars]:
+    """What was found out about each frame's exposure, as far as it was."""
+    figures: list[tuple[str, str, dict[int, float | None], bool]] = [
+        ("Motion blur", "px", {row.frame.frame_id: row.blur_px for row in rows}, False),
+        ("Rolling shutter", "px", {row.frame.frame_id: _skew(row) for row in rows}, False),
+        ("Defocus", "px", {row.frame.frame_id: row.formation.get("defocus_px") for row in rows}, False),
+        ("Exposure", "stops", {row.frame.frame_id: row.gain_ev for row in rows}, True),
+    ]
+    bars = []
+    for title, unit, found, signed in figures:
+        known = {frame_id: float(value) for frame_id, value in found.items() if value is not None}
+        if not known:
+            continue
+        values = np.array(list(known.values()))
+        summary = (
+            f"from {values.min():+.2f} to {values.max():+.2f} {unit}"
+            if signed
+            else f"median {np.median(values):.1f} {unit}, at most {values.max():.1f} {unit}"
+        )
+        bars.append(
+            Bars(
+                title,
+                unit,
+                tuple(known.items()),
+                min(0.0, float(values.min())),
+                max(float(values.max()), 0.0) or 1.0,
+                summary,
+            )
+        )
+    return bars
+
+
+def _skew(row: FrameRow) -> float | None:
+    found = row.formation.get("skew_px")
+    return found if found is not None else row.selection.skew_px if row.selection else None

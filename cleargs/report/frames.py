@@ -1,0 +1,155 @@
+"""What became of every frame: the rows of a report's strip, joined from the tables of the stages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cleargs.capture.tables import Frame, load_frames
+from cleargs.rivr.tables import Selection, read_selection
+from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
+from cleargs.splat.compensation import Exposure, read_exposure
+from cleargs.tables import read_table
+
+HELD_OUT, UNPLACED = "held out", "not placed"
+"""Roles of frames on which RVA has nothing to say."""
+
+CHOICES = {
+    "render": "the render",
+    "restored": "the restored frame",
+    "fused": "render and restored frame, fused",
+}
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One frame; None where a stage has nothing to say about it."""
+
+    frame: Frame
+    role: str
+    weight: float | None
+    """Of its raw supervision, 0 to 1."""
+    R: float | None
+    B: float | None
+    G: float | None
+    cues: Mapping[str, float] = field(default_factory=dict)
+    """Name -> how bad it is, 0 to 1, qualities turned round."""
+    geometry: Mapping[str, float] = field(default_factory=dict)
+    selection: Selection | None = None
+    """Of the latest round."""
+    gain_ev: float | None = None
+    """Exposure beside the scene's at middle grey, stops; None without compensation."""
+    formation: Mapping[str, Any] = field(default_factory=dict)
+    """Column of ``formation.parquet`` -> value."""
+
+    @property
+    def worst(self) -> tuple[str, float] | None:
+        """The worst cue and how bad it is."""
+        return max(self.cues.items(), key=lambda item: item[1], default=None)
+
+    @property
+    def blur_px(self) -> float | None:
+        """How far the pixels moved while exposed."""
+        found = self.formation.get("blur_px")
+        return found if found is not None else self.selection.blur_px if self.selection else None
+
+    @property
+    def repair(self) -> str:
+        """The repair chosen, in words."""
+        if self.selection is None:
+            return "none tried"
+        chosen = CHOICES[self.selection.chosen]
+        return chosen if self.selection.accepted else f"none: {chosen} was refused"
+
+    @property
+    def why(self) -> str:
+        """Why it was chosen."""
+        if self.selection is None:
+            return ""
+        scores = scores_of(self.selection, "primary")
+        found = ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
+        return f"{self.selection.reason}; {self.selection.primary_metric}: {found}"
+
+
+def scores_of(selection: Selection, role: str) -> dict[str, float]:
+    """Candidate -> score by the ``primary`` or ``tiebreak`` scorer."""
+    scores = {name: getattr(selection, f"{role}_{name}") for name in CHOICES}
+    return {name: score for name, score in scores.items() if score is not None}
+
+
+def load_rows(run: Path, final: str | None) -> list[FrameRow]:
+    """The frames of ``run`` in their order; ``final`` is the stage of the scene shown. Raises StoreError."""
+    judged = _judged(run)
+    selections = _selections(run)
+    exposure = read_exposure(run / final / "exposure.parquet") if final else None
+    formation = _formation(run, final)
+    rows = []
+    for frame in load_frames(run / "ingest"):
+        seen = judged.get(frame.frame_id, {})
+        role = seen.get("role", "") if frame.split == "train" else HELD_OUT
+        rows.append(
+            FrameRow(
+                frame=frame,
+                role=role if frame.registered else UNPLACED,
+                weight=seen.get("weight"),
+                R=seen.get("R"),
+                B=seen.get("B"),
+                G=seen.get("G"),
+                cues=_cues(seen),
+                geometry={name: seen[name] for name in "CDOZ" if seen.get(name) is not None},
+                selection=selections.get(frame.frame_id),
+                gain_ev=_gain(exposure, frame.frame_id),
+                formation=formation.get(frame.frame_id, {}),
+            )
+        )
+    return rows
+
+
+def _judged(run: Path) -> dict[int, dict[str, Any]]:
+    path = run / "rva" / "frames.parquet"
+    return {row["frame_id"]: row for row in read_table(path, FRAMES).to_pylist()} if path.is_file() else {}
+
+
+def _selections(run: Path) -> dict[int, Selection]:
+    """The row of the latest round of every target frame."""
+    path = run / "rivr" / "selection.parquet"
+    rows = read_selection(path) if path.is_file() else []
+    return {row.frame_id: row for row in sorted(rows, key=lambda row: row.round)}
+
+
+def _formation(run: Path, final: str | None) -> dict[int, dict[str, Any]]:
+    """What the camera did to each frame, as the latest stage found it."""
+    path = run / (final or "") / "formation.parquet"
+    if not path.is_file():
+        return {}
+    rows = pq.read_table(path).to_pylist()
+    return {row.pop("frame_id"): row for row in rows if "frame_id" in row}
+
+
+def formation_meanings(run: Path, final: str | None) -> dict[str, str]:
+    """Column of ``formation.parquet`` -> what it means."""
+    path = run / (final or "") / "formation.parquet"
+    schema = pq.read_schema(path) if path.is_file() else pa.schema([])
+    return {field.name: (field.metadata or {}).get(b"meaning", b"").decode() for field in schema}
+
+
+def _cues(row: Mapping[str, Any]) -> dict[str, float]:
+    qualities = {f"low {name}": row.get(f"r_{name}") for name in R_CUES}
+    lacking = {name: 1.0 - value for name, value in qualities.items() if value is not None}
+    harms = {name.replace("_", " "): row.get(f"b_{name}") for name in B_CUES}
+    return {**lacking, **{name: value for name, value in harms.items() if value is not None}}
+
+
+def _gain(exposure: Exposure | None, frame_id: int) -> float | None:
+    if exposure is None or not exposure.enabled or frame_id not in exposure.frame_ids:
+        return None
+    affine = exposure.of(frame_id)
+    grey = affine[:, :3].sum(axis=1) * 0.5 + affine[:, 3]
+    # sRGB to linear light near middle grey is a power of 2.4 or so; a stop is a factor of two there.
+    return 2.4 * math.log2(max(float(grey.mean()), 1e-3) / 0.5)

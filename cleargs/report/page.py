@@ -1,0 +1,362 @@
+"""``RUN/report/index.html``: a run as a page that opens from the disk, without a server or a network."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import cleargs
+from cleargs.capture.tables import Frame
+from cleargs.errors import InputError
+from cleargs.files import PARTIAL_SUFFIX, disk_error
+from cleargs.pipeline.manifest import Manifest, plain_json
+from cleargs.pipeline.plan import Planner, StagePlan
+from cleargs.report import charts, facts, words
+from cleargs.report.frames import FrameRow, formation_meanings, load_rows, scores_of
+from cleargs.report.pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
+from cleargs.report.record import FOLDER, PAGE, LastRun, linked_manifests, noted, page_of, write_record
+from cleargs.report.scene import (
+    Renderer,
+    camera_of,
+    level_camera,
+    opening,
+    viewer_pose,
+    write_scene,
+    write_viewer,
+)
+from cleargs.report.verdict import judge
+from cleargs.splat.compensation import read_exposure
+from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.ply import read_ply
+
+RENDERED = 40
+"""Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
+
+_STILL = 960  # px, long side of the pictures that stand for the viewers
+_SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
+_SCENES = ("g0", "rivr", "consolidate")
+
+TITLES = {
+    "before": ("Before", "trained on the frames as filmed"),
+    "after": ("After", "trained on with repaired views"),
+}
+"""The two scenes, and what each is."""
+
+UNCHANGED = "the same scene: no repair changed it"
+"""What the second is where it has the bytes of the first."""
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """One of the two scenes."""
+
+    key: str
+    title: str
+    what: str
+    stage: str
+    gaussians: int
+    still: Picture
+    sh_degree: int
+    shown_degree: int
+    antialias: bool
+    background: tuple[float, float, float]
+
+
+def write_report(planner: Planner, last: LastRun | None = None) -> Path:
+    """Write the report of ``planner.run``, in place of an older one; returns its page.
+
+    Without ``last``, what an older report noted of the last run is kept. The folder appears whole.
+
+    Raises:
+        InputError: when nothing of the run is done yet.
+        StoreError: when a result cannot be read, or the report not be written.
+    """
+    run = planner.run.folder
+    manifests = linked_manifests(run, planner.dag.names)
+    if "ingest" not in manifests:
+        raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs explain {run}")
+    last = last or noted(run)
+    folder = run / f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{FOLDER}"
+    try:
+        folder.mkdir()
+        _fill(folder, planner, manifests, last)
+        write_record(folder, manifests, last)
+        old = folder.with_name(f"{folder.name}.old")
+        if (run / FOLDER).exists():
+            (run / FOLDER).rename(old)
+        folder.rename(run / FOLDER)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise disk_error(error, run / FOLDER) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return page_of(run)
+
+
+def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+    """Write the page and all that it needs into ``folder``."""
+    run = planner.run.folder
+    set_threads(planner.threads)
+    trained = [stage for stage in _SCENES if stage in manifests]
+    final = trained[-1] if trained else None
+    rows = load_rows(run, final)
+    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, rows)
+    exposure = read_exposure(run / final / "exposure.parquet") if final else None
+
+    def render(row: FrameRow, side: int) -> Any:
+        camera = camera_of(row.frame)
+        assert renderer is not None and exposure is not None  # asked for only where there is a scene
+        shown = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
+        return renderer(shown, exposure.of(row.frame.frame_id))
+
+    pictures = write_pictures(
+        rows, run, folder, render if renderer else None, _rendered(rows, renderer), planner.threads
+    )
+    viewer = write_viewer(folder) if scenes else ""
+    plans = _plans(planner)
+    stale = {
+        name: "; ".join(plan.reasons)
+        for name, plan in plans.items()
+        if plan.state != "hit" and name in manifests
+    }
+    html = (
+        _environment()
+        .get_template("report.html.jinja")
+        .render(
+            name=run.name,
+            source=planner.run.source.name,
+            version=cleargs.__version__,
+            rows=rows,
+            pictures=pictures,
+            verdict=judge(manifests, rows, planner.run.config, stale),
+            scenes=scenes,
+            viewer=viewer,
+            plan=charts.plan_of(rows),
+            curves=charts.training_curves(run, trained),
+            bars=charts.fitted_bars(rows),
+            stages=facts.stage_rows(planner.dag.names, manifests, plans, last.stages if last else {}),
+            total=words.duration(sum(manifest.seconds for manifest in manifests.values())),
+            memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
+            device=list(manifests.values())[-1].device,
+            started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
+            settings=facts.changed_settings(planner.run.config),
+            versions=facts.versions(manifests),
+            command=facts.command(planner.run, planner.dag),
+            layers=LAYERS,
+            aspect=_aspect(rows),
+            data=_data(rows, pictures, scenes, formation_meanings(run, final)),
+        )
+    )
+    (folder / PAGE).write_bytes(html.encode())
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("cleargs.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["json"] = json_in_html
+    environment.globals["static"] = _static
+    environment.globals["weight_colour"] = charts.weight_colour
+    return environment
+
+
+def _static(name: str) -> Markup:
+    """A style sheet or script of ours, to stand in the page as it is."""
+    return Markup(files("cleargs.report").joinpath("static", name).read_text(encoding="utf-8"))
+
+
+def json_in_html(value: Any) -> Markup:
+    """``value`` as JSON that is inert inside a script element, whatever its strings hold."""
+    text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
+    for letter in "<>&":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)
+
+
+def _scenes(
+    folder: Path, run: Path, trained: Mapping[str, Manifest], rows: Sequence[FrameRow]
+) -> tuple[list[SceneView], Renderer | None]:
+    """Write the first and the last scene, each with a still; and what renders the last."""
+    placed = _placed(rows)
+    if not trained or not placed:
+        return [], None
+    stages = list(trained)
+    first, last = stages[0], stages[-1]
+    chosen = {"before": first, "after": last}
+    unchanged = trained[first].files["scene.ply"] == trained[last].files["scene.ply"]
+    views: list[SceneView] = []
+    renderer = None
+    start = placed[opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])]
+    for key, stage in chosen.items():
+        scene = read_ply(run / stage / "scene.ply")
+        renderer = Renderer(scene)
+        camera = camera_of(start.frame)
+        factor = _STILL / max(camera.width, camera.height)
+        size = (max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        still = write_jpeg(folder, f"{key}.jpg", renderer(level_camera(camera, *size)), _STILL)
+        degree = write_scene(folder / f"scene-{key}.js", key, scene)
+        views.append(
+            SceneView(
+                key,
+                TITLES[key][0],
+                UNCHANGED if unchanged and key == "after" else TITLES[key][1],
+                stage,
+                scene.gaussians.num,
+                still,
+                scene.gaussians.sh_degree,
+                degree,
+                scene.antialias,
+                scene.background,
+            )
+        )
+    return views, renderer
+
+
+def _placed(rows: Sequence[FrameRow]) -> list[FrameRow]:
+    return [row for row in rows if row.frame.registered]
+
+
+def _rendered(rows: Sequence[FrameRow], renderer: Renderer | None) -> frozenset[int]:
+    """Frames at which the final scene is rendered."""
+    placed = _placed(rows) if renderer else []
+    every = -(-len(placed) // RENDERED) or 1
+    return frozenset(row.frame.frame_id for row in placed[::every])
+
+
+def _plans(planner: Planner) -> dict[str, StagePlan]:
+    """The state of every stage; empty when the capture has gone."""
+    try:
+        return {plan.stage: plan for plan in planner.plan()}
+    except InputError as error:
+        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
+        return {}
+
+
+def _aspect(rows: Sequence[FrameRow]) -> str:
+    """Of the frames, as CSS takes it."""
+    frame: Frame | None = rows[0].frame if rows else None
+    return f"{frame.width} / {frame.height}" if frame else "16 / 9"
+
+
+# -- what the scripts of the page know ----------------------------------------------------------------------
+
+
+def _data(
+    rows: Sequence[FrameRow],
+    pictures: Mapping[int, FramePictures],
+    scenes: Sequence[SceneView],
+    meanings: Mapping[str, str],
+) -> dict[str, Any]:
+    placed = _placed(rows)
+    times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
+    return {
+        "layers": LAYERS,
+        "frames": [
+            _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id), meanings)
+            for row in rows
+        ],
+        "viewer": _viewer_data(placed, scenes) if scenes else None,
+    }
+
+
+def _frame_data(
+    row: FrameRow, pictures: FramePictures, time: float | None, meanings: Mapping[str, str]
+) -> dict[str, Any]:
+    figures = {"R": row.R, "B": row.B, "G": row.G, **row.geometry}
+    selection = row.selection
+    scores = (
+        {}
+        if selection is None
+        else {
+            metric: scores_of(selection, role)
+            for role, metric in (
+                ("primary", selection.primary_metric),
+                ("tiebreak", selection.tiebreak_metric),
+            )
+        }
+    )
+    found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
+    return {
+        "id": row.frame.frame_id,
+        "name": row.frame.name,
+        "role": row.role,
+        "weight": row.weight,
+        "figures": {name: value for name, value in figures.items() if value is not None},
+        "cues": dict(sorted(row.cues.items(), key=lambda item: -item[1])),
+        "repair": row.repair,
+        "why": row.why,
+        "chosen": selection.chosen if selection and selection.accepted else None,
+        "scores": scores,
+        "found": {name: value for name, value in found.items() if value is not None},
+        "formation": [
+            {"name": name.replace("_", " "), "value": value, "meaning": meanings.get(name, "")}
+            for name, value in row.formation.items()
+        ],
+        "layers": {name: picture.path for name, picture in pictures.layers.items()},
+        "time": time,
+    }
+
+
+def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dict[str, Any]:
+    """The settings of the two viewers (SuperSplat Viewer's schema, version 2), and their scenes.
+
+    The trajectory is an animation track: its keys are the frames' poses, to which the page goes by time.
+    """
+    poses = [viewer_pose(camera_of(row.frame)) for row in placed]
+    start = opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])
+    duration = max(_SECONDS_A_FRAME * len(poses), _SECONDS_A_FRAME)
+    off = {"enabled": False}
+    return {
+        "scenes": [
+            {"key": scene.key, "antialias": scene.antialias, "background": scene.background}
+            for scene in scenes
+        ],
+        "start": start * _SECONDS_A_FRAME,
+        "settings": {
+            "version": 2,
+            "tonemapping": "none",
+            "highPrecisionRendering": True,
+            "background": {"color": list(scenes[-1].background)},
+            "postEffectSettings": {
+                "sharpness": {**off, "amount": 0},
+                "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
+                "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+                "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+                "fringing": {**off, "intensity": 0.5},
+            },
+            "animTracks": [
+                {
+                    "name": "trajectory",
+                    "duration": duration,
+                    "frameRate": 1 / _SECONDS_A_FRAME,
+                    "loopMode": "none",
+                    "interpolation": "spline",
+                    "smoothness": 1,
+                    "keyframes": {
+                        "times": list(range(len(poses))),
+                        "values": {
+                            "position": [x for pose in poses for x in pose["position"]],
+                            "target": [x for pose in poses for x in pose["target"]],
+                            "fov": [pose["fov"] for pose in poses],
+                        },
+                    },
+                }
+            ],
+            "cameras": [{"initial": poses[start]}],
+            "annotations": [],
+            "startMode": "animTrack",
+        },
+    }

@@ -1,0 +1,113 @@
+"""The pictures of a report's frames, as JPEGs: what was filmed, what the scene shows there, the repairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.media.exr import from_layer, read_exr
+from cleargs.media.image import read_rgb, to_uint8
+from cleargs.report.frames import FrameRow
+
+LAYERS = {
+    "observed": "As filmed",
+    "deblurred": "Motion undone",
+    "restored": "Restored",
+    "fused": "Fused",
+    "render": "Scene, before",
+    "final": "Final scene",
+}
+"""Layers in the order shown -> what the page calls them."""
+
+FOLDER = "frames"
+BYTES = 8_500_000
+"""About how much all layers together may take."""
+
+_BYTES_A_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
+_THUMBNAIL, _QUALITY = 240, 84
+
+Image = NDArray[np.uint8]
+RenderFrame = Callable[[FrameRow, int], Image]
+"""The final scene at a frame, at most so many pixels long."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report, with the size it has."""
+
+    path: str
+    """Relative to the report."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class FramePictures:
+    """The pictures of one frame."""
+
+    thumbnail: Picture
+    layers: Mapping[str, Picture]
+    """Name in `LAYERS` -> picture, in that order."""
+
+
+def write_pictures(
+    rows: Sequence[FrameRow],
+    run: Path,
+    report: Path,
+    render: RenderFrame | None,
+    rendered: frozenset[int],
+    threads: int,
+) -> dict[int, FramePictures]:
+    """Write all pictures below ``report``; ``rendered``: the frames for which ``render`` is asked."""
+    (report / FOLDER).mkdir(parents=True)
+    layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
+    aspect = rows[0].frame.height / rows[0].frame.width if rows else 1.0
+    pixels = BYTES / (_BYTES_A_PIXEL * max(layers, 1))
+    side = int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
+    # Renders come one after the other, since each uses all threads; the files are read and written beside.
+    with ThreadPoolExecutor(threads) as pool:
+        futures = {}
+        for row in rows:
+            frame_id = row.frame.frame_id
+            final = render(row, side) if render and frame_id in rendered else None
+            futures[frame_id] = pool.submit(_write_frame, row, run, report, final, side)
+        return {frame_id: future.result() for frame_id, future in futures.items()}
+
+
+def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
+    observed = read_rgb(run / "ingest" / row.frame.image)
+    images: dict[str, Image] = {"observed": observed}
+    if row.selection is not None:
+        stored = read_exr(run / "rivr" / row.selection.exr).layers
+        images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
+    if final is not None:
+        images["final"] = final
+    name = f"{FOLDER}/{row.frame.frame_id:06d}"
+    return FramePictures(
+        write_jpeg(report, f"{name}.jpg", observed, _THUMBNAIL),
+        {
+            layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side)
+            for layer in LAYERS
+            if layer in images
+        },
+    )
+
+
+def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
+    """Write ``image`` reduced to at most ``side`` pixels."""
+    height, width = image.shape[:2]
+    factor = min(1.0, side / max(height, width))
+    if factor < 1.0:
+        width, height = max(1, round(width * factor)), max(1, round(height * factor))
+        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+    (report / name).write_bytes(data.tobytes())
+    return Picture(name, width, height)

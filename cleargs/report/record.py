@@ -1,0 +1,67 @@
+"""What a report was made from, and what the last run did: ``report.json`` beside the page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cleargs
+from cleargs.files import write_json
+from cleargs.pipeline.manifest import Manifest, linked_manifest
+
+FOLDER, PAGE, RECORD = "report", "index.html", "report.json"
+
+
+@dataclass(frozen=True)
+class LastRun:
+    """What the last ``cleargs run`` did, which no manifest says."""
+
+    stages: Mapping[str, str]
+    """Stage -> made or found."""
+    peak_memory_gb: float
+
+
+def page_of(run: Path) -> Path:
+    """Where the report of ``run`` is, or would be."""
+    return run / FOLDER / PAGE
+
+
+def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
+    """The manifests that the run shows now, in the order of the stages."""
+    found = {name: linked_manifest(run, name) for name in names}
+    return {name: manifest for name, manifest in found.items() if manifest is not None}
+
+
+def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
+    """Whether the report of ``run`` is of these results, and of this version of ClearGS."""
+    return (run / FOLDER / PAGE).is_file() and _record(run).get("made_from") == _made_from(manifests)
+
+
+def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
+    return {"cleargs": cleargs.__version__, **{name: manifest.key for name, manifest in manifests.items()}}
+
+
+def _record(run: Path) -> dict[str, Any]:
+    try:
+        record = json.loads((run / FOLDER / RECORD).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def noted(run: Path) -> LastRun | None:
+    """What the present report knows of the last run; None without it."""
+    try:
+        return LastRun(**_record(run)["last_run"])
+    except (KeyError, TypeError):
+        return None
+
+
+def write_record(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+    """Note in the report's ``folder`` what it is made from."""
+    write_json(
+        folder / RECORD, {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
+    )

@@ -1,0 +1,125 @@
+"""The scenes of a report: packed for the browser, the poses its viewers know, and a still in their place.
+
+The viewer is PlayCanvas's. It turns every PLY by 180 degrees about z, so that our y down becomes its y up;
+poses are turned alike. Its cameras have no roll: a still that stands for a viewer is that of `level_camera`.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cleargs.capture.tables import Frame
+from cleargs.splat.camera import Camera
+from cleargs.splat.compressed_ply import compressed_ply
+from cleargs.splat.constants import SH_DEGREES
+from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+from cleargs.splat.views import view_of
+
+BYTES = 10_000_000
+"""Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
+
+_TURN = np.array([-1.0, -1.0, 1.0])
+_INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
+_BASE64, _GZIP = 4 / 3, 0.9  # at worst, of what was measured on trained scenes
+
+
+def shown_degree(gaussians: int, sh_degree: int) -> int:
+    """The largest SH degree up to ``sh_degree`` with which so many Gaussians stay below `BYTES`."""
+    for coefficients, degree in sorted(SH_DEGREES.items(), reverse=True):
+        size = gaussians * (16 + 3 * (coefficients - 1)) * _BASE64 * _GZIP
+        if degree <= sh_degree and size <= BYTES:
+            return degree
+    return 0
+
+
+def write_scene(path: Path, name: str, scene: Scene) -> int:
+    """Write ``scene`` as a script that gives it to the page under ``name``; returns the SH degree kept.
+
+    A page from a disk may load scripts, but not read files.
+    """
+    gaussians = scene.gaussians
+    visible = torch.sigmoid(gaussians.logit_opacities) >= _INVISIBLE
+    degree = shown_degree(int(visible.sum()), gaussians.sh_degree)
+    kept = gaussians.select(visible)
+    kept = Gaussians(**{**kept.tensors(), "sh": kept.sh[:, : (degree + 1) ** 2].contiguous()})
+    packed = gzip.compress(compressed_ply(Scene(kept)), 6, mtime=0)
+    path.write_bytes(_script(name, packed))
+    return degree
+
+
+def write_viewer(folder: Path) -> str:
+    """Write the vendored viewer as a script, its licence beside it; returns its name and version."""
+    viewer = files("cleargs.report").joinpath("static", "viewer")
+    (folder / "viewer.js").write_bytes(_script("viewer", viewer.joinpath("index.js.gz").read_bytes()))
+    (folder / "viewer-LICENSE.txt").write_bytes(viewer.joinpath("LICENSE").read_bytes())
+    return viewer.joinpath("VERSION").read_text(encoding="utf-8").strip()
+
+
+def _script(name: str, packed: bytes) -> bytes:
+    return b'(window.packed ??= {})["%s"] = "%s";\n' % (name.encode(), base64.b64encode(packed))
+
+
+def camera_of(frame: Frame) -> Camera:
+    """The camera of a registered frame."""
+    return view_of(frame, Path(), 0.0).camera
+
+
+def viewer_pose(camera: Camera) -> dict[str, Any]:
+    """``camera`` as the viewer takes it: position, target, field of view of the longer side in degrees."""
+    forward = camera.world_to_camera[2, :3]
+    side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
+    return {
+        "position": (camera.centre * _TURN).tolist(),
+        "target": ((camera.centre + forward) * _TURN).tolist(),
+        "fov": float(np.degrees(2.0 * np.arctan(0.5 * side / focal))),
+    }
+
+
+def level_camera(camera: Camera, width: int, height: int) -> Camera:
+    """What the viewer shows at `viewer_pose` in a canvas of this size: no roll, the axis in the middle."""
+    forward = camera.world_to_camera[2, :3]
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(forward, right), forward]
+    pose[:3, 3] = -pose[:3, :3] @ camera.centre
+    side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
+    focal *= max(width, height) / side
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def opening(frames: Sequence[Frame], weights: Sequence[float]) -> int:
+    """Which of the registered ``frames`` the viewers open at: of the heaviest, the one halfway along."""
+    heaviest = [index for index, weight in enumerate(weights) if weight >= 0.95 * max(weights)]
+    return heaviest[len(heaviest) // 2]
+
+
+class Renderer:
+    """Pictures of one scene, uint8 sRGB."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._engine = Engine()
+
+    def __call__(
+        self, camera: Camera, affine: NDArray[np.float64] | None = None
+    ) -> NDArray[np.uint8]:  # [H, W, 3]
+        """The view of ``camera``, its colours through ``affine`` [3, 4] if there is one."""
+        scene = self._scene
+        image = self._engine.forward(
+            scene.gaussians, camera, background=scene.background, antialias=scene.antialias
+        ).image.numpy()
+        if affine is not None:
+            image = image @ affine[:, :3].T.astype(np.float32) + affine[:, 3].astype(np.float32)
+        return np.asarray(np.rint(image.clip(0.0, 1.0) * 255.0), np.uint8)

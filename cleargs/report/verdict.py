@@ -1,0 +1,255 @@
+"""How a run went, in words, and what stands in the way of a better one, each with the setting to change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from cleargs.pipeline.config import Config
+from cleargs.pipeline.manifest import Manifest
+from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
+from cleargs.report.words import count, decibel
+
+CLOSE_DB, LOOSE_DB = 28.0, 22.0
+"""PSNR on the trusted frames from which a scene explains them closely, and below which only loosely. For
+orientation: what a number means depends on the noise and the texture of the capture."""
+
+FEW_PLACED = 0.8
+MANY_UNUSED = 0.4
+SOFT_PX = 6.0
+
+Tone = Literal["good", "fair", "poor"]
+
+
+@dataclass(frozen=True)
+class Caution:
+    """Something that keeps the result from being better."""
+
+    what: str
+    why: str
+    settings: tuple[str, ...]
+    """As ``--set`` takes them; empty where no setting helps."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number that stands for a part of the run."""
+
+    value: str
+    label: str
+    note: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the first screen of a report says."""
+
+    tone: Tone
+    headline: str
+    text: str
+    figures: tuple[Figure, ...]
+    warnings: tuple[Caution, ...]
+
+
+def judge(
+    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
+) -> Verdict:
+    """The verdict on a run that shows these ``manifests``; ``stale``: stage -> what changed since."""
+    warnings = tuple(_warnings(manifests, rows, config, stale))
+    tone, headline = _headline(manifests)
+    return Verdict(tone, headline, _text(manifests, rows), tuple(_figures(manifests, rows)), warnings)
+
+
+def _figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
+    """A figure that a stage reported; None without the stage or the figure."""
+    value: Any = manifests[stage].summary if stage in manifests else None
+    for name in path:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value
+
+
+def _setting(config: Config, section: str, name: str) -> Any:
+    return getattr(config.sections[section], name)
+
+
+def _headline(manifests: Mapping[str, Manifest]) -> tuple[Tone, str]:
+    if "g0" not in manifests:
+        return "fair", "The capture is prepared; no scene is trained yet."
+    strong = _figure(manifests, "g0", "psnr_strong") or _figure(manifests, "g0", "psnr_active")
+    if strong is None:
+        return "fair", "The scene is trained."
+    if strong >= CLOSE_DB:
+        return "good", "The scene follows the trusted frames closely."
+    if strong >= LOOSE_DB:
+        return "fair", "The scene follows the trusted frames, with fine detail missing."
+    return "poor", "The scene follows even the trusted frames only loosely."
+
+
+def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> str:
+    placed = sum(row.frame.registered for row in rows)
+    roles = [row.role for row in rows]
+    parts = [f"{placed} of {count(len(rows), 'frame')} found their place in the scene"]
+    if strong := roles.count("strong"):
+        parts[0] += f", {strong} of them sharp and reliable enough to lead the training"
+    unused = sum(row.weight == 0.0 for row in rows if row.frame.registered)
+    if unused:
+        parts.append(f"{count(unused, 'frame')} took no part in it")
+    held = _harm(manifests)
+    if held is not None:
+        parts.append(held)
+    return ". ".join(part[:1].upper() + part[1:] for part in parts) + "."
+
+
+def _harm(manifests: Mapping[str, Manifest]) -> str | None:
+    """What the repairs did to frames that no repair was trained on."""
+    stage = "consolidate" if "consolidate" in manifests else "rivr"
+    before, after = (_figure(manifests, stage, "held_back", f"psnr_{when}") for when in ("before", "after"))
+    if before is None or after is None:
+        return None
+    if _figure(manifests, stage, "published") == "G0":
+        return "the repairs did not pay off, so the first scene is also the last"
+    change = after - before
+    kind = "more" if change >= 0 else "less"
+    return (
+        "after the repairs, the scene explains the frames kept aside for this check "
+        f"{abs(change):.1f} dB {kind} exactly ({decibel(before)} before, {decibel(after)} now)"
+    )
+
+
+def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Iterator[Figure]:
+    placed = sum(row.frame.registered for row in rows)
+    yield Figure(f"{placed} of {len(rows)}", "frames placed", "with a pose that fits the others")
+    active = sum(bool(row.weight) for row in rows)
+    if "rva" in manifests:
+        effective = _figure(manifests, "rva", "effective_frames")
+        yield Figure(f"{active}", "frames train the scene", f"as much as {effective:.1f} whole ones together")
+    psnr = _figure(manifests, "g0", "psnr_strong")
+    if psnr is not None:
+        yield Figure(
+            decibel(psnr), "on trusted frames", "PSNR of the first scene, on frames it was trained on"
+        )
+    repairs = _figure(manifests, "consolidate", "repairs")
+    if repairs is not None:
+        yield Figure(
+            str(repairs),
+            "repaired views" if repairs != 1 else "repaired view",
+            "carried into the final scene",
+        )
+
+
+def _warnings(
+    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
+) -> Iterator[Caution]:
+    for stage, reason in stale.items():
+        yield Caution(f"{stage} is not from today's settings and input", reason, ())
+    for manifest in manifests.values():
+        for missing in manifest.missing:
+            yield Caution(f"{manifest.stage} is done only in part", missing, ())
+    yield from _capture_warnings(manifests, rows, config)
+    yield from _allocation_warnings(manifests, rows, config)
+    yield from _scene_warnings(manifests, config)
+
+
+def _capture_warnings(
+    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
+) -> Iterator[Caution]:
+    unplaced = sum(row.role == UNPLACED for row in rows)
+    if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
+        yield Caution(
+            f"{count(unplaced, 'frame')} found no place",
+            "They share too few points with their neighbours: too blurred, or too far apart.",
+            (
+                f"ingest.max_frames={2 * len(rows)}",
+                f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}",
+            ),
+        )
+    available = _figure(manifests, "ingest", "frames_available") or 0
+    if available > 1.5 * len(rows):
+        yield Caution(
+            f"{len(rows)} of {available} frames were used",
+            "More frames bring more views of every surface, at more time.",
+            (f"ingest.max_frames={min(available, 2 * len(rows))}",),
+        )
+    if rows and not any(row.role == HELD_OUT for row in rows):
+        yield Caution(
+            "No frame was held out",
+            "All figures here are of frames that the scene has seen; new views may look worse.",
+            ("ingest.holdout=every:8",),
+        )
+
+
+def _allocation_warnings(
+    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
+) -> Iterator[Caution]:
+    if _figure(manifests, "rva", "stand_in"):
+        yield Caution(
+            "No frame counts as reliable",
+            "The best of them stand in. Thresholds nearer to this capture tell good frames from bad ones.",
+            tuple(
+                f"rva.{name}={_setting(config, 'rva', name) + step:.2f}"
+                for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
+            ),
+        )
+    uncovered = _figure(manifests, "rva", "bins_uncovered_before") or 0
+    if uncovered:
+        yield Caution(
+            f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
+            "Weak frames were taken back there, at low weight, and the scene is softer. Film slower there.",
+            (),
+        )
+    placed = [row for row in rows if row.frame.registered and row.weight is not None]
+    unused = sum(row.weight == 0.0 for row in placed)
+    if placed and unused > MANY_UNUSED * len(placed):
+        yield Caution(
+            f"{unused} of {len(placed)} placed frames are unused",
+            "A lower threshold of reliability lets more of them in.",
+            (f"rva.tau_R={max(0.0, _setting(config, 'rva', 'tau_R') - 0.1):.2f}",),
+        )
+    blurred = [row for row in rows if (row.blur_px or 0.0) > SOFT_PX]
+    if len(blurred) > len(rows) / 2:
+        yield Caution(
+            f"{count(len(blurred), 'frame')} moved by more than {SOFT_PX:g} px while exposed",
+            "A shorter exposure or a slower hand gives sharper frames than any repair.",
+            (),
+        )
+
+
+def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterator[Caution]:
+    psnr = _figure(manifests, "g0", "psnr_strong")
+    steps = _setting(config, "g0", "steps")
+    if psnr is not None and psnr < CLOSE_DB:
+        yield Caution(
+            f"The first scene reaches {decibel(psnr)} on the frames it trusts",
+            "A longer training, or larger images, bring out finer detail.",
+            (
+                f"g0.steps={2 * steps}",
+                f"ingest.max_size={_setting(config, 'ingest', 'max_size') * 3 // 2}",
+            ),
+        )
+    spread = _figure(manifests, "g0", "exposure_spread")
+    threshold = _setting(config, "g0", "exposure_threshold")
+    if spread is not None and spread > threshold and not _figure(manifests, "g0", "exposure"):
+        yield Caution(
+            f"Exposure differs by {100 * spread:.0f} % between frames",
+            "Without compensation the scene takes on their average, with floating haze.",
+            ("g0.exposure=auto",),
+        )
+    for stage in ("rivr", "consolidate"):
+        harm = _figure(manifests, stage, "held_back", "harm")
+        if harm:
+            yield Caution(
+                f"The scene of {stage} was rejected",
+                f"It explains frames kept aside worse than before ({harm}), so the one before it stays.",
+                (f"{stage}.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
+            )
+    rounds = _figure(manifests, "rivr", "rounds") or []
+    refused = sum(found["repairs_refused"] for found in rounds)
+    made = sum(sum(found["chosen"].values()) for found in rounds)
+    if made and 2 * refused > made:
+        yield Caution(
+            f"{refused} of {made} repairs were refused",
+            "They agree with neither the frame nor the render: the repair model does not suit this capture. "
+            "`cleargs models list` names others.",
+            ("rivr.expert=NAME",),
+        )

@@ -1,0 +1,27 @@
+"""Numbers in words, as a report says them."""
+
+from __future__ import annotations
+
+
+def count(number: int, one: str, many: str = "") -> str:
+    """``3 frames``, ``1 frame``."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def decibel(value: float) -> str:
+    """``31.2 dB``."""
+    return f"{value:.1f} dB"
+
+
+def duration(seconds: float) -> str:
+    """``4.0 s``, ``3.4 min``, ``2.1 h``."""
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def size(count: int) -> str:
+    """Bytes as ``640 kB`` or ``12.3 MB``."""
+    if count < 1e6:
+        return f"{count / 1e3:.0f} kB"
+    return f"{count / 1e6:.1f} MB" if count < 1e9 else f"{count / 1e9:.2f} GB"

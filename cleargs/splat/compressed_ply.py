@@ -1,0 +1,136 @@
+"""``.compressed.ply``, PlayCanvas's quantised PLY: 16 bytes a Gaussian, and one a spherical-harmonics number.
+
+Gaussians stand in chunks of 256. A chunk keeps the range of its positions, log scales and colours in float32;
+a Gaussian keeps where in these ranges it lies (11, 10 and 11 bits; colours 8), the three smaller numbers of
+its quaternion (10 bits each, and 2 that say which was left out) and its opacity (8 bits). Numbers of the
+spherical harmonics above degree 0 are 8 bits from -4 to 4. Source: the writer of splat-transform.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cleargs.files import write_bytes
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+
+CHUNK = 256
+"""Gaussians that share their ranges."""
+
+_C0 = 0.28209479177387814  # Y_00, the constant spherical harmonic
+_LOG_SCALE_MAX = 20.0
+_MORTON_BITS = 21  # a coordinate; three of them fit into 63 bits
+_RANGES = [
+    f"{end}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+]
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def write_compressed_ply(path: Path, scene: Scene) -> None:
+    """Write ``scene`` atomically; equal scenes give equal bytes. Gaussians come out in Morton order."""
+    write_bytes(path, compressed_ply(scene))
+
+
+def compressed_ply(scene: Scene) -> bytes:
+    """The bytes of `write_compressed_ply`."""
+    gaussians = scene.gaussians.to("cpu").detach()
+    order = morton_order(gaussians.means.numpy())
+    gaussians = gaussians.select(torch.from_numpy(order))
+    count, coefficients = gaussians.num, gaussians.sh.shape[1]
+    ranges, packed = _chunks(gaussians)
+    rest = 3 * (coefficients - 1)
+    by_colour = gaussians.sh.numpy()[:, 1:].transpose(0, 2, 1).reshape(count, rest)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment written by ClearGS",
+        f"element chunk {len(ranges)}",
+        *(f"property float {name}" for name in _RANGES),
+        f"element vertex {count}",
+        *(f"property uint {name}" for name in _PACKED),
+        *([f"element sh {count}"] if rest else []),
+        *(f"property uchar f_rest_{index}" for index in range(rest)),
+        "end_header\n",
+    ]
+    return b"".join(
+        [
+            "\n".join(header).encode("ascii"),
+            ranges.astype("<f4").tobytes(),
+            packed.astype("<u4").tobytes(),
+            np.clip((by_colour / 8.0 + 0.5) * 256.0, 0, 255).astype(np.uint8).tobytes(),
+        ]
+    )
+
+
+def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:  # [N, 3] -> [N]
+    """The order along a Z-curve, in which neighbours in a file are neighbours in space."""
+    if len(means) == 0:
+        return np.zeros(0, np.int64)
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    steps = (means - low) / np.maximum(high - low, 1e-12) * (2**_MORTON_BITS - 1)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        spread = steps[:, axis].astype(np.uint64)
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
+        code |= spread << np.uint64(axis)
+    return np.argsort(code, kind="stable")
+
+
+def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Ranges [chunks, 18] and packed Gaussians [N, 4]. The last chunk is filled with its last Gaussian."""
+    count = gaussians.num
+    chunks = -(-count // CHUNK)
+    rows = np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0))
+    colours = gaussians.sh.numpy()[:, 0] * np.float32(_C0) + np.float32(0.5)
+    scales = gaussians.log_scales.numpy().clip(-_LOG_SCALE_MAX, _LOG_SCALE_MAX)
+    ranges, places = [], []
+    for values in (gaussians.means.numpy(), scales, colours):
+        chunked = values[rows].reshape(chunks, CHUNK, 3)
+        low, high = chunked.min(axis=1), chunked.max(axis=1)
+        ranges += [low, high]
+        width = np.where(high > low, high - low, 1.0)[:, None]
+        places.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
+    position, scale, colour = places
+    alpha = torch.sigmoid(gaussians.logit_opacities).numpy()
+    packed = [
+        _pack(position, (11, 10, 11)),
+        _pack_rotation(gaussians.rotations.numpy()),
+        _pack(scale, (11, 10, 11)),
+        _pack(np.column_stack([colour, alpha]), (8, 8, 8, 8)),
+    ]
+    return np.concatenate(ranges, axis=1), np.stack(packed, axis=1)
+
+
+def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint32]:  # [N, K] -> [N]
+    """K numbers in [0, 1] in so many bits each, the first in the highest."""
+    packed = np.zeros(len(values), np.uint32)
+    for column, width in enumerate(bits):
+        top = 2**width - 1
+        steps = np.clip(np.floor(values[:, column] * top + 0.5), 0, top)
+        packed = (packed << np.uint32(width)) | steps.astype(np.uint32)
+    return packed
+
+
+def _pack_rotation(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] -> [N]
+    """Which of w, x, y, z is largest (2 bits), and the other three in their order, times sqrt(1/2)."""
+    unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
+    largest = np.abs(unit).argmax(axis=1)
+    unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    smaller = np.take_along_axis(unit, others, axis=1) * np.sqrt(0.5) + 0.5
+    packed: NDArray[np.uint32] = (largest.astype(np.uint32) << np.uint32(30)) | _pack(smaller, (10, 10, 10))
+    return packed

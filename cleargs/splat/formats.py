@@ -1,0 +1,83 @@
+"""Scene files for other programs, by their ending.
+
+Each format has axes of its own. Ours are those of COLMAP and of the Inria code's PLYs: y down, z forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cleargs.errors import InputError
+from cleargs.files import write_bytes
+from cleargs.splat.compressed_ply import write_compressed_ply
+from cleargs.splat.export import transform_scene
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.glb import glb
+from cleargs.splat.ply import write_ply
+from cleargs.splat.scene import Scene
+from cleargs.splat.spz import spz
+from cleargs.splat.usd import write_usd
+
+_AS_IS = (1.0, 1.0, 1.0)
+_ABOUT_X = (1.0, -1.0, -1.0)  # to x right, y up, z back: the axes of SPZ
+_ABOUT_Z = (-1.0, -1.0, 1.0)  # to y up, z still forward: how glTF and PlayCanvas's tools show PLYs
+
+
+@dataclass(frozen=True)
+class Format:
+    """How one kind of file is written."""
+
+    write: Callable[[Path, Scene], None]
+    axes: tuple[float, float, float]
+    """Signs of our axes in the file: half a turn, or none."""
+
+
+FORMATS: Mapping[str, Format] = {
+    "compressed.ply": Format(write_compressed_ply, _AS_IS),
+    "ply": Format(write_ply, _AS_IS),
+    "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
+    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z),
+    "usdc": Format(write_usd, _ABOUT_Z),
+}
+"""Ending -> format; a longer ending stands before the one that it ends with."""
+
+
+def format_of(path: Path) -> str:
+    """The ending of ``path`` in `FORMATS`. Raises InputError for any other."""
+    name = path.name.lower()
+    kind = next((ending for ending in FORMATS if name.endswith(f".{ending}")), None)
+    if kind is None:
+        raise InputError(
+            f"{path} has no ending that says what to write",
+            hint=f"end it with one of .{', .'.join(FORMATS)}",
+        )
+    return kind
+
+
+def write_scene(path: Path, scene: Scene, kind: str) -> None:
+    """Write ``scene`` (our axes) to ``path`` as ``kind`` of `FORMATS`, atomically."""
+    target = FORMATS[kind]
+    if target.axes != _AS_IS:
+        scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
+    target.write(path, scene)
+
+
+def padded(scene: Scene, sh_degree: int) -> Scene:
+    """``scene`` with zeros for spherical harmonics up to ``sh_degree``: the Inria code reads degree 3 only.
+
+    Raises InputError when the scene has a higher degree.
+    """
+    gaussians, coefficients = scene.gaussians, (sh_degree + 1) ** 2
+    if sh_degree < gaussians.sh_degree:
+        raise InputError(
+            f"the scene has spherical harmonics of degree {gaussians.sh_degree}",
+            hint=f"give --sh-degree {gaussians.sh_degree} or more, or leave it out",
+        )
+    sh = torch.zeros(gaussians.num, coefficients, 3)
+    sh[:, : gaussians.sh.shape[1]] = gaussians.sh
+    return replace(scene, gaussians=Gaussians(**{**gaussians.tensors(), "sh": sh}))

@@ -1,0 +1,97 @@
+"""``.glb`` with KHR_gaussian_splatting: points whose attributes are the parameters of Gaussians.
+
+Scales and opacities are stored after activation (standard deviations, and 0 to 1), rotations as x y z w,
+spherical harmonics as they are. COLOR_0 lets programs that know nothing of Gaussians show coloured points.
+Source: the Khronos extension's text.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cleargs.splat.scene import Scene
+
+_NAME = "KHR_gaussian_splatting"
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_C0 = 0.28209479177387814
+
+
+def glb(scene: Scene) -> bytes:
+    """The bytes of ``scene``, whose y is up as glTF wants it; equal scenes give equal bytes."""
+    columns = _columns(scene)
+    data = b""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    for column in columns.values():
+        content = column.tobytes()
+        views.append(
+            {"buffer": 0, "byteOffset": len(data), "byteLength": len(content), "target": _ARRAY_BUFFER}
+        )
+        bytewise = column.dtype == np.uint8
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": _BYTE if bytewise else _FLOAT,
+                "count": len(column),
+                "type": _KINDS[column.shape[1]],
+                **({"normalized": True} if bytewise else {}),
+            }
+        )
+        data += content + bytes(-len(content) % 4)
+    means = columns["POSITION"]
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    splats = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(columns)},
+        "mode": _POINTS,
+        "extensions": {_NAME: splats},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "ClearGS"},
+        "extensionsUsed": [_NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
+    """Attribute -> values [N, 1, 3 or 4]."""
+    gaussians = scene.gaussians.to("cpu").detach()
+    sh = gaussians.sh.numpy()
+    alpha = torch.sigmoid(gaussians.logit_opacities).numpy()[:, None]
+    unit = torch.nn.functional.normalize(gaussians.rotations.double(), dim=1).float().numpy()
+    colour = np.concatenate([sh[:, 0] * _C0 + 0.5, alpha], axis=1)
+    columns: dict[str, NDArray[np.float32] | NDArray[np.uint8]] = {
+        "POSITION": gaussians.means.numpy(),
+        "COLOR_0": np.rint(colour.clip(0, 1) * 255).astype(np.uint8),
+        f"{_NAME}:ROTATION": np.ascontiguousarray(unit[:, [1, 2, 3, 0]]),
+        f"{_NAME}:SCALE": gaussians.log_scales.exp().numpy(),
+        f"{_NAME}:OPACITY": alpha,
+    }
+    for degree in range(gaussians.sh_degree + 1):
+        for index in range(2 * degree + 1):
+            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{index}"] = np.ascontiguousarray(
+                sh[:, degree**2 + index]
+            )
+    return columns

@@ -1,0 +1,201 @@
+"""The report as files: what is in it, what is not, and that nothing in a capture can break it."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+from base64 import b64decode
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from report_run import COUNT, HOSTILE, FinishedRun, wall
+
+from cleargs.cli.report import report_on
+from cleargs.errors import InputError
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.store import Store
+from cleargs.report import facts
+from cleargs.report.charts import weight_colour
+from cleargs.report.page import json_in_html, write_report
+from cleargs.report.record import LastRun, is_current, linked_manifests
+from cleargs.report.scene import BYTES, shown_degree, write_scene
+
+
+class Page(HTMLParser):
+    """Elements of a page: (tag, attributes), and the text in all."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    return FinishedRun(tmp_path_factory.mktemp("report"))
+
+
+@pytest.fixture(scope="module")
+def store(run: FinishedRun) -> Iterator[Store]:
+    root = run.folder / ".store"
+    root.mkdir()
+    with DigestMemo(root / "digests.sqlite") as memo:
+        yield Store(root, memo)
+
+
+@pytest.fixture(scope="module")
+def page(run: FinishedRun, store: Store) -> Path:
+    return write_report(run.planner(store), LastRun({"ingest": "found", "g0": "made"}, 1.25))
+
+
+@pytest.fixture(scope="module")
+def parsed(page: Path) -> Page:
+    return Page(page.read_text())
+
+
+def test_every_file_that_the_page_names_is_there(page: Path, parsed: Page) -> None:
+    named = [image["src"] for image in parsed.all("img") if "src" in image]
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(), re.S)[1])
+    named += [path for frame in data["frames"] for path in frame["layers"].values()]
+    named += ["viewer.js", "scene-before.js", "scene-after.js", "viewer-LICENSE.txt"]
+    missing = [name for name in named if name and not (page.parent / name).is_file()]
+    assert len(named) > 30 and not missing
+    frames = {frame["id"]: frame for frame in data["frames"]}
+    assert set(frames[0]["layers"]) == {"observed", "restored", "render", "final"}
+    assert set(frames[5]["layers"]) == {"observed", "final"}  # no repair was tried
+    assert set(frames[6]["layers"]) == {"observed"} and frames[6]["time"] is None  # it has no place
+    assert frames[0]["chosen"] == "restored" and frames[4]["chosen"] is None
+
+
+def test_every_picture_says_what_it_shows(parsed: Page) -> None:
+    pictures = [image for image in parsed.all("img") if "src" in image]
+    assert len(pictures) == COUNT + 2 and all(image.get("alt") for image in pictures)
+    drawings = [svg for svg in parsed.all("svg") if svg.get("aria-hidden") != "true"]
+    assert len(drawings) == 1 + 3 + 3 and all(svg.get("aria-label") for svg in drawings)
+
+
+def test_nothing_is_loaded_from_a_network(page: Path, parsed: Page) -> None:
+    links = [
+        value
+        for _, attributes in parsed.elements
+        for name, value in attributes.items()
+        if name in ("src", "href")
+    ]
+    assert not [link for link in links if link and re.match(r"(https?:)?//", link)]
+    style = re.search(r"<style>(.*?)</style>", page.read_text(), re.S)[1]
+    assert "url(" not in style and "@import" not in style
+
+
+def test_hostile_names_stay_text(page: Path, parsed: Page) -> None:
+    assert all(name in parsed.text for name in HOSTILE)  # as text, whole
+    assert not any("onerror" in attributes for _, attributes in parsed.elements)
+    assert len(parsed.all("script")) == 3 and "window.hacked = 1</script>" not in page.read_text()
+
+
+def test_json_in_a_script_cannot_end_it() -> None:
+    hostile = {"a": "</script><!-- <script> & \u2028", "nan": float("nan")}
+    text = str(json_in_html(hostile))
+    assert not set(text) & set("<>&\u2028")
+    assert json.loads(text) == {"a": hostile["a"], "nan": None}
+
+
+def test_the_verdict_names_settings_that_exist(parsed: Page, run: FinishedRun) -> None:
+    chips = [button["data-copy"] for button in parsed.all("button") if button.get("class") == "chip"]
+    assert "--set ingest.holdout=every:8" in chips and "--set g0.steps=800" in chips
+    sections = run.run.config.sections
+    for chip in chips:
+        section, _, name = str(chip).removeprefix("--set ").partition("=")[0].partition(".")
+        assert name in type(sections[section]).model_fields
+    assert "24.0 dB before, 25.5 dB now" in parsed.text
+    assert "1 stretch of the path" in parsed.text
+
+
+def test_settings_and_the_command_make_the_run_again(run: FinishedRun) -> None:
+    changed = {
+        setting.name: (setting.value, setting.default) for setting in facts.changed_settings(run.run.config)
+    }
+    assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "600")
+    assert facts.command(run.run, run.dag) == (
+        "cleargs run 'gone & <away>.mp4' -o run --workflow smoke --set rva.tau_R=0.61"
+    )
+
+
+def test_a_report_knows_whether_it_is_current(run: FinishedRun, store: Store, page: Path) -> None:
+    manifests = linked_manifests(run.folder, run.dag.names)
+    assert is_current(run.folder, manifests)
+    other = manifests["g0"].model_copy(update={"key": "0" * 64})
+    assert not is_current(run.folder, {**manifests, "g0": other})
+    again = write_report(run.planner(store))  # what the last run did is kept
+    assert "1.2 GB of memory" in Page(again.read_text()).text and "made anew" in again.read_text()
+    assert not [path for path in run.folder.iterdir() if "partial" in path.name]
+
+
+def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    manifests = linked_manifests(run.folder, run.dag.names)
+
+    def outcomes(how: Literal["made", "found"]) -> list[Outcome]:
+        return [Outcome(name, how, manifest, run.folder / name) for name, manifest in manifests.items()]
+
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        planner = run.planner(Store(tmp_path, memo))
+        page = report_on(planner, outcomes("found"))
+        assert page == run.folder / "report/index.html" and "found in the store" in page.read_text()
+        page.write_text("as it was")
+        assert report_on(planner, outcomes("found")) == page and page.read_text() == "as it was"
+        assert report_on(planner, outcomes("made")) == page and "made anew" in page.read_text()
+        (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
+        assert report_on(planner, outcomes("made")) is None  # the run itself has succeeded
+        assert "made anew" in page.read_text()  # the report before stays
+        assert report_on(planner, []) is None
+
+
+def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        for stage in ("rivr", "consolidate"):
+            (run.folder / stage / "manifest.json").unlink()
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+        assert "no repair changed it" in text and "with repaired views" not in text
+        (run.folder / "g0/manifest.json").unlink()
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+        assert "no scene is trained yet" in text and 'id="stage"' not in text
+        for stage in ("ingest", "rva"):
+            (run.folder / stage / "manifest.json").unlink()
+        with pytest.raises(InputError, match="nothing is done"):
+            write_report(run.planner(Store(tmp_path, memo)))
+
+
+def test_a_scene_in_a_report_is_bounded(tmp_path: Path) -> None:
+    assert shown_degree(40_000, 3) == 3
+    assert shown_degree(300_000, 3) == 1
+    assert shown_degree(300_000, 0) == 0
+    scene = wall(3, gaussians=3000, sh_degree=2)
+    scene.gaussians.logit_opacities[:1000] = -8.0  # alpha 0.0003, stored as 0: nothing is lost
+    assert write_scene(tmp_path / "scene.js", "after", scene) == 2
+    script = (tmp_path / "scene.js").read_bytes()
+    packed = gzip.decompress(b64decode(script.split(b'"')[3]))
+    assert b"element vertex 2000\n" in packed and len(script) < BYTES
+
+
+def test_weights_run_from_amber_to_teal() -> None:
+    def rgb(weight: float) -> np.ndarray:
+        return np.array([int(weight_colour(weight)[k : k + 2], 16) for k in (1, 3, 5)])
+
+    assert rgb(0.0)[0] > 200 and rgb(1.0)[0] < 50 and (rgb(2.0) == rgb(1.0)).all()
