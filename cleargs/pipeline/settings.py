@@ -160,6 +160,8 @@ def _allowed(annotation: Any, metadata: list[Any]) -> str:
             words += [str(choice) for choice in get_args(kind)]
         elif get_origin(kind) is tuple:
             words.append(_several(get_args(kind)))
+        elif get_origin(kind) is Annotated:
+            words.append(_annotated(kind))
         else:
             words.append(KIND_WORDS.get(kind, ""))
     if not all(words):
@@ -175,12 +177,15 @@ def _allowed(annotation: Any, metadata: list[Any]) -> str:
 
 def _several(kinds: tuple[Any, ...]) -> str:
     """What a list of a fixed length takes."""
-    first, limits = kinds[0], []
-    if get_origin(first) is Annotated:
-        first, *fields = get_args(first)
-        limits = [item for field in fields for item in field.metadata]
-    each = _allowed(first, limits)
+    first = kinds[0]
+    each = _annotated(first) if get_origin(first) is Annotated else _allowed(first, [])
     return f"{len(kinds)} values, each {each}" if each else ""
+
+
+def _annotated(kind: Any) -> str:
+    """What a type with limits of its own takes."""
+    inner, *fields = get_args(kind)
+    return _allowed(inner, [item for field in fields for item in field.metadata])
 
 
 def suggestion(name: str, prefix: str, siblings: list[str], models: Mapping[str, type[BaseModel]]) -> str:

@@ -34,7 +34,7 @@ from cleargs.report.scene import (
     write_viewer,
 )
 from cleargs.report.verdict import judge
-from cleargs.splat.compensation import read_exposure
+from cleargs.formation.colour import read_exposure
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 

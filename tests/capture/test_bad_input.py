@@ -213,5 +213,5 @@ def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) ->
 def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
     (posed / "masks").mkdir()
     cv2.imwrite(str(posed / "masks" / "003.png"), np.full((1, 1), 255, np.uint8))
-    with pytest.raises(InputError, match=r"mask 003\.png is far smaller than images/003\.png"):
+    with pytest.raises(InputError, match=r"the mask of images/003\.png is far smaller than it"):
         ingest(posed)

@@ -26,7 +26,7 @@ from cleargs.rivr.tables import Selection, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
 from cleargs.splat.camera import Camera
-from cleargs.splat.compensation import Exposure, write_exposure
+from cleargs.formation.colour import Exposure, write_exposure
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene

@@ -32,7 +32,6 @@ def test_the_ending_says_what_is_written(
         assert export(run, tmp_path / name) == 2 and not (tmp_path / name).exists()
         cause, remedy = capsys.readouterr().err.splitlines()
         assert "no ending that says what to write" in cause and ".ply" in remedy
-    assert export(run, tmp_path / "x.splat", "--format", "ply") == 0, "told explicitly"
     assert export(run, tmp_path / "x.PLY") == 0
     assert read_ply(tmp_path / "x.PLY").gaussians.num == 20
 
