@@ -115,7 +115,9 @@ def evidence(
                 write_json(out / f"{section.name}.json", found[-1].compared.document())
     origin = Origin(
         version=version_of_source(),
-        command=_command(quick=quick, captures=captures is not None, listed=listed is not None),
+        command=_command(
+            quick=quick, captures=captures is not None, listed=listed is not None, sections=sections
+        ),
         recipe=recipe.workflow,
         quick=quick,
         threads=recipe.threads,
@@ -126,13 +128,14 @@ def evidence(
     return DONE_IN_PART if any(outcome.missing for outcome in found) else 0
 
 
-def _command(*, quick: bool, captures: bool, listed: bool) -> str:
+def _command(*, quick: bool, captures: bool, listed: bool, sections: tuple[str, ...]) -> str:
     """The command as a reader would type it: with words for the folders."""
     words = [
         "cleargs evidence -o OUT",
         "--quick" * quick,
         "--captures DIR" * captures,
         "--list FILE" * listed,
+        *(f"--section {name}" for name in sections),
     ]
     return " ".join(word for word in words if word)
 

@@ -18,6 +18,7 @@ import cleargs
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
 from cleargs.files import PARTIAL_SUFFIX, disk_error
+from cleargs.formation.colour import read_exposure
 from cleargs.pipeline.manifest import Manifest, plain_json
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
@@ -34,7 +35,6 @@ from cleargs.report.scene import (
     write_viewer,
 )
 from cleargs.report.verdict import judge
-from cleargs.formation.colour import read_exposure
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 

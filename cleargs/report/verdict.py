@@ -148,7 +148,8 @@ def _warnings(
             yield Caution(f"{manifest.stage} is done only in part", missing, ())
     yield from _capture_warnings(manifests, rows, config)
     yield from _allocation_warnings(manifests, rows, config)
-    yield from _scene_warnings(manifests, config)
+    if "g0" in manifests:
+        yield from _scene_warnings(manifests, config)
 
 
 def _capture_warnings(

@@ -75,7 +75,7 @@ def test_the_test_set_is_no_tuning_set() -> None:
     for sections in (evidence.quick, evidence.full):
         assert len({section.name for section in sections}) == len(sections)
         claiming = [
-            section for section in sections if "no-repairs" in section.variants and section.name == "rooms"
+            section for section in sections if "formation" in section.variants and section.name == "rooms"
         ]
         assert all(len(section.seeds) >= 5 for section in claiming) and claiming
 

@@ -10,6 +10,7 @@ import pyarrow as pa
 import torch
 
 from cleargs.capture.tables import FRAMES
+from cleargs.formation.colour import Exposure, write_exposure
 from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
@@ -26,7 +27,6 @@ from cleargs.rivr.tables import Selection, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
 from cleargs.splat.camera import Camera
-from cleargs.formation.colour import Exposure, write_exposure
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
@@ -234,10 +234,12 @@ class FinishedRun:
                     primary_render=80.0,
                     primary_restored=85.0 + index,
                     primary_fused=None,
+                    primary_observed=75.0,
                     tiebreak_metric="natural-1",
                     tiebreak_render=70.0,
                     tiebreak_restored=71.0,
                     tiebreak_fused=None,
+                    tiebreak_observed=72.0,
                     restored_from="observation",
                     blur_px=2.0 * index,
                     skew_px=0.3,
