@@ -24,6 +24,7 @@ CHOICES = {
     "render": "the render",
     "restored": "the restored frame",
     "fused": "render and restored frame, fused",
+    "observed": "none: the raw frame is kept",
 }
 
 
@@ -65,7 +66,8 @@ class FrameRow:
         if self.selection is None:
             return "none tried"
         chosen = CHOICES[self.selection.chosen]
-        return chosen if self.selection.accepted else f"none: {chosen} was refused"
+        kept = self.selection.accepted or self.selection.chosen == "observed"
+        return chosen if kept else f"none: {chosen} was refused"
 
     @property
     def why(self) -> str:

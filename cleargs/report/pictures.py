@@ -18,6 +18,7 @@ from cleargs.report.frames import FrameRow
 
 LAYERS = {
     "observed": "As filmed",
+    "explained": "As the scene explains it",
     "deblurred": "Motion undone",
     "restored": "Restored",
     "fused": "Fused",
