@@ -24,11 +24,11 @@ import torch
 
 from cleargs.capture.tables import load_frames
 from cleargs.formation.colour import read_exposure
+from cleargs.formation.photograph import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.splat.config import G0Config
 from cleargs.splat.ply import read_ply
-from cleargs.splat.trainer import evaluate_views
 from cleargs.splat.views import view_of
 
 

@@ -13,6 +13,7 @@ import torch
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.colour import Exposure, affine_backward, apply_affine
+from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
 from cleargs.splat import strategy
 from cleargs.splat.adam import adam_step
@@ -20,7 +21,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.losses import photometric_loss, psnr, ssim
 from cleargs.splat.state import load_state
-from cleargs.splat.trainer import Trainer, evaluate_views, train
+from cleargs.splat.trainer import Trainer, train
 from cleargs.splat.views import ImageCache
 
 
