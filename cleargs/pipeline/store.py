@@ -412,8 +412,8 @@ def _only_files(folder: Path) -> Iterator[str]:
     if folder.is_symlink() or not folder.is_dir():
         folder.unlink(missing_ok=True)
     for place in sorted(folder.rglob("*")):
-        depth = len(place.relative_to(folder).parts)
-        if place.is_symlink() or not (place.is_dir() or (place.is_file() and depth > 1)):
+        ours = place.parent != folder or place.name == SECONDS
+        if place.is_symlink() or not (place.is_dir() or (place.is_file() and ours)):
             place.unlink(missing_ok=True)
             yield place.relative_to(folder).as_posix()
 
