@@ -171,7 +171,7 @@ class CaptureFormation:
             if frame.model != "none":
                 motion = frame
         if motion is None and affine is None:
-            return None if weight == view.weight else FormedView(camera, weight)
+            return None
         return FormedView(
             camera,
             weight,

@@ -46,11 +46,6 @@ class FrameMotion:
     median_depth: float = 1.0
 
     @property
-    def is_still(self) -> bool:
-        """Whether it changes nothing."""
-        return self.disc_px == 0.0 and not (self.blur.any() or self.skew.any() or self.pose.any())
-
-    @property
     def vector(self) -> Vector:
         """Pose, blur and skew, [18]."""
         return np.concatenate([self.pose, self.blur, self.skew])

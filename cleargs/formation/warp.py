@@ -17,7 +17,7 @@ from cleargs.splat.kernels.cpu import launch
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
 
 SAMPLES_PER_PIXEL = 1.0
-"""Of a blur; with two the photograph differs by less than 1e-3 of white (docs/formation.md)."""
+"""Of a blur."""
 SAMPLES_PER_DISC_PIXEL = 0.8
 """Of a disc's area."""
 FEWEST_SAMPLES, MOST_SAMPLES = 3, 64

@@ -138,7 +138,6 @@ def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
 
 def test_a_still_frame_is_the_image_itself() -> None:
     still = FrameMotion()
-    assert still.is_still
     warp = Warp.of(fields_of(still, CAMERA, wall(), np.ones_like(wall())))
     image = random_image(*wall().shape)
     np.testing.assert_array_equal(warp.forward(image), image)
