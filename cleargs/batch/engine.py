@@ -91,14 +91,8 @@ def only_batch(folder: BatchFolder) -> Iterator[int]:
 
     The lock lives as long as the engine, also where the command that started it was killed; one that was
     interrupted is waited for. Where the file system has no locks, the lease tells. Raises StageError when
-    another batch is at work, StoreError when the folder cannot be made,
-    InputError where Snakemake cannot work in it.
+    another batch is at work, StoreError when the folder cannot be made.
     """
-    if set("{}") & set(str(folder.root)):
-        raise InputError(
-            f"the batch folder {folder.root} has braces in its path, which Snakemake takes for wildcards",
-            hint="choose another -o",
-        )
     try:
         folder.root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
