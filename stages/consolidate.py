@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 5
+VERSION = 6
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),

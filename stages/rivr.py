@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 8
+VERSION = 9
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),

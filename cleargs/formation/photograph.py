@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.capture import FormedView, FrameFormation
 from cleargs.formation.colour import Exposure
+from cleargs.formation.frame import FrameFormation
+from cleargs.formation.view import FormedView
 from cleargs.splat.engine import Engine
 from cleargs.splat.losses import psnr
 from cleargs.splat.scene import Scene

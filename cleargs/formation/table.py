@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.tables import column, read_table, write_table
 
@@ -45,6 +46,12 @@ FORMATION = pa.schema(
         column("explained", pa.float64(), "share of the frame's misfit that the model takes away"),
         column("misfit", pa.float64(), "mean difference of high-passed linear luminance that is left"),
         column("misfit_still", pa.float64(), "the same without the model"),
+        column(
+            "skew_gain",
+            pa.float64(),
+            "share of the misfit that a rolling shutter explains beyond blur and defocus",
+            nullable=True,
+        ),
         column("weight_before", pa.float64(), "RVA's weight of the frame"),
         column("weight_after", pa.float64(), "with which it taught at the end"),
         *_twist("pose"),
@@ -98,5 +105,6 @@ def _frame(row: dict[str, Any]) -> FrameFormation:
         row["model"],
         misfit=row["misfit"],
         misfit_still=row["misfit_still"],
+        skew_gain=row["skew_gain"],
         **lengths,
     )

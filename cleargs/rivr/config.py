@@ -54,7 +54,6 @@ class GateConfig(BaseModel):
 class RepairDistilConfig(DistilConfig):
     """Joint distillation of raw frames and repairs."""
 
-    steps: int = Field(600, ge=1, le=1_000_000, description="optimisation steps, one view each")
     pseudo_weight: float = Field(0.5, ge=0, description="factor on the loss of a repaired view")
 
 

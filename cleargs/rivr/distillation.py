@@ -11,11 +11,13 @@ import pyarrow as pa
 import torch
 
 from cleargs.files import atomic_path
-from cleargs.formation.capture import CaptureFormation, FormedView, FrameFormation, explain
+from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.colour import Exposure, apply_affine, read_exposure, write_exposure
+from cleargs.formation.frame import FrameFormation, explain
 from cleargs.formation.photograph import photograph
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.formation.undo import undo
+from cleargs.formation.view import FormedView
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
@@ -92,6 +94,7 @@ class Snapshot:
             torch.from_numpy(observed),
             None if mask is None else torch.from_numpy(mask),
             self._with_depth,
+            rolling=rolls(self.formations.values()),
         )
         if found.model == "none":
             return None

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cleargs.errors import StoreError
-from cleargs.formation.capture import FrameFormation
+from cleargs.formation.frame import FrameFormation
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.rivr.candidates import Image, Source
 from cleargs.splat.views import Mask, View

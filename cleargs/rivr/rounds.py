@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cleargs.errors import StoreError
-from cleargs.formation.capture import described
+from cleargs.formation.frame import described
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter

@@ -40,7 +40,7 @@ class TrainConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    steps: int = Field(2000, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    steps: int = Field(3200, ge=1, le=1_000_000, description="optimisation steps, one view each")
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
     coarse_share: float = Field(
         0.25, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
@@ -138,7 +138,7 @@ class G0Config(TrainConfig):
 class DistilConfig(TrainConfig):
     """Training on from a finished scene, with repaired views beside the real ones."""
 
-    steps: int = Field(600, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    steps: int = Field(200, ge=1, le=1_000_000, description="optimisation steps, one view each")
     coarse_share: float = Field(
         0.0, ge=0, le=1, description="share of the steps that see reduced images; 0 = off"
     )

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.colour import Exposure
+from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.photograph import photograph
 from cleargs.formation.table import read_formation, write_formation
@@ -150,6 +151,41 @@ def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
     other = FormationConfig(start=0.0, every=5)
     second = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), other))
     assert not second.wrote(first.state())
+
+
+SKEW = FrameMotion(skew=np.array([0, 0, 0, 0, 9.0, 0]), median_depth=3.0)
+
+
+def skewed(frames: list[int]) -> list[View]:
+    """The views, with a rolling shutter in these."""
+    made = []
+    for view in views(blurred=None):
+        moved = FrameFormation(view.frame_id, SKEW, "skew", reach_px=5.0)
+        seen = photograph(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
+        pixels = np.rint(255 * seen).astype(np.uint8)
+        made.append(View(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+    return made
+
+
+@pytest.mark.parametrize("frames", [[0, 1, 2, 3, 4], [2]])
+def test_a_shutter_rolls_in_the_whole_capture_or_not_at_all(tmp_path: Path, frames: list[int]) -> None:
+    """A single skewed frame has a wrong pose, or something moved in it."""
+    formation = CaptureFormation(skewed(frames), FormationConfig(start=0.0, every=3))
+    run(tmp_path, skewed(frames), formation)
+    gains = {k: frame.skew_gain or 0.0 for k, frame in formation.frames.items()}
+    assert all(gains[k] > 0.1 for k in frames), gains
+    found = {k for k, frame in formation.frames.items() if frame.model in ("skew", "both")}
+    assert found == (set(range(FRAMES)) if len(frames) == FRAMES else set())
+
+
+def test_few_frames_or_little_gain_tell_no_rolling_shutter() -> None:
+    def asked(gains: list[float | None]) -> list[FrameFormation]:
+        return [FrameFormation(k, skew_gain=gain) for k, gain in enumerate(gains)]
+
+    assert rolls(asked([0.2, 0.1, 0.1, 0.3]))
+    assert not rolls(asked([0.2, 0.1, 0.1]))
+    assert not rolls(asked([0.2, 0.1, 0.1, None]))
+    assert not rolls(asked([0.4, 0.4, 0.0, 0.0, 0.0]))
 
 
 def test_trust_is_earned() -> None:

@@ -25,7 +25,8 @@ from tiny_capture import (
     write_capture,
 )
 
-from cleargs.formation.capture import CaptureFormation, FrameFormation
+from cleargs.formation.capture import CaptureFormation
+from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr

@@ -1,0 +1,241 @@
+"""How one frame was taken: what is known of it, and asking again in the light of a scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cleargs.formation.colour import apply_affine
+from cleargs.formation.motion import MODELS, TWIST, Floats, FrameMotion, Model
+from cleargs.formation.search import (
+    Explanation,
+    Sight,
+    explained_share,
+    luminance,
+    preferred,
+    refine,
+    search,
+)
+from cleargs.formation.warp import Fields, fields_of
+from cleargs.splat.camera import Camera
+from cleargs.splat.config import FormationConfig
+from cleargs.splat.engine import Render
+from cleargs.splat.formation import Renderer
+
+MARGIN_STEP = 4
+"""Margins are multiples of it, px."""
+MARGIN_SHARE = 0.25
+"""Most of a margin, as a share of the shorter side."""
+
+NUMBERS = 3 + 3 * TWIST + 3 + 2 + 4 + 1
+"""Of a frame in a checkpoint."""
+
+
+@dataclass(frozen=True)
+class FrameFormation:
+    """What is known of how one frame was taken."""
+
+    frame_id: int
+    motion: FrameMotion = field(default_factory=FrameMotion)
+    model: Model = "none"
+    misfit: float = 0.0
+    """Mean difference of high-passed linear luminance that the model leaves, see `search.Explanation`."""
+    misfit_still: float = 0.0
+    blur_px: float = 0.0
+    """Mean length of the pixels' ways while they were exposed."""
+    skew_px: float = 0.0
+    """Mean length of their ways from the first to the last row's exposure."""
+    defocus_px: float = 0.0
+    """Mean radius of the discs."""
+    reach_px: float = 0.0
+    """Farthest that a pixel looks from its place (95 % of them look less far)."""
+    skew_gain: float | None = None
+    """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search; None
+    where none was made."""
+    draws: int = 0
+    """Steps that were taken on the frame since its formation is looked for."""
+
+    @property
+    def explained(self) -> float:
+        """Share of the misfit that the model takes away."""
+        return explained_share(self.misfit, self.misfit_still)
+
+
+def described(frame: FrameFormation) -> str:
+    """In a few words: ``blur 5.2 px, skew 1.4 px``."""
+    lengths = {"blur": frame.blur_px, "skew": frame.skew_px, "defocus": frame.defocus_px}
+    parts = ("blur", "skew") if frame.model == "both" else (frame.model,)
+    return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
+
+
+def explain(
+    frame: FrameFormation,
+    config: FormationConfig,
+    camera: Camera,
+    affine: Tensor | None,
+    target: Tensor,
+    mask: Tensor | None,
+    render: Renderer,
+    *,
+    factor: float = 1.0,
+    warm: bool = False,
+    rolling: bool = False,
+) -> FrameFormation:
+    """How a raw frame was taken, in the light of the scene that ``render`` shows.
+
+    Args:
+        frame: what is known already; its model stays in the race.
+        camera: of the frame, reduced by ``factor``.
+        affine: the frame's colour, [3, 4].
+        target, mask: the frame, [H, W, 3] sRGB and [H, W].
+        warm: refine what is known instead of searching among all models.
+        rolling: whether models with a skew are in the race.
+    """
+    # What was found under the other belief about the shutter is searched for anew.
+    missed = rolling and _admitted(frame.model, rolling=False) and (frame.skew_gain or 0.0) > config.accept
+    warm = warm and _admitted(frame.model, rolling) and not missed
+    margin = margin_for(frame.reach_px * factor, camera) if warm else _search_margin(camera)
+    rendered = render(widened(camera, margin))
+    sight = sight_of(rendered, affine, target, mask, camera, margin)
+    known = _scaled(frame.motion, factor)
+    if warm:
+        found = refine(sight, frame.model, known, pose=config.pose)
+        best = found[-1]
+    else:
+        found = search(sight, pose=config.pose)
+        frame = replace(frame, skew_gain=_skew_gain(found))
+        if frame.model != "none":
+            found += refine(sight, frame.model, known, pose=config.pose)[1:]
+        best = preferred([e for e in found if _admitted(e.model, rolling)])
+    # Hysteresis: what was taken before may stay at half the gain that lets a model in.
+    if best.explained < config.accept * (0.5 if frame.model == best.model else 1.0):
+        best = found[0]
+    return _described(frame, best, factor, camera, rendered, margin)
+
+
+def _admitted(model: Model, rolling: bool) -> bool:
+    return rolling or model not in ("skew", "both")
+
+
+def _skew_gain(found: list[Explanation]) -> float:
+    """Share of the misfit that is left without a skew and goes with one."""
+    still = preferred([e for e in found if _admitted(e.model, rolling=False)])
+    rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
+    return max(0.0, explained_share(rolled.misfit, still.misfit))
+
+
+def widened(camera: Camera, margin: int) -> Camera:
+    """The camera with ``margin`` more pixels on every side."""
+    if margin == 0:
+        return camera
+    return replace(
+        camera,
+        width=camera.width + 2 * margin,
+        height=camera.height + 2 * margin,
+        cx=camera.cx + margin,
+        cy=camera.cy + margin,
+    )
+
+
+def sight_of(
+    rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
+) -> Sight:
+    """What `search` compares: masked pixels of the frame show the render."""
+    assert rendered.depth is not None
+    image = rendered.image if affine is None else apply_affine(rendered.image, affine)
+    shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
+    counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
+    inner = shown[margin : margin + camera.height, margin : margin + camera.width]
+    return Sight(
+        luminance(shown),
+        rendered.depth.cpu().numpy(),
+        rendered.alpha.cpu().numpy(),
+        luminance(np.where(counts[..., None], seen, inner)),
+        counts.astype(np.float32),
+        camera,
+        margin,
+    )
+
+
+def _described(
+    frame: FrameFormation, best: Explanation, factor: float, camera: Camera, rendered: Render, margin: int
+) -> FrameFormation:
+    """The frame with a new explanation; lengths in pixels of the full image."""
+    motion = _scaled(best.motion, 1.0 / factor)
+    assert rendered.depth is not None
+    depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
+
+    def fields(of: FrameMotion) -> Fields:
+        return fields_of(of, camera, depth, alpha, margin, factor)
+
+    whole, turned = fields(motion), fields(replace(motion, pose=np.zeros(TWIST), blur=motion.skew))
+    ways = np.abs(whole.offset) + 0.5 * np.abs(whole.sweep) + whole.radius
+    return replace(
+        frame,
+        motion=motion,
+        model=best.model,
+        misfit=best.misfit,
+        misfit_still=best.misfit_still,
+        blur_px=_mean_length(whole.sweep) / factor,
+        skew_px=_mean_length(turned.sweep) / factor,
+        defocus_px=float(whole.radius.mean(dtype=np.float64)) / factor,
+        reach_px=float(np.quantile(ways.max(axis=0)[::4, ::4], 0.95)) / factor,
+    )
+
+
+def _mean_length(field: Floats) -> float:
+    return float(np.hypot(*field).mean(dtype=np.float64))
+
+
+def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
+    if factor == 1.0:
+        return motion
+    return replace(motion.with_vector(factor * motion.vector), disc_px=factor * motion.disc_px)
+
+
+def margin_for(reach: float, camera: Camera) -> int:
+    """That shows what moved in from beyond the border."""
+    largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
+    return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
+
+
+def _search_margin(camera: Camera) -> int:
+    """For a search, whose motions are not known yet."""
+    return margin_for(0.05 * max(camera.width, camera.height), camera)
+
+
+def packed(frame: FrameFormation) -> NDArray[np.float64]:
+    motion = frame.motion
+    return np.concatenate(
+        [
+            [frame.frame_id, MODELS.index(frame.model), frame.draws],
+            motion.vector,
+            [motion.disc_px, motion.focus, motion.median_depth],
+            [frame.misfit, frame.misfit_still],
+            [frame.blur_px, frame.skew_px, frame.defocus_px, frame.reach_px],
+            [math.nan if frame.skew_gain is None else frame.skew_gain],
+        ]
+    )
+
+
+def unpacked(row: NDArray[np.float64]) -> FrameFormation:
+    frame_id, model, draws = (int(value) for value in row[:3])
+    vector, rest = row[3 : 3 + 3 * TWIST], [float(value) for value in row[3 + 3 * TWIST :]]
+    disc_px, focus, median_depth, misfit, misfit_still, blur_px, skew_px, defocus_px, reach_px, gain = rest
+    return FrameFormation(
+        frame_id,
+        FrameMotion(disc_px=disc_px, focus=focus, median_depth=median_depth).with_vector(vector),
+        MODELS[model],
+        misfit,
+        misfit_still,
+        blur_px,
+        skew_px,
+        defocus_px,
+        reach_px,
+        None if math.isnan(gain) else gain,
+        draws,
+    )

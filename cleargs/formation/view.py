@@ -1,0 +1,74 @@
+"""A render as the camera of one frame saw it, and the way back of its gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cleargs.formation.colour import AffineOptimiser, affine_backward, apply_affine
+from cleargs.formation.frame import FrameFormation, margin_for, widened
+from cleargs.formation.warp import Warp, fields_of, linear_curve, srgb_curve, through_curve, times_slope
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Render
+from cleargs.splat.kernels.cpu.pixel import CHANNELS
+
+
+@dataclass(eq=False)
+class FormedView:
+    """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light."""
+
+    camera: Camera
+    weight: float
+    frame_id: int = -1
+    affine: Tensor | None = None
+    affines: AffineOptimiser | None = None
+    formation: FrameFormation | None = None
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._photo = self.camera
+        self._margin = 0
+        if self.formation is not None:
+            self._margin = margin_for(self.formation.reach_px * self.factor, self._photo)
+            self.camera = widened(self._photo, self._margin)
+        self.needs_depth = self.formation is not None
+
+    def forward(self, render: Render) -> Tensor:
+        image = render.image
+        if self.affine is not None:
+            self._rendered = render.image
+            image = apply_affine(image, self.affine)
+        if self.formation is None:
+            return image
+        self._warp = self.warp(render)
+        linear, self._to_linear = through_curve(image.cpu().numpy(), linear_curve(), CHANNELS)
+        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve())
+        return torch.from_numpy(photograph).to(image.device)
+
+    def warp(self, render: Render) -> Warp:
+        """B of the frame, from a render at ``camera`` with depth."""
+        assert self.formation is not None and render.depth is not None
+        fields = fields_of(
+            self.formation.motion,
+            self._photo,
+            render.depth.cpu().numpy(),
+            render.alpha.cpu().numpy(),
+            self._margin,
+            self.factor,
+        )
+        return Warp.of(fields, self._margin)
+
+    def backward(self, gradient: Tensor) -> Tensor:
+        if self.formation is not None:
+            light = times_slope(gradient.cpu().numpy(), self._to_srgb, CHANNELS)
+            light = times_slope(self._warp.transpose(light), self._to_linear)
+            gradient = torch.from_numpy(light).to(gradient.device)
+        if self.affine is not None:
+            gradient, self._affine_gradient = affine_backward(self._rendered, self.affine, gradient)
+        return gradient
+
+    def learn(self) -> None:
+        if self.affines is not None:
+            self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
