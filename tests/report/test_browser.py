@@ -183,10 +183,10 @@ def test_dragging_either_side_turns_both(wide: Opened, pane: str) -> None:
 
 def test_the_strip_opens_the_layers_under_a_slider(wide: Opened) -> None:
     page = wide.page
-    page.locator('#filters [data-role="strong"]').click()
+    page.locator('#filters [data-kind="strong"]').click()
     assert page.locator("#strip li:visible").count() == 2
-    page.locator('#filters [data-role=""]').click()
-    page.locator('.card[data-frame="0"]').press("Enter")
+    page.locator('#filters [data-kind=""]').click()
+    page.locator('.card[data-opens="0"]').press("Enter")
     assert page.locator("#inspector").is_visible()
     assert page.locator("#inspector-title").inner_text() == f"Frame 0 · {HOSTILE[0]}"
     assert page.locator("#left").get_attribute("alt") == "Frame 0: As filmed"

@@ -22,7 +22,8 @@ from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report import facts
 from cleargs.report.charts import weight_colour
-from cleargs.report.page import json_in_html, write_report
+from cleargs.report.html import json_in_html
+from cleargs.report.page import write_report
 from cleargs.report.record import LastRun, is_current, linked_manifests
 from cleargs.report.scene import BYTES, shown_degree, write_scene
 
