@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import cleargs
+from cleargs.evaluate.tables import Bold
 from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.pipeline.manifest import plain_json
 from cleargs.report.charts import weight_colour
@@ -65,6 +66,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["json"] = json_in_html
+    environment.tests["bold"] = lambda text: isinstance(text, Bold)
     environment.globals["static"] = _static
     environment.globals["weight_colour"] = weight_colour
     return environment

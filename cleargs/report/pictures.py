@@ -69,9 +69,7 @@ def write_pictures(
     """Write all pictures below ``report``; ``rendered``: the frames for which ``render`` is asked."""
     (report / FOLDER).mkdir(parents=True)
     layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
-    aspect = rows[0].frame.height / rows[0].frame.width if rows else 1.0
-    pixels = BYTES / (_BYTES_A_PIXEL * max(layers, 1))
-    side = int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
+    side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, BYTES)
     # Renders come one after the other, since each uses all threads; the files are read and written beside.
     with ThreadPoolExecutor(threads) as pool:
         futures = {}
@@ -80,6 +78,12 @@ def write_pictures(
             final = render(row, side) if render and frame_id in rendered else None
             futures[frame_id] = pool.submit(_write_frame, row, run, report, final, side)
         return {frame_id: future.result() for frame_id, future in futures.items()}
+
+
+def side_of(pictures: int, aspect: float, budget: int) -> int:
+    """The longer side, px, with which so many pictures (height / width: ``aspect``) take ``budget`` bytes."""
+    pixels = budget / (_BYTES_A_PIXEL * max(pictures, 1))
+    return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
 
 
 def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:

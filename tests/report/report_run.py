@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +75,15 @@ def camera(index: int, height: float = HEIGHT, width: float = WIDTH) -> Camera:
 
 
 class FinishedRun:
-    """``folder`` as `cleargs run` leaves it, all five stages done."""
+    """``folder`` as `cleargs run` leaves it, all five stages done, the frames ``held_out`` for testing."""
 
-    def __init__(self, root: Path) -> None:
-        self.folder = root / "run"
+    def __init__(self, root: Path, name: str = "run", held_out: Sequence[int] = ()) -> None:
+        self.folder = root / name
         self.dag = installed()
         self.scenes = {"g0": wall(1), "consolidate": wall(2)}
-        config = load_config(self.dag, "smoke", ["rva.tau_R=0.61"])
+        self.held_out = held_out
+        overrides = ["rva.tau_R=0.61", *(["ingest.holdout=every:3"] if held_out else [])]
+        config = load_config(self.dag, "smoke", overrides)
         self.run = Run(self.folder, root / "gone & <away>.mp4", config, self.folder / ".store", "cpu")
         write_run_file(self.run)
         self._ingest()
@@ -160,7 +163,7 @@ class FinishedRun:
                     **{name: float(value) if placed else None for name, value in values.items()},
                     "registered": placed,
                     "n_points": 30,
-                    "split": "train",
+                    "split": "test" if index in self.held_out else "train",
                 }
             )
         write_table(folder / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)

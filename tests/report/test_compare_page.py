@@ -1,0 +1,98 @@
+"""The page of a comparison: two finished runs of one capture, with names that try to break it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pages import Page, assert_offline
+from report_run import FinishedRun
+
+from cleargs.evaluate.compared import Compared, compare_scenes
+from cleargs.evaluate.comparison import Recipe, existing
+from cleargs.evaluate.config import EvalOptions
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.store import Store
+from cleargs.progress import SilentReporter
+from cleargs.report.compare_page import write_comparison
+
+HOSTILE = "<img src=x onerror='window.hacked = 1'>"
+CAPTURE = "gone & <away>"
+HELD_OUT = (1, 2, 4, 5)
+WARNING = "g0 is stale: </script><script>window.hacked = 2</script>"
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Compared]]:
+    root = tmp_path_factory.mktemp("compare")
+    runs = [FinishedRun(root, name, HELD_OUT) for name in (HOSTILE, "second")]
+    (runs[1].folder / "consolidate/manifest.json").unlink()  # its scene is that of g0
+    (runs[1].folder / "rivr/manifest.json").unlink()
+    out = root / "out"
+    out.mkdir()
+    options = EvalOptions(lpips=(), scorers=())
+    recipe = Recipe(runs[0].dag, "default", (), "cpu", 1, options)
+    with DigestMemo(root / "digests.sqlite") as memo:
+        store = Store(root, memo)
+        made = [existing(run.folder, run.dag, None) for run in runs]
+        yield out, compare_scenes(out, made, recipe, store, SilentReporter())
+
+
+@pytest.fixture(scope="module")
+def page(compared: tuple[Path, Compared]) -> Path:
+    out, found = compared
+    return write_comparison(out, found, [HOSTILE], ["device cpu"], [WARNING])
+
+
+def test_the_page_holds_all_that_it_shows(page: Path) -> None:
+    assert page.name == "index.html" and page.parent.name == "report"
+    assert_offline(page)
+    assert [path.name for path in page.parent.parent.iterdir() if "partial" in path.name] == []
+    size = sum(file.stat().st_size for file in page.parent.rglob("*"))
+    assert size < 1_000_000  # 9 small pictures and a page
+
+
+def test_losses_come_first_with_how_little_one_sample_says(page: Path) -> None:
+    text = Page(page.read_text()).text
+    # The other scene is the one of which the frames were rendered: it is far better by PSNR and SSIM.
+    assert "second is behind in 0 of 2 comparisons." in text
+    places = [text.index(part) for part in ("Where second is behind", "Poses are chosen", "SH degree")]
+    assert places == sorted(places)
+    assert "nothing here tells a small difference from chance" in text
+    assert "No scene was trained on these frames" in text
+
+
+def test_variants_stand_side_by_side_at_the_same_poses(page: Path, compared: tuple[Path, Compared]) -> None:
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page.read_text(), re.S)[1])
+    assert data["layers"] == {"reference": "Reference", "filmed": "As filmed", "v0": HOSTILE, "v1": "second"}
+    assert data["opening"] == {"left": "reference", "right": "v1"}
+    assert [pose["title"] for pose in data["frames"]] == [f"{CAPTURE} · {name}" for name in names(data)]
+    assert len(set(names(data))) == 3
+    for pose in data["frames"]:
+        assert list(pose["layers"]) == ["reference", "v0", "v1"]  # filmed is the reference itself
+        (metric, psnr), (other, _) = pose["figures"]
+        assert metric.startswith("PSNR") and other.startswith("SSIM")
+        assert pose["notes"]["v0"] == f"{dict(psnr)[HOSTILE]} dB"
+        assert float(dict(psnr)["second"]) > float(dict(psnr)[HOSTILE]) + 5.0  # the frames are its renders
+
+
+def names(data: dict) -> list[str]:
+    return [pose["title"].removeprefix(f"{CAPTURE} · ") for pose in data["frames"]]
+
+
+def test_hostile_names_stay_text(page: Path) -> None:
+    parsed = Page(page.read_text())
+    assert HOSTILE in parsed.text and CAPTURE in parsed.text and WARNING in parsed.text
+    assert len(parsed.all("script")) == 2
+
+
+def test_one_scene_has_nothing_to_be_compared_with(tmp_path: Path, compared: tuple[Path, Compared]) -> None:
+    out, found = compared
+    shutil.copytree(out / "evaluations", tmp_path / "evaluations")
+    single = Compared(found.scenes[:1], found.cells[:1], found.roles[:1])
+    text = write_comparison(tmp_path, single, [HOSTILE], [], []).read_text()
+    assert "judged by itself" in text and 'id="losses"' not in text
