@@ -108,6 +108,7 @@ def write_comparison(
                 for baseline in baselines
                 if baseline in labels and len(labels) > 1
             ],
+            equal=_equal_work(cells),
             work=work_table(cells, labels),
             roles=roles_table(compared.roles, labels),
             choices=choices_table(compared.choices, labels) if compared.choices else None,
@@ -128,6 +129,12 @@ def _against(cells: Cells, labels: Mapping[str, str], subject: str) -> dict[str,
         "verdicts": Counter(loss.verdict for loss in found),
         "losses": losses_table(("capture", "views", "behind"), places),
     }
+
+
+def _equal_work(cells: Cells) -> bool:
+    """Whether all variants of a sample had as many steps and the same SH degree."""
+    given = {(cell.sample, cell.steps, cell.sh_degree) for cell in cells.cells}
+    return len(given) == len({sample for sample, _, _ in given})
 
 
 # -- captures -----------------------------------------------------------------------------------------------
@@ -218,9 +225,7 @@ def _evenly(views: Sequence[ReferenceView], wanted: int) -> list[ReferenceView]:
     return [views[(2 * place + 1) * len(views) // (2 * wanted)] for place in range(wanted)]
 
 
-def _pose(
-    shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]
-) -> Pose:
+def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]) -> Pose:
     """Write the pictures of a pose."""
     reference = shot.view.load()[0]
     height, width = reference.shape[:2]

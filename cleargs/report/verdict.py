@@ -142,7 +142,7 @@ def _warnings(
     manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
 ) -> Iterator[Caution]:
     for stage, reason in stale.items():
-        yield Caution(f"{stage} is not from today's settings and input", reason, ())
+        yield Caution(f"{stage} is stale", reason, ())
     for manifest in manifests.values():
         for missing in manifest.missing:
             yield Caution(f"{manifest.stage} is done only in part", missing, ())

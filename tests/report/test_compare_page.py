@@ -64,6 +64,7 @@ def test_losses_come_first_with_how_little_one_sample_says(page: Path) -> None:
     assert places == sorted(places)
     assert "nothing here tells a small difference from chance" in text
     assert "No scene was trained on these frames" in text
+    assert "They were not trained alike" in text  # 180 steps and 90
 
 
 def test_variants_stand_side_by_side_at_the_same_poses(page: Path, compared: tuple[Path, Compared]) -> None:

@@ -15,9 +15,11 @@ import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
+from cleargs.cli.main import invoke
 from cleargs.cli.report import report_on
 from cleargs.errors import InputError
 from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.manifest import linked_manifest, write_manifest
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report import facts
@@ -136,7 +138,33 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
         (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
         assert report_on(planner, outcomes("made")) is None  # the run itself has succeeded
         assert "made anew" in page.read_text()  # the report before stays
-        assert report_on(planner, []) is None
+        (run.folder / "ingest/manifest.json").unlink()
+        assert report_on(planner, outcomes("found")) is None  # there is nothing to report on
+
+
+def test_stale_results_are_shown_only_where_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = FinishedRun(tmp_path)
+    g0 = linked_manifest(run.folder, "g0")
+    assert g0 is not None
+    old = g0.model_copy(update={"parts": g0.parts.model_copy(update={"config": {"steps": 7}})})
+    write_manifest(run.folder / "g0", old)
+    steps = run.run.config.sections["g0"].steps
+    reason = f"g0 is stale: setting g0.steps: 7 -> {steps}"
+    assert invoke(["report", str(run.folder)]) == 2
+    assert reason in capsys.readouterr().err and not (run.folder / "report").exists()
+    assert invoke(["report", str(run.folder), "--stale"]) == 0
+    assert reason in capsys.readouterr().err
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        planner = run.planner(Store(tmp_path, memo))
+        text = write_report(planner, stale=True).read_text()
+        assert "g0 is stale" in text and "rivr is stale" in text and 'id="stage"' in text
+        manifests = linked_manifests(run.folder, run.dag.names)
+        assert not is_current(run.folder, manifests), "it stays no longer than it must"
+        text = write_report(planner).read_text()  # as at the end of `cleargs run --until rva`
+        assert "is stale" not in text and "no scene is trained yet" in text
+        assert "none tried" in text and "the restored frame" not in text
 
 
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
