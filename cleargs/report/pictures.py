@@ -86,17 +86,22 @@ def side_of(pictures: int, aspect: float, budget: int) -> int:
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
 
 
-def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
-    observed = read_rgb(run / "ingest" / row.frame.image)
-    images: dict[str, Image] = {"observed": observed}
+def layers_of(row: FrameRow, run: Path) -> dict[str, Image]:
+    """The frame as filmed, and the other layers of its latest round. Raises InputError, StoreError."""
+    images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.selection is not None:
         stored = read_exr(run / "rivr" / row.selection.exr).layers
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
+    return images
+
+
+def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
+    images = layers_of(row, run)
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
     return FramePictures(
-        write_jpeg(report, f"{name}.jpg", observed, _THUMBNAIL),
+        write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL),
         {
             layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side)
             for layer in LAYERS

@@ -17,14 +17,14 @@ from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.keys import KeyParts
+from cleargs.pipeline.keys import KeyParts, key_config
 from cleargs.pipeline.manifest import FileRecord, Manifest, published_files, write_manifest
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.scene import Renderer
-from cleargs.rivr.tables import Selection, write_selection
+from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
 from cleargs.splat.camera import Camera
@@ -110,7 +110,7 @@ class FinishedRun:
         parts = KeyParts(
             stage=stage,
             version=1,
-            config={},
+            config=key_config(self.run.config.sections[stage]),
             inputs={},
             externals={},
             seed=0,
@@ -213,6 +213,8 @@ class FinishedRun:
         write_table(folder / "train.parquet", pa.Table.from_pylist(rows, TRAIN), TRAIN)
         gains = np.linspace(0.8, 1.2, 5)
         write_exposure(folder / "exposure.parquet", Exposure.from_gains(list(range(5)), gains))
+        if stage == "consolidate":
+            write_repairs(folder / "repairs.parquet", latest_accepted(self.selections))
         self.finish(stage, summary)
 
     def _rivr(self) -> None:
@@ -252,4 +254,5 @@ class FinishedRun:
                 )
             )
         write_selection(folder / "selection.parquet", rows)
+        self.selections = rows
         self.finish("rivr", {"published": "G0", "rounds": []})
