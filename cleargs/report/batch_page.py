@@ -22,6 +22,7 @@ from cleargs.report.frames import last_scene
 from cleargs.report.html import new_report, write_page
 from cleargs.report.pictures import Picture, side_of, write_jpeg
 from cleargs.report.record import FOLDER, is_current, linked_manifests, page_of
+from cleargs.report.verdict import training_psnr
 from cleargs.report.words import count, decibel, duration, size
 
 BYTES = 15_000_000
@@ -143,9 +144,7 @@ def _figures(run: Path, made: Mapping[str, Manifest]) -> list[tuple[str, str]]:
     if (scene := last_scene(made)) is not None:
         with suppress(CleargsError, OSError):  # a damaged scene has no size
             found.append((f"{size_of(run / scene / 'scene.ply')[0]:,}", "Gaussians"))
-    g0: Mapping[str, Any] = made["g0"].summary if "g0" in made else {}
-    psnr = g0.get("psnr_strong") or g0.get("psnr_active")
-    if psnr is not None:
+    if (psnr := training_psnr(made)[0]) is not None:
         found.append((decibel(psnr), "PSNR of the first scene on training poses"))
     if made:
         found.append((duration(sum(manifest.seconds for manifest in made.values())), "of work"))

@@ -2,53 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
+from made_pages import CAUSE, batch_page
 from pages import Page, assert_offline
-from report_run import FinishedRun
-
-from cleargs.batch.folder import BatchFolder, Plan
-from cleargs.batch.resources import Wanted, resources
-from cleargs.batch.status import SceneState
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.store import Store
-from cleargs.report.batch_page import write_batch
-from cleargs.report.page import write_report
-
-CAUSE = "<script>window.hacked = 1</script> cannot be read"
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("pages")
-    folder = BatchFolder(root / "captures & more.batch")
-    run = FinishedRun(folder.root / "scenes", "attic")
-    with DigestMemo(root / "digests.sqlite") as memo:
-        write_report(run.planner(Store(root, memo)))
-    barn = shutil.copytree(run.folder, folder.run("barn"), ignore=shutil.ignore_patterns("report"))
-    shutil.rmtree(barn / "consolidate")
-    log = folder.log("cellar", "ingest")
-    log.parent.mkdir(parents=True)
-    log.touch()
-    stages = {stage: tuple(run.dag.load(stage).INPUTS) for stage in run.dag.names}
-    asked = {stage: resources(stage, None, Wanted(), "cpu") for stage in stages}
-    plan = Plan(
-        watcher=(),
-        program=(),
-        options=(),
-        stages=stages,
-        until="consolidate",
-        report=True,
-        scenes=dict.fromkeys(("attic", "barn", "cellar"), asked),
-    )
-    states = [
-        SceneState("attic", "done", "consolidate", 5),
-        SceneState("barn", "running", "consolidate", 4, where="node7, job 12"),
-        SceneState("cellar", "failed", "ingest", 0, CAUSE, log=log),
-    ]
-    return write_batch(folder, plan, states)
+    return batch_page(tmp_path_factory.mktemp("pages"))
 
 
 def test_the_page_holds_all_that_it_shows_and_leads_to(page: Path) -> None:

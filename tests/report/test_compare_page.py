@@ -5,41 +5,22 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from made_pages import HOSTILE, compare_runs
 from pages import Page, assert_offline
-from report_run import FinishedRun
 
-from cleargs.evaluate.compared import Compared, compare_scenes
-from cleargs.evaluate.comparison import Recipe, existing
-from cleargs.evaluate.config import EvalOptions
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.store import Store
-from cleargs.progress import SilentReporter
+from cleargs.evaluate.compared import Compared
 from cleargs.report.compare_page import write_comparison
 
-HOSTILE = "<img src=x onerror='window.hacked = 1'>"
 CAPTURE = "gone & <away>"
-HELD_OUT = (1, 2, 4, 5)
 WARNING = "g0 is stale: </script><script>window.hacked = 2</script>"
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Compared]]:
-    root = tmp_path_factory.mktemp("compare")
-    runs = [FinishedRun(root, name, HELD_OUT) for name in (HOSTILE, "second")]
-    (runs[1].folder / "consolidate/manifest.json").unlink()  # its scene is that of g0
-    (runs[1].folder / "rivr/manifest.json").unlink()
-    out = root / "out"
-    out.mkdir()
-    options = EvalOptions(lpips=(), scorers=())
-    recipe = Recipe(runs[0].dag, "default", (), "cpu", 1, options)
-    with DigestMemo(root / "digests.sqlite") as memo:
-        store = Store(root, memo)
-        made = [existing(run.folder, run.dag, None) for run in runs]
-        yield out, compare_scenes(out, made, recipe, store, SilentReporter())
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compared]:
+    return compare_runs(tmp_path_factory.mktemp("compare"))
 
 
 @pytest.fixture(scope="module")
