@@ -62,6 +62,7 @@ Examples:
   cleargs compare data/mixed -o table --variants all-view,rva --seeds 0,1,2
   cleargs compare data/kitchen -o table --set ingest.holdout=sharpest:8
   cleargs compare runs/a runs/b -o table                  runs that exist already
+  table/report/index.html                                 the page to look at
 """
 )
 @click.argument("sources", metavar="CAPTURE|RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -71,7 +72,7 @@ Examples:
     "out",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of the runs, tables and pictures; an existing one goes on.",
+    help="Folder of the runs, tables, pictures and report; an existing one goes on.",
 )
 @click.option(
     "--variants",

@@ -49,7 +49,10 @@ def report(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
+    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it.
+
+    Results that were made with other settings or inputs than the run's are refused without --stale.
+    """
     from cleargs.report.page import write_report
 
     settings = read_run_file(run, dag, store=store)

@@ -66,10 +66,7 @@ def test_a_pose_opens_under_a_slider_by_keyboard(browser: Any, pages: dict[str, 
     title = page.locator("#inspector-title").inner_text()
     assert title != first
     assert page.locator("#tag-right").inner_text() == HOSTILE, "the variant stays from pose to pose"
-    assert (
-        page.locator("#right").get_attribute("alt")
-        == f"{title}: {HOSTILE}"
-    )
+    assert page.locator("#right").get_attribute("alt") == f"{title}: {HOSTILE}"
     page.keyboard.press("Escape")
     assert not page.locator("#inspector").is_visible() and opened.complaints == []
     page.close()
