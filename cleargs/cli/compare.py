@@ -21,7 +21,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import InputError
+from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
 from cleargs.pipeline.dag import Dag
@@ -182,7 +182,10 @@ def compare(
     if wants_report:
         from cleargs.report.compare_page import write_comparison
 
-        page = write_comparison(out, compared, baselines, made_with, warnings)
+        try:
+            page = write_comparison(out, compared, baselines, made_with, warnings)
+        except CleargsError as error:  # the comparison itself has succeeded
+            reporter.warn(f"there is no report: {error}; {error.hint}")
     if as_json:
         print_json(document)
     else:

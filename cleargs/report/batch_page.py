@@ -63,7 +63,7 @@ def write_batch(folder: BatchFolder, plan: Plan, states: Sequence[SceneState]) -
     """
     ordered = sorted(states, key=lambda state: ORDER.index(state.state))
     side = min(_SIDE, side_of(len(states), _ASPECT, BYTES))
-    kinds = Counter(state.state for state in states)
+    kinds: Counter[str] = Counter(state.state for state in states)
     with new_report(folder.root) as report:
         (report / _FOLDER).mkdir()
         made = {state.scene: linked_manifests(folder.run(state.scene), list(plan.stages)) for state in states}

@@ -186,22 +186,18 @@ def _values(cells: Cells, labels: Mapping[str, str], views: ViewSet, column: str
 def _shots(
     out: Path, compared: Compared, column: str, layers: Mapping[str, str], poses: int
 ) -> Iterator[_Shot]:
-    """Some poses of the first sample of a column."""
+    """Some poses of the first capture of a column."""
     scenes = [scene for scene in compared.scenes if scene.sample.column == column]
     first = scenes[0]
+    samples = {scene.sample.name for scene in scenes if scene.sample.capture == first.sample.capture}
     for found in view_sets(first):
         if found.views == "given":  # nearly the pictures of the true poses
             continue
-        own = {
-            cell.variant: cell
-            for cell in compared.cells
-            if (cell.sample, cell.views) == (first.sample.name, found.views)
-        }
-        renders = [
-            (layers[variant], cell, _evaluation(out, cell))
-            for variant, cell in own.items()
-            if variant in layers
-        ]
+        own: dict[str, Cell] = {}
+        for cell in compared.cells:
+            if cell.sample in samples and cell.views == found.views:
+                own.setdefault(cell.variant, cell)
+        renders = [(layers[variant], cell, _evaluation(out, cell)) for variant, cell in own.items()]
         reference = reference_of(
             first.run, found.directory, poses=found.poses, align=found.align, reporter=SilentReporter()
         )

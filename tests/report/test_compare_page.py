@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,22 @@ def test_hostile_names_stay_text(page: Path) -> None:
     parsed = Page(page.read_text())
     assert HOSTILE in parsed.text and CAPTURE in parsed.text and WARNING in parsed.text
     assert len(parsed.all("script")) == 2
+
+
+def test_scenes_of_other_seeds_are_seen_but_not_subtracted(
+    tmp_path: Path, compared: tuple[Path, Compared]
+) -> None:
+    out, found = compared
+    shutil.copytree(out / "evaluations", tmp_path / "evaluations")
+    first, second = found.scenes
+    other = replace(second, sample=replace(second.sample, seed=1))
+    cells = [found.cells[0], found.cells[1].model_copy(update={"sample": other.sample.name})]
+    text = write_comparison(
+        tmp_path, Compared([first, other], cells, found.roles), [HOSTILE], [], []
+    ).read_text()
+    assert "2 scenes side by side." in text and "share no sample" in text
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+    assert all(list(pose["layers"]) == ["reference", "v0", "v1"] for pose in data["frames"])
 
 
 def test_one_scene_has_nothing_to_be_compared_with(tmp_path: Path, compared: tuple[Path, Compared]) -> None:
