@@ -31,7 +31,7 @@ BYTES = 15_000_000
 ORDER = ("failed", "partial", "running", "waiting", "done")
 """Of the scenes: what needs a look comes first."""
 
-_SIDE = 480  # px, of a thumbnail at most
+_SIDE, _LEAST = 480, 96  # px, of a thumbnail
 _FOLDER = "scenes"
 _ASPECT = 9 / 16  # of most captures
 
@@ -54,6 +54,10 @@ class Card:
     """What to know of its report."""
     log: str
     """Address of the log of a stage that failed."""
+    seconds: float
+    """Of work, all stages."""
+    bytes: int
+    """Of results."""
 
 
 def write_batch(folder: BatchFolder, plan: Plan, states: Sequence[SceneState]) -> Path:
@@ -62,12 +66,11 @@ def write_batch(folder: BatchFolder, plan: Plan, states: Sequence[SceneState]) -
     Raises StoreError when it cannot be written.
     """
     ordered = sorted(states, key=lambda state: ORDER.index(state.state))
-    side = min(_SIDE, side_of(len(states), _ASPECT, BYTES))
+    side = min(_SIDE, side_of(len(states), _ASPECT, BYTES, _LEAST))
     kinds: Counter[str] = Counter(state.state for state in states)
     with new_report(folder.root) as report:
         (report / _FOLDER).mkdir()
-        made = {state.scene: linked_manifests(folder.run(state.scene), list(plan.stages)) for state in states}
-        every = [manifest for manifests in made.values() for manifest in manifests.values()]
+        cards = [_card(folder, plan, state, report, place, side) for place, state in enumerate(ordered)]
         write_page(
             report,
             "batch.html.jinja",
@@ -77,13 +80,10 @@ def write_batch(folder: BatchFolder, plan: Plan, states: Sequence[SceneState]) -
             scenes=count(len(states), "scene"),
             kinds=[(kind, kinds[kind]) for kind in ORDER if kinds[kind]],
             done=kinds["done"],
-            total=duration(sum(manifest.seconds for manifest in every)),
-            bytes=size(sum(manifest.bytes for manifest in every)),
+            total=duration(sum(card.seconds for card in cards)),
+            bytes=size(sum(card.bytes for card in cards)),
             until=plan.until,
-            cards=[
-                _card(folder, plan, state, made[state.scene], report, place, side)
-                for place, state in enumerate(ordered)
-            ],
+            cards=cards,
         )
     return page_of(folder.root)
 
@@ -92,12 +92,12 @@ def _card(
     folder: BatchFolder,
     plan: Plan,
     state: SceneState,
-    made: Mapping[str, Manifest],
     report: Path,
     place: int,
     side: int,
 ) -> Card:
     run = folder.run(state.scene)
+    made = linked_manifests(run, list(plan.stages))
     picture, shows = _picture(run, made, report, f"{_FOLDER}/{place:05d}.jpg", side)
     page = page_of(run)
     note = ""
@@ -115,6 +115,8 @@ def _card(
         report=_address(folder, page) if page.is_file() else "",
         note=note,
         log=_address(folder, state.log) if state.log is not None and state.log.is_file() else "",
+        seconds=sum(manifest.seconds for manifest in made.values()),
+        bytes=sum(manifest.bytes for manifest in made.values()),
     )
 
 

@@ -80,10 +80,13 @@ def write_pictures(
         return {frame_id: future.result() for frame_id, future in futures.items()}
 
 
-def side_of(pictures: int, aspect: float, budget: int) -> int:
-    """The longer side, px, with which so many pictures (height / width: ``aspect``) take ``budget`` bytes."""
+def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -> int:
+    """The longer side, px, with which so many pictures (height / width: ``aspect``) take ``budget`` bytes.
+
+    It is ``least`` where that would be too small to see anything.
+    """
     pixels = budget / (_BYTES_A_PIXEL * max(pictures, 1))
-    return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
+    return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, Image]:
