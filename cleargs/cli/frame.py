@@ -101,6 +101,7 @@ def write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) 
         if name in images
     ]
     rows = [tiles[start : start + _ACROSS] for start in range(0, len(tiles), _ACROSS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_rgb(path, contact_sheet(rows, tile_width=min(_WIDEST, max(240, row.frame.width))))
     return [name for name in LAYERS if name in images]
 

@@ -86,7 +86,7 @@ def _headline(manifests: Mapping[str, Manifest]) -> tuple[Tone, str]:
     psnr, frames = training_psnr(manifests)
     if psnr is None:
         return "fair", "The scene is trained."
-    follows = f"On its training poses, the first scene follows {frames}"
+    follows = f"The first scene follows {frames}"
     if psnr >= CLOSE_DB:
         return "good", f"{follows} closely."
     if psnr >= LOOSE_DB:
@@ -98,8 +98,8 @@ def training_psnr(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]
     """PSNR of the first scene on the best frames that it was trained on, dB, and what these are called."""
     strong = _figure(manifests, "g0", "psnr_strong")
     if strong is not None:
-        return strong, "the trusted frames"
-    return _figure(manifests, "g0", "psnr_active"), "the frames in use"
+        return strong, "the trusted training frames"
+    return _figure(manifests, "g0", "psnr_active"), "its training frames"
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> str:

@@ -97,7 +97,7 @@ def test_the_verdict_names_settings_that_exist(parsed: Page, run: FinishedRun) -
     for chip in chips:
         section, _, name = str(chip).removeprefix("--set ").partition("=")[0].partition(".")
         assert name in type(sections[section]).model_fields
-    assert "On its training poses, the first scene follows the trusted frames fairly closely." in parsed.text
+    assert "The first scene follows the trusted training frames fairly closely." in parsed.text
     assert "24.0 dB before, 25.5 dB now" in parsed.text
     assert "1 stretch of the path" in parsed.text
 
