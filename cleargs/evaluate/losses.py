@@ -14,8 +14,8 @@ VERDICTS = ("sure", "one sample", "none")
 
 
 @dataclass(frozen=True)
-class Loss:
-    """A variant in a cell, beside another one."""
+class Gap:
+    """How far a variant is from another in one cell: ``difference`` is its value minus the other's."""
 
     views: ViewSet
     column: str
@@ -31,18 +31,18 @@ class Loss:
         return "sure" if self.difference.is_sure else "none"
 
 
-def compared_with(cells: Cells, variant: str) -> Iterator[Loss]:
-    """``variant`` against every other, in every column and each of `COMPARED`, losses or not."""
+def compared_with(cells: Cells, variant: str) -> Iterator[Gap]:
+    """``variant`` against every other, in every column and each of `COMPARED`."""
     for views in cells.view_sets():
         for column in cells.columns(views):
             for other in cells.variants():
                 for metric in COMPARED:
                     difference = cells.difference(views, column, variant, other, metric)
                     if other != variant and difference is not None:
-                        yield Loss(views, column, other, metric, difference)
+                        yield Gap(views, column, other, metric, difference)
 
 
-def losses_of(cells: Cells, variant: str) -> list[Loss]:
+def losses_of(cells: Cells, variant: str) -> list[Gap]:
     """The cells in which ``variant`` is behind, those that are sure first."""
     found = [loss for loss in compared_with(cells, variant) if is_behind(loss.difference, loss.metric)]
     return sorted(found, key=lambda loss: VERDICTS.index(loss.verdict))
@@ -53,7 +53,7 @@ def is_behind(difference: Spread, metric: str) -> bool:
     return difference.mean > 0 if metric in LOWER_IS_BETTER else difference.mean < 0
 
 
-def losses_table(places: Sequence[str], found: Iterable[tuple[tuple[str, ...], Loss]]) -> Table:
+def losses_table(places: Sequence[str], found: Iterable[tuple[tuple[str, ...], Gap]]) -> Table:
     """A row a place, a column a metric; sure losses in bold. ``places``: head of the columns of a place."""
     rows: dict[tuple[str, ...], list[str]] = {}
     for place, loss in found:

@@ -78,7 +78,7 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
         parts += [NOTES[views]] if views in NOTES else []
         for metric in cells.metrics():
             parts.append(f"### {metric_title(metric)}")
-            parts.append(metric_table(cells, labels, views, metric))
+            parts.append(metric_table(cells, labels, views, metric).markdown())
         for baseline in baselines:
             if baseline in cells.variants():
                 parts.append(f"### Minus {labels[baseline]}")
@@ -94,10 +94,10 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
     return "\n\n".join(parts) + "\n"
 
 
-def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> str:
+def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> Table:
     """A metric of every variant by column, the best of a column in bold."""
     rows = [[labels[variant], *value_texts(cells, views, variant, metric)] for variant in cells.variants()]
-    return Table(["", *cells.columns(views)], rows).markdown()
+    return Table(["", *cells.columns(views)], rows)
 
 
 def value_texts(cells: Cells, views: ViewSet, variant: str, metric: str) -> list[str]:

@@ -9,7 +9,7 @@ from importlib.resources import files
 
 from cleargs.evaluate.cells import Cells, ViewSet
 from cleargs.evaluate.evidence import Outcome, Section
-from cleargs.evaluate.losses import VERDICTS, Loss, compared_with, is_behind, losses_of, losses_table
+from cleargs.evaluate.losses import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
 from cleargs.evaluate.tables import (
     COMPARED,
     NAMES,
@@ -75,7 +75,7 @@ def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
 
 
-def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Loss]]:
+def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
     """Sections and all cells in which the whole method is behind, those that are sure first."""
     found = [
         (outcome.section.title, loss)
