@@ -119,7 +119,8 @@ def in_lines(facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
     else:
         x, y, z = facts["centre"]
         quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
-        yield "pose", f"at ({x:.3f}, {y:.3f}, {z:.3f}) of the run's world, turned by ({quaternion}), w first"
+        place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) of the run's world"
+        yield "pose", f"{place}, world to camera ({quaternion}), w first"
         yield "points", f"{facts['n_points']} sparse points seen"
     if facts["rva"] is not None:
         yield from _judged(facts["rva"])

@@ -238,8 +238,8 @@ def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, label
         images[layer] = read_rgb(out / cell.evaluation / f"{shot.view.name}.png")
         notes[layer] = _note(image.values)
         for metric, value in image.values.items():
-            text = "n/a" if value is None else number(value, metric)
-            figures.setdefault(metric, []).append((labels[cell.variant], text))
+            if value is not None:
+                figures.setdefault(metric, []).append((labels[cell.variant], number(value, metric)))
     return Pose(
         place,
         shot.views,
