@@ -7,6 +7,7 @@
     BATCH/handles/<scene>/<stage>.json digests of a finished stage: what Snakemake sees
     BATCH/status/<scene>/<stage>.json  what the stage's job did last
     BATCH/logs/<scene>/<stage>.log     what it said; BATCH/logs/engine.log is Snakemake's
+    BATCH/report/index.html            all scenes as a page, which leads to their own reports
     BATCH/plan.json                    what the Snakefile reads; a dry run has dry-run.json
 """
 
@@ -70,6 +71,8 @@ class Plan(BaseModel):
     may be left on the cluster, and read this when they start."""
     until: str
     """The last stage that is wanted."""
+    report: bool = False
+    """Whether the job of the last stage also writes the report of its scene."""
     scenes: dict[str, dict[str, Resources]]
     """Scene -> stage -> what the job asks for."""
 

@@ -28,6 +28,9 @@ def main(arguments: Sequence[str]) -> int:
     root, scene, stage = arguments[:divider]
     command = list(arguments[divider + 1 :])
     folder = BatchFolder(Path(root))
+    plan = folder.read_plan()
+    if plan is not None and plan.report and stage == plan.until:
+        command.append("--report")
     job, begin = SlurmJob.mine(), time.time()
 
     def note(state: Doing, code: int | None = None, cause: str = "") -> None:

@@ -39,6 +39,8 @@ class Preparation:
     """Further options of every ``cleargs stage``."""
     program: tuple[str, ...] = (str(Path(sys.executable).with_name("cleargs")),)
     """How ``cleargs`` is called on the nodes."""
+    report: bool = True
+    """Whether every scene ends with its report."""
 
     def conflicts(self, scenes: Sequence[Scene]) -> list[Problem]:
         """Scenes whose run folder was made for another input."""
@@ -90,6 +92,7 @@ class Preparation:
             options=self.options,
             stages={stage: tuple(self.dag.load(stage).INPUTS) for stage in self.dag.names},
             until=wanted[-1],
+            report=self.report,
             scenes=asked,
         )
         self.folder.write_plan(plan, dry_run=dry_run)

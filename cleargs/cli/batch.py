@@ -23,7 +23,7 @@ from cleargs.cli.common import (
     usable_cores,
 )
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import InputError, StageError
+from cleargs.errors import CleargsError, InputError, StageError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
 from cleargs.progress import Reporter, Task
@@ -63,6 +63,13 @@ Examples:
     show_default=True,
     help="Where to compute. Today auto is the CPU.",
 )
+@click.option(
+    "--report/--no-report",
+    "wants_report",
+    default=True,
+    help="Write a report of every scene, and BATCH/report/index.html, which leads to them.  "
+    "[default: report]",
+)
 @click.option("--cores", type=click.IntRange(min=1), help="Cores for local jobs.  [default: all]")
 @json_option
 @quiet_option
@@ -76,6 +83,7 @@ def batch(
     dry_run: bool,
     allow_partial: bool,
     device: DeviceChoice,
+    wants_report: bool,
     cores: int | None,
     as_json: bool,
     quiet: bool,
@@ -90,7 +98,7 @@ def batch(
     command = _engine(root, place, cores or usable_cores(), dry_run=dry_run)
     resolved: Device = "cuda" if device == "cuda" and not is_local(place) else resolve_device(device)
     options = ("--allow-partial",) if allow_partial else ()
-    preparation = Preparation(dag, root, resolved, until, options)
+    preparation = Preparation(dag, root, resolved, until, options, report=wants_report)
     scenes = checked_scenes(sheet, preparation)
     return run_batch(preparation, scenes, command, make_reporter(quiet), dry_run=dry_run, as_json=as_json)
 
@@ -130,11 +138,25 @@ def run_batch(
             code = run_engine(command, folder, lock, _teller(folder, plan, reporter, task))
     states = scene_states(folder, plan, ended=True)
     print_states(states, plan, as_json)
+    page = _page(folder, plan, states, reporter) if plan.report else None
+    if page is not None and not as_json:
+        click.echo(f"report: {page}")
     kinds = {state.state for state in states}
     if "failed" in kinds or (code and "partial" not in kinds):
         click.echo(f"what Snakemake said: {folder.engine_log}", err=True)
         return 1
     return 3 if "partial" in kinds else 0
+
+
+def _page(folder: BatchFolder, plan: Plan, states: Sequence[SceneState], reporter: Reporter) -> Path | None:
+    """The report of the batch; None where it could not be written, which is no failure of the batch."""
+    from cleargs.report.batch_page import write_batch
+
+    try:
+        return write_batch(folder, plan, states)
+    except CleargsError as error:
+        reporter.warn(f"there is no report: {error}; {error.hint}")
+        return None
 
 
 def checked_scenes(sheet: Path, preparation: Preparation) -> list[Scene]:

@@ -21,7 +21,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress import make_reporter
-from cleargs.errors import InputError
+from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
 from cleargs.pipeline.dag import Dag
@@ -62,6 +62,7 @@ Examples:
   cleargs compare data/mixed -o table --variants all-view,rva --seeds 0,1,2
   cleargs compare data/kitchen -o table --set ingest.holdout=sharpest:8
   cleargs compare runs/a runs/b -o table                  runs that exist already
+  table/report/index.html                                 the page to look at
 """
 )
 @click.argument("sources", metavar="CAPTURE|RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -71,7 +72,7 @@ Examples:
     "out",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of the runs, tables and pictures; an existing one goes on.",
+    help="Folder of the runs, tables, pictures and report; an existing one goes on.",
 )
 @click.option(
     "--variants",
@@ -101,6 +102,12 @@ Examples:
     "--workflow", default="default", show_default=True, metavar="NAME|FILE.toml", help="The recipe."
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@click.option(
+    "--report/--no-report",
+    "wants_report",
+    default=True,
+    help="Write OUT/report/index.html, the tables and pictures as a page.  [default: report]",
+)
 @stale_option
 @work_options
 @json_option
@@ -117,6 +124,7 @@ def compare(
     lpips: tuple[LpipsNet, ...],
     workflow: str,
     overrides: tuple[str, ...],
+    wants_report: bool,
     stale: bool,
     device: DeviceChoice,
     threads: int | None,
@@ -160,8 +168,9 @@ def compare(
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels
     baselines = BASELINES if not runs else found.variants()[:1]
-    head = "".join(f"{warning}\n\n" for warning in warnings) + _head(() if runs else chosen, seeds, recipe)
-    text = head + markdown(compared.results, labels, baselines)
+    made_with = _made_with(() if runs else chosen, seeds, recipe)
+    head = "\n\n".join(["# Comparison", *warnings, "\n".join(f"* {line}" for line in made_with)])
+    text = f"{head}\n\n" + markdown(compared.results, labels, baselines)
     write_bytes(out / "comparison.md", text.encode())
     document = compared.document()
     write_json(out / "comparison.json", document)
@@ -169,35 +178,42 @@ def compare(
     shown = (found.variants()[0], *(name for name in ("rva", "full") if name in labels))
     captures = {scene.sample.name: scene.sample.capture for scene in compared.scenes}
     comparison_sheet(out / "sheet.png", out, found, labels, shown, captures)
+    page = None
+    if wants_report:
+        from cleargs.report.compare_page import write_comparison
+
+        try:
+            page = write_comparison(out, compared, baselines, made_with, warnings)
+        except CleargsError as error:  # the comparison itself has succeeded
+            reporter.warn(f"there is no report: {error}; {error.hint}")
     if as_json:
         print_json(document)
     else:
         click.echo(text)
+        if page is not None:
+            click.echo(f"report: {page}")
         click.echo(f"written: {out}/comparison.md, comparison.json, comparison.png, sheet.png")
     return DONE_IN_PART if compared.failures else 0
 
 
-def _head(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> str:
-    """What the tables were made with."""
+def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> list[str]:
+    """What the tables were made with, in lines."""
     from cleargs.pipeline.manifest import versions
 
-    nets = ", ".join(recipe.options.lpips) or "no network"
-    lines = ["# Comparison", "", f"LPIPS v0.1 with {nets}; device {recipe.device}."]
+    lines = [f"LPIPS v0.1 with {', '.join(recipe.options.lpips) or 'no network'}; device {recipe.device}"]
     if variants:
         settings = "".join(f" --set {override}" for override in recipe.overrides)
         steps = f"{recipe.steps or 'as many as the whole method'}"
         lines.append(
-            f"Recipe `{recipe.workflow}{settings}`; seeds {', '.join(map(str, seeds))}; steps: {steps}."
+            f"recipe {recipe.workflow}{settings}; seeds {', '.join(map(str, seeds))}; steps: {steps}"
         )
-        lines += ["", *(f"* {variant.label}: {_settings(variant)}" for variant in variants)]
-    lines += ["", ", ".join(f"{name} {version}" for name, version in versions().items())]
-    return "\n".join(lines) + "\n\n"
+        lines += [f"{variant.label}: {_settings(variant)}" for variant in variants]
+    return [*lines, ", ".join(f"{name} {version}" for name, version in versions().items())]
 
 
 def _settings(variant: Variant) -> str:
-    recipe = "the recipe" if variant.workflow is None else f"the recipe `{variant.workflow}`"
-    changes = ", ".join((recipe, *(f"`{override}`" for override in variant.overrides)))
-    return f"{changes}; the scene of `{variant.stage}`"
+    recipe = "the recipe" if variant.workflow is None else f"the recipe {variant.workflow}"
+    return f"{', '.join((recipe, *variant.overrides))}; the scene of {variant.stage}"
 
 
 def _check_names(samples: Sequence[Sample]) -> None:

@@ -14,12 +14,14 @@ from cleargs.cli.common import (
     print_json,
     quiet_option,
     run_argument,
+    stale_option,
     store_option,
     threads_or_all,
 )
 from cleargs.cli.progress import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Outcome
@@ -32,18 +34,33 @@ Examples:
 """
 )
 @run_argument
+@stale_option
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all cores]")
 @store_option
 @json_option
 @quiet_option
 @click.pass_obj
-def report(dag: Dag, run: Path, threads: int | None, store: Path | None, as_json: bool, quiet: bool) -> None:
-    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
+def report(
+    dag: Dag,
+    run: Path,
+    stale: bool,
+    threads: int | None,
+    store: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it.
+
+    Results that were made with other settings or inputs than the run's are refused without --stale.
+    """
     from cleargs.report.page import write_report
 
     settings = read_run_file(run, dag, store=store)
+    reporter = make_reporter(quiet)
+    if line := require_fresh(dag, run, dag.names, stale=stale):
+        reporter.warn(line)
     with opened_store(settings.store) as opened:
-        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet)))
+        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), reporter), stale=stale)
     if as_json:
         print_json({"report": str(page)})
     else:
@@ -55,14 +72,13 @@ def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
 
     A report that shows these results already stays.
     """
-    if not any("frames.parquet" in outcome.manifest.files for outcome in outcomes):
-        return None
     from cleargs.report.record import LastRun, is_current, linked_manifests, page_of
 
     run = planner.run.folder
-    if all(outcome.how == "found" for outcome in outcomes) and is_current(
-        run, linked_manifests(run, planner.dag.names)
-    ):
+    manifests = linked_manifests(run, planner.dag.names)
+    if "ingest" not in manifests:
+        return None
+    if all(outcome.how == "found" for outcome in outcomes) and is_current(run, manifests):
         return page_of(run)
     from cleargs.report.page import write_report
 

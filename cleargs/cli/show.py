@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, run_argument
+from cleargs.cli.common import json_option, print_json, run_argument, stale_option
 from cleargs.cli.frames import COLUMNS, frame_rows, short_name
 from cleargs.cli.summary import describe_table, sampled_rows
 from cleargs.cli.words import headlines, in_words, text_of
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import Reasons, stale_stages
+from cleargs.pipeline.freshness import Reasons, require_fresh, stale_stages
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import read_run_file
 
@@ -36,6 +36,7 @@ Examples:
   cleargs show room rva --columns   what the tables hold, column by column
   cleargs show room g0 --rows 5     rows of each table, evenly spread
   cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
+  cleargs show room --frame 3       all about one frame, and its layers: room/frame-000003.png
 
 \b
 A stage is stale when it was made with other settings or inputs than the run has now.
@@ -53,11 +54,18 @@ A stage is stale when it was made with other settings or inputs than the run has
     help="With rva, in place of its tables: draw the trajectory, scores, roles, weights and telling frames.",
 )
 @click.option(
+    "--frame",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="In place of tables: all about frame N, with a picture of its layers side by side.",
+)
+@click.option(
     "-o",
     "--output",
     type=click.Path(dir_okay=False, path_type=Path),
-    help=f"Picture of --plot (.png).  [default: RUN/{PLOT}]",
+    help=f"Picture of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
 )
+@stale_option
 @json_option
 @click.pass_obj
 def show(
@@ -67,33 +75,38 @@ def show(
     rows: int | None,
     columns: bool,
     plot: bool,
+    frame: int | None,
     output: Path | None,
+    stale: bool,
     as_json: bool,
 ) -> None:
     """Show what the stages of RUN found, or the tables of one STAGE."""
     if plot and stage != "rva":
         raise InputError("--plot draws the stage rva", hint=f"cleargs show {run} rva --plot")
-    if output is not None and (not plot or output.suffix.lower() != ".png"):
+    if frame is not None and stage is not None:
+        raise InputError("--frame is about all stages", hint=f"cleargs show {run} --frame {frame}")
+    pictured = plot or frame is not None
+    if output is not None and (not pictured or output.suffix.lower() != ".png"):
         raise InputError(
-            "--output names the PNG of --plot", hint=f"cleargs show {run} rva --plot -o FILE.png"
+            "--output names the PNG of --plot or --frame", hint=f"cleargs show {run} rva --plot -o FILE.png"
         )
-    stale = stale_stages(dag, read_run_file(run, dag))
+    if frame is not None:
+        _show_frame(dag, run, frame, output or run / f"frame-{frame:06d}.png", stale, as_json)
+        return
+    old = stale_stages(dag, read_run_file(run, dag))
     if stage is None:
         manifests = {name: linked_manifest(run, name) for name in dag.names}
         if as_json:
-            print_json({name: _facts(manifest, stale.get(name)) for name, manifest in manifests.items()})
+            print_json({name: _facts(manifest, old.get(name)) for name, manifest in manifests.items()})
         else:
-            _print_run(manifests, stale)
+            _print_run(manifests, old)
         return
     dag.check(stage)
     manifest = linked_manifest(run, stage)
     if manifest is None:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs explain {run}")
     if plot:
-        for name in ("ingest", "rva"):
-            if name in stale:
-                reasons = "; ".join(stale[name])
-                raise InputError(f"{name} is stale: {reasons}", hint=f"see cleargs explain {quote(str(run))}")
+        _say(require_fresh(dag, run, ("ingest", "rva"), stale=stale))
         picture = _plot(run, output or run / PLOT)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
@@ -108,17 +121,17 @@ def show(
     frames = None
     if stage == "rva":
         rivr = run / "rivr" / "selection.parquet"
-        repairs = _read(rivr).to_pylist() if rivr.is_file() and "rivr" not in stale else None
+        repairs = _read(rivr).to_pylist() if rivr.is_file() and "rivr" not in old else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
     if as_json:
         shown = {
             name: {"rows": table.num_rows, "columns": describe_table(table)} for name, table in tables.items()
         }
-        facts = {"stage": stage, **(_facts(manifest, stale.get(stage)) or {}), "tables": shown}
+        facts = {"stage": stage, **(_facts(manifest, old.get(stage)) or {}), "tables": shown}
         print_json(facts if frames is None else {**facts, "frames": frames})
         return
     console = _console()
-    _print_facts(console, manifest, stale.get(stage))
+    _print_facts(console, manifest, old.get(stage))
     if frames is not None and not columns and rows is None:
         _print_frames(console, frames)
         return
@@ -132,6 +145,37 @@ def show(
             _print_rows(console, table, wanted)
     if not columns:
         console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns", markup=False)
+
+
+def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, stale: bool, as_json: bool) -> None:
+    """Print all about one frame, and write the picture of its layers. Raises InputError, StoreError."""
+    from cleargs.cli.frame import frame_facts, frame_row, in_lines, write_layers
+
+    made = {name: found for name in dag.names if (found := linked_manifest(run, name)) is not None}
+    if "ingest" not in made:
+        raise InputError(f"{run} has no frames yet", hint=f"see cleargs explain {run}")
+    _say(require_fresh(dag, run, list(made), stale=stale))
+    row = frame_row(run, made, frame)
+    facts = frame_facts(run, made, row, made["rva"].parts.config if "rva" in made else {})
+    layers = write_layers(picture, run, made, row)
+    if as_json:
+        print_json({**facts, "layers": layers, "picture": str(picture)})
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, title=f"frame {frame}", title_justify="left")
+    table.add_column(no_wrap=True)
+    for label, text in in_lines(facts, run):
+        table.add_row(label, Text(text))
+    _console().print(table)
+    click.echo(f"written: {picture}")
+
+
+def _say(warning: str) -> None:
+    """What is taken although it is stale."""
+    if warning:
+        click.echo(f"warning: {warning}", err=True)
 
 
 def _plot(run: Path, picture: Path) -> Path:

@@ -21,6 +21,7 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes
 from cleargs.cli.progress import make_reporter
+from cleargs.cli.report import report_on
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner
@@ -36,6 +37,7 @@ Example:
 @click.argument("name")
 @run_argument
 @click.option("--force", is_flag=True, help="Make the stage again, even if its results are there.")
+@click.option("--report", "wants_report", is_flag=True, help="Write RUN/report/index.html at the end.")
 @partial_option
 @work_options
 @store_option
@@ -47,6 +49,7 @@ def stage(
     name: str,
     run: Path,
     force: bool,
+    wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
     threads: int | None,
@@ -64,6 +67,8 @@ def stage(
     with opened_store(settings.store) as opened:
         runner = Runner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet))
         outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
+        if wants_report:
+            report_on(runner.planner, [outcome])
     if as_json:
         print_json(outcome_json(outcome))
     else:

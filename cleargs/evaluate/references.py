@@ -93,7 +93,7 @@ def reference_of(
     if directory is None:
         return _held_out(ingest, frames)
     listed = _listed(directory)
-    own = _by_stem((_stem(frame.name), frame) for frame in frames if frame.registered)
+    own = _by_stem((stem_of(frame.name), frame) for frame in frames if frame.registered)
     if poses == "given":
         matched = sorted(listed.keys() & own.keys(), key=natural_key)
         _require_match(matched, listed, own, run_folder)
@@ -162,7 +162,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
             hint="give --reference DIR, or run it again with --set ingest.holdout=every:8",
         )
     views = []
-    for stem, frame in _by_stem((_stem(frame.name), frame) for frame in test).items():
+    for stem, frame in _by_stem((stem_of(frame.name), frame) for frame in test).items():
         view = view_of(frame, ingest, 1.0)
         mask = None if frame.mask is None else ingest / frame.mask
         size = (frame.width, frame.height)
@@ -186,7 +186,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
         trained = {int(number) for number in read_exposure(run / stage / "exposure.parquet").frame_ids}
     except StoreError:
         return None
-    own = {_stem(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}
+    own = {stem_of(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}
     return sum(view.name in own and _about_there(view.camera, own[view.name]) for view in reference.views)
 
 
@@ -231,7 +231,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
         assert lens is not None  # asked for with poses=True
         if lens not in ways:
             ways[lens] = undistorter(lens, sys.maxsize)
-        stem = _stem(entry.name)
+        stem = stem_of(entry.name)
         listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), ways[lens])))
     return _by_stem(listed)
 
@@ -344,7 +344,7 @@ def _own_pose(frame: Frame) -> Pose:
 # -- names -------------------------------------------------------------------------------------------------
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
     """A file's name without folder and image ending (a video's name may hold dots of its own)."""
     path = Path(name)
     return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name

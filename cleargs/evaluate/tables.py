@@ -17,6 +17,13 @@ TITLES: Mapping[ViewSet, str] = {
     "held-out": "On held-out frames",
     "reference": "Against the given reference",
 }
+NOTES: Mapping[ViewSet, str] = {
+    "observed": "Training poses: the scenes were trained on the frames filmed from here, not on this truth.",
+    "given": "Training poses: the scenes were trained on the frames filmed from here, not on this truth.",
+    "novel": "No frame was filmed from these places.",
+    "held-out": "No scene was trained on these frames. They are as sharp as they were filmed.",
+}
+"""What to know of a set of views."""
 NAMES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
 COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 """Metrics whose differences are tabled."""
@@ -26,6 +33,26 @@ _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 def metric_title(metric: str) -> str:
     """Name and direction of a metric, as a heading."""
     return f"{NAMES.get(metric, metric)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
+
+
+class Bold(str):
+    """A text of a table that stands out."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True)
+class Table:
+    """Words in rows below a head."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        """The table as Markdown."""
+        rows = [[f"**{text}**" if isinstance(text, Bold) else text for text in row] for row in self.rows]
+        lines = [self.head, ["---"] * len(self.head), *rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 @dataclass(frozen=True)
@@ -48,40 +75,43 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
     cells, parts = found.cells, []
     for views in cells.view_sets():
         parts.append(f"## {TITLES[views]}")
+        parts += [NOTES[views]] if views in NOTES else []
         for metric in cells.metrics():
             parts.append(f"### {metric_title(metric)}")
-            parts.append(metric_table(cells, labels, views, metric))
+            parts.append(metric_table(cells, labels, views, metric).markdown())
         for baseline in baselines:
             if baseline in cells.variants():
                 parts.append(f"### Minus {labels[baseline]}")
-                parts.append(difference_table(cells, labels, views, baseline))
+                parts.append(difference_table(cells, labels, views, baseline).markdown())
     parts += [
         "## Work",
-        work_table(cells, labels),
+        work_table(cells, labels).markdown(),
         "## Roles of the frames",
-        roles_table(found.roles, labels),
+        roles_table(found.roles, labels).markdown(),
     ]
     if found.choices:
-        parts += ["## The choice against the truth", choices_table(found.choices, labels)]
+        parts += ["## The choice against the truth", choices_table(found.choices, labels).markdown()]
     return "\n\n".join(parts) + "\n"
 
 
-def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> str:
+def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> Table:
     """A metric of every variant by column, the best of a column in bold."""
     rows = [[labels[variant], *value_texts(cells, views, variant, metric)] for variant in cells.variants()]
-    return table(["", *cells.columns(views)], rows)
+    return Table(["", *cells.columns(views)], rows)
 
 
 def value_texts(cells: Cells, views: ViewSet, variant: str, metric: str) -> list[str]:
     """A variant's values of a metric by column, in bold where it is the best."""
-    texts = []
-    for column in cells.columns(views):
-        text = _value(cells.spread(views, column, variant, metric), metric)
-        texts.append(f"**{text}**" if variant == cells.best(views, column, metric) else text)
-    return texts
+    return [value_text(cells, views, column, variant, metric) for column in cells.columns(views)]
 
 
-def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> str:
+def value_text(cells: Cells, views: ViewSet, column: str, variant: str, metric: str) -> str:
+    """A variant's value of a metric in one column, in bold where it is the best."""
+    text = _value(cells.spread(views, column, variant, metric), metric)
+    return Bold(text) if variant == cells.best(views, column, metric) else text
+
+
+def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> Table:
     """PSNR, SSIM and LPIPS of every other variant minus the baseline's, paired within samples, with 95 %
     intervals; for LPIPS the share of the baseline's too.
     """
@@ -97,7 +127,7 @@ def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, ba
                 difference = cells.difference(views, column, variant, baseline, metric)
                 row.append(difference_text(difference, cells.spread(views, column, baseline, metric), metric))
             rows.append(row)
-    return table(["", "", *counted(cells, views)], rows)
+    return Table(["", "", *counted(cells, views)], rows)
 
 
 def counted(cells: Cells, views: ViewSet) -> list[str]:
@@ -109,7 +139,7 @@ def counted(cells: Cells, views: ViewSet) -> list[str]:
     return found
 
 
-def work_table(cells: Cells, labels: Mapping[str, str]) -> str:
+def work_table(cells: Cells, labels: Mapping[str, str]) -> Table:
     """What each variant was given and what it took: means over all samples, ranges of what must be equal."""
     rows = []
     for variant in cells.variants():
@@ -129,10 +159,10 @@ def work_table(cells: Cells, labels: Mapping[str, str]) -> str:
             ]
         )
     head = ["", "steps", "Gaussians", "SH degree", "CPU s", "peak memory, GB", "wall s, own + shared stages"]
-    return table(head, rows)
+    return Table(head, rows)
 
 
-def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> str:
+def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> Table:
     """Frames of all samples of a column by role; variants whose counts agree share a row."""
     rows = []
     for column in dict.fromkeys(scene.column for scene in roles):
@@ -144,10 +174,10 @@ def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> str:
             groups.setdefault(counts, []).append(variant)
         for counts, variants in groups.items():
             rows.append([column, ", ".join(labels[name] for name in variants), *map(str, counts)])
-    return table(["", "", *KINDS], rows)
+    return Table(["", "", *KINDS], rows)
 
 
-def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> str:
+def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> Table:
     """How often the chosen candidate is the best, over all rows of all samples of a column."""
     rows = []
     for column, variant in dict.fromkeys((scene.column, scene.variant) for scene in choices):
@@ -174,13 +204,7 @@ def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> str:
         "by chance",
         "lost against the best, dB",
     ]
-    return table(head, rows)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return Table(head, rows)
 
 
 def number(value: float, metric: str) -> str:

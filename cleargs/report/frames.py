@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -85,10 +85,20 @@ def scores_of(selection: Selection, role: str) -> dict[str, float]:
     return {name: score for name, score in scores.items() if score is not None}
 
 
-def load_rows(run: Path, final: str | None) -> list[FrameRow]:
-    """The frames of ``run`` in their order; ``final`` is the stage of the scene shown. Raises StoreError."""
-    judged = _judged(run)
-    selections = _selections(run)
+SCENES = ("g0", "rivr", "consolidate")
+"""The stages that make a scene, in order."""
+
+
+def last_scene(stages: Collection[str]) -> str | None:
+    """The last of ``stages`` that makes a scene; None without one."""
+    return next((stage for stage in reversed(SCENES) if stage in stages), None)
+
+
+def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
+    """The frames of ``run`` in their order, as far as ``stages`` say something of them. Raises StoreError."""
+    judged = _judged(run) if "rva" in stages else {}
+    selections = _selections(run) if "rivr" in stages else {}
+    final = last_scene(stages)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None
     formation = _formation(run, final)
     rows = []

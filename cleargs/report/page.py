@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import secrets
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
-
-import cleargs
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
-from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.formation.colour import read_exposure
-from cleargs.pipeline.manifest import Manifest, plain_json
+from cleargs.pipeline.freshness import stale_stages
+from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
-from cleargs.report.frames import FrameRow, formation_meanings, load_rows, scores_of
+from cleargs.report.frames import SCENES, FrameRow, formation_meanings, load_rows, scores_of
+from cleargs.report.html import new_report, write_page
 from cleargs.report.pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
-from cleargs.report.record import FOLDER, PAGE, LastRun, linked_manifests, noted, page_of, write_record
+from cleargs.report.record import LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.scene import (
     Renderer,
     camera_of,
@@ -43,7 +36,6 @@ RENDERED = 40
 
 _STILL = 960  # px, long side of the pictures that stand for the viewers
 _SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
-_SCENES = ("g0", "rivr", "consolidate")
 
 TITLES = {
     "before": ("Before", "trained on the frames as filmed"),
@@ -71,10 +63,12 @@ class SceneView:
     background: tuple[float, float, float]
 
 
-def write_report(planner: Planner, last: LastRun | None = None) -> Path:
+def write_report(planner: Planner, last: LastRun | None = None, *, stale: bool = False) -> Path:
     """Write the report of ``planner.run``, in place of an older one; returns its page.
 
-    Without ``last``, what an older report noted of the last run is kept. The folder appears whole.
+    Without ``last``, what an older report noted of the last run is kept. With ``stale`` the report also shows
+    results that were made with other settings or inputs than the run's, and says so; else they are left out.
+    The folder appears whole.
 
     Raises:
         InputError: when nothing of the run is done yet.
@@ -82,33 +76,32 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
+    old = {name: why for name, why in stale_stages(planner.dag, planner.run).items() if name in manifests}
+    if not stale:
+        manifests = {name: manifest for name, manifest in manifests.items() if name not in old}
+        old = {}
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs explain {run}")
     last = last or noted(run)
-    folder = run / f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{FOLDER}"
-    try:
-        folder.mkdir()
-        _fill(folder, planner, manifests, last)
-        write_record(folder, manifests, last)
-        old = folder.with_name(f"{folder.name}.old")
-        if (run / FOLDER).exists():
-            (run / FOLDER).rename(old)
-        folder.rename(run / FOLDER)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise disk_error(error, run / FOLDER) from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with new_report(run) as folder:
+        _fill(folder, planner, manifests, last, {name: "; ".join(why) for name, why in old.items()})
+        write_record(folder, manifests, last, stale=list(old))
     return page_of(run)
 
 
-def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+def _fill(
+    folder: Path,
+    planner: Planner,
+    manifests: Mapping[str, Manifest],
+    last: LastRun | None,
+    stale: Mapping[str, str],
+) -> None:
     """Write the page and all that it needs into ``folder``."""
     run = planner.run.folder
     set_threads(planner.threads)
-    trained = [stage for stage in _SCENES if stage in manifests]
+    trained = [stage for stage in SCENES if stage in manifests]
     final = trained[-1] if trained else None
-    rows = load_rows(run, final)
+    rows = load_rows(run, manifests)
     scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, rows)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None
 
@@ -121,69 +114,31 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     pictures = write_pictures(
         rows, run, folder, render if renderer else None, _rendered(rows, renderer), planner.threads
     )
-    viewer = write_viewer(folder) if scenes else ""
-    plans = _plans(planner)
-    stale = {
-        name: "; ".join(plan.reasons)
-        for name, plan in plans.items()
-        if plan.state != "hit" and name in manifests
-    }
-    html = (
-        _environment()
-        .get_template("report.html.jinja")
-        .render(
-            name=run.name,
-            source=planner.run.source.name,
-            version=cleargs.__version__,
-            rows=rows,
-            pictures=pictures,
-            verdict=judge(manifests, rows, planner.run.config, stale),
-            scenes=scenes,
-            viewer=viewer,
-            plan=charts.plan_of(rows),
-            curves=charts.training_curves(run, trained),
-            bars=charts.fitted_bars(rows),
-            stages=facts.stage_rows(planner.dag.names, manifests, plans, last.stages if last else {}),
-            total=words.duration(sum(manifest.seconds for manifest in manifests.values())),
-            memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
-            device=list(manifests.values())[-1].device,
-            started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
-            settings=facts.changed_settings(planner.run.config),
-            versions=facts.versions(manifests),
-            command=facts.command(planner.run, planner.dag),
-            layers=LAYERS,
-            aspect=_aspect(rows),
-            data=_data(rows, pictures, scenes, formation_meanings(run, final)),
-        )
+    write_page(
+        folder,
+        "report.html.jinja",
+        name=run.name,
+        source=planner.run.source.name,
+        rows=rows,
+        pictures=pictures,
+        verdict=judge(manifests, rows, planner.run.config, stale),
+        scenes=scenes,
+        viewer=write_viewer(folder) if scenes else "",
+        plan=charts.plan_of(rows),
+        curves=charts.training_curves(run, trained),
+        bars=charts.fitted_bars(rows),
+        stages=facts.stage_rows(planner.dag.names, manifests, _plans(planner), last.stages if last else {}),
+        total=words.duration(sum(manifest.seconds for manifest in manifests.values())),
+        memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
+        device=list(manifests.values())[-1].device,
+        started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
+        settings=facts.changed_settings(planner.run.config),
+        versions=facts.versions(manifests),
+        command=facts.command(planner.run, planner.dag),
+        layers=LAYERS,
+        aspect=_aspect(rows),
+        data=_data(rows, pictures, scenes, formation_meanings(run, final)),
     )
-    (folder / PAGE).write_bytes(html.encode())
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("cleargs.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["json"] = json_in_html
-    environment.globals["static"] = _static
-    environment.globals["weight_colour"] = charts.weight_colour
-    return environment
-
-
-def _static(name: str) -> Markup:
-    """A style sheet or script of ours, to stand in the page as it is."""
-    return Markup(files("cleargs.report").joinpath("static", name).read_text(encoding="utf-8"))
-
-
-def json_in_html(value: Any) -> Markup:
-    """``value`` as JSON that is inert inside a script element, whatever its strings hold."""
-    text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
-    for letter in "<>&":
-        text = text.replace(letter, f"\\u{ord(letter):04x}")
-    return Markup(text)
 
 
 def _scenes(
@@ -264,6 +219,7 @@ def _data(
     times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
     return {
         "layers": LAYERS,
+        "opening": {"left": "observed", "right": "final"},
         "frames": [
             _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id), meanings)
             for row in rows

@@ -69,9 +69,7 @@ def write_pictures(
     """Write all pictures below ``report``; ``rendered``: the frames for which ``render`` is asked."""
     (report / FOLDER).mkdir(parents=True)
     layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
-    aspect = rows[0].frame.height / rows[0].frame.width if rows else 1.0
-    pixels = BYTES / (_BYTES_A_PIXEL * max(layers, 1))
-    side = int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), _SIDE_MIN, _SIDE_MAX))
+    side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, BYTES)
     # Renders come one after the other, since each uses all threads; the files are read and written beside.
     with ThreadPoolExecutor(threads) as pool:
         futures = {}
@@ -82,17 +80,31 @@ def write_pictures(
         return {frame_id: future.result() for frame_id, future in futures.items()}
 
 
-def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
-    observed = read_rgb(run / "ingest" / row.frame.image)
-    images: dict[str, Image] = {"observed": observed}
+def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -> int:
+    """The longer side, px, with which so many pictures (height / width: ``aspect``) take ``budget`` bytes.
+
+    It is ``least`` where that would be too small to see anything.
+    """
+    pixels = budget / (_BYTES_A_PIXEL * max(pictures, 1))
+    return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
+
+
+def layers_of(row: FrameRow, run: Path) -> dict[str, Image]:
+    """The frame as filmed, and the other layers of its latest round. Raises InputError, StoreError."""
+    images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.selection is not None:
         stored = read_exr(run / "rivr" / row.selection.exr).layers
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
+    return images
+
+
+def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
+    images = layers_of(row, run)
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
     return FramePictures(
-        write_jpeg(report, f"{name}.jpg", observed, _THUMBNAIL),
+        write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL),
         {
             layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side)
             for layer in LAYERS

@@ -7,19 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from cleargs.evaluate.cells import Cells, Spread, ViewSet
+from cleargs.evaluate.cells import Cells, ViewSet
 from cleargs.evaluate.evidence import Outcome, Section
-from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.losses import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
 from cleargs.evaluate.tables import (
     COMPARED,
     NAMES,
     TITLES,
+    Table,
     choices_table,
     counted,
     difference_text,
     metric_title,
     roles_table,
-    table,
     value_texts,
     work_table,
 )
@@ -49,24 +49,6 @@ class Origin:
         return f"`{self.command}{only}`, version {self.version}"
 
 
-@dataclass(frozen=True)
-class Loss:
-    """A cell in which the whole method is behind another variant."""
-
-    section: str
-    views: ViewSet
-    column: str
-    against: str
-    metric: str
-    difference: Spread
-
-    @property
-    def verdict(self) -> str:
-        if self.difference.half_width is None:
-            return "one sample"
-        return "sure" if self.difference.is_sure else "none"
-
-
 def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
     """The whole page as Markdown; pictures are expected in ``results/`` beside it, by the sections' names."""
     template = (files("cleargs.report") / "results.md").read_text(encoding="utf-8")
@@ -82,7 +64,7 @@ def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
     values = {
         "warning": "\n".join(f"**{warning}**" for warning in warnings),
         "confidence": CONFIDENCE,
-        "losses": losses_table(outcomes),
+        "losses": losses_found(outcomes),
         "answers": answers_table(outcomes),
         "recipe": origin.recipe,
         "variants": "\n".join(_variant_rows()),
@@ -93,38 +75,28 @@ def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
 
 
-def losses(outcomes: Sequence[Outcome]) -> list[Loss]:
-    """All cells in which the whole method is behind, those that are sure first."""
-    found = []
-    for outcome, cells, views, column in _columns(outcomes):
-        for variant in cells.variants():
-            for metric in COMPARED:
-                difference = cells.difference(views, column, WHOLE, variant, metric)
-                if variant != WHOLE and difference is not None and _behind(difference, metric):
-                    found.append(Loss(outcome.section.title, views, column, variant, metric, difference))
-    order = ("sure", "one sample", "none")
-    return sorted(found, key=lambda loss: order.index(loss.verdict))
+def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
+    """Sections and all cells in which the whole method is behind, those that are sure first."""
+    found = [
+        (outcome.section.title, loss)
+        for outcome, cells in _compared(outcomes)
+        for loss in losses_of(cells, WHOLE)
+    ]
+    return sorted(found, key=lambda item: VERDICTS.index(item[1].verdict))
 
 
-def losses_table(outcomes: Sequence[Outcome]) -> str:
+def losses_found(outcomes: Sequence[Outcome]) -> str:
     """The losses, and of how many comparisons they are."""
     found, labels = losses(outcomes), _labels()
-    compared = sum(
-        variant != WHOLE and cells.difference(views, column, WHOLE, variant, metric) is not None
-        for _, cells, views, column in _columns(outcomes)
-        for variant in cells.variants()
-        for metric in COMPARED
-    )
-    sure = sum(loss.verdict == "sure" for loss in found)
+    compared = sum(1 for _, cells in _compared(outcomes) for _ in compared_with(cells, WHOLE))
+    sure = sum(loss.verdict == "sure" for _, loss in found)
     line = f"{len(found)} of {compared} comparisons, {sure} of them sure."
-    rows: dict[tuple[str, str, str, str], list[str]] = {}
-    for loss in found:
-        place = (loss.section, loss.column, TITLES[loss.views].split(",")[0], labels[loss.against])
-        text = difference_text(loss.difference, None, loss.metric)
-        cells = rows.setdefault(place, [""] * len(COMPARED))
-        cells[COMPARED.index(loss.metric)] = f"**{text}**" if loss.verdict == "sure" else text
-    head = ["section", "column", "views", "behind", *(NAMES[metric] for metric in COMPARED)]
-    return f"{line}\n\n{table(head, [[*place, *cells] for place, cells in rows.items()])}" if rows else line
+    places = [
+        ((section, loss.column, TITLES[loss.views].split(",")[0], labels[loss.against]), loss)
+        for section, loss in found
+    ]
+    rows = losses_table(("section", "column", "views", "behind"), places)
+    return f"{line}\n\n{rows.markdown()}" if found else line
 
 
 def answers_table(outcomes: Sequence[Outcome]) -> str:
@@ -135,14 +107,16 @@ def answers_table(outcomes: Sequence[Outcome]) -> str:
         for metric in COMPARED:
             found = [
                 difference
-                for _, cells, views, column in _columns(outcomes)
+                for _, cells in _compared(outcomes)
+                for views in cells.view_sets()
+                for column in cells.columns(views)
                 if (difference := cells.difference(views, column, variant, against, metric)) is not None
             ]
-            worse = sum(one.is_sure and _behind(one, metric) for one in found)
+            worse = sum(one.is_sure and is_behind(one, metric) for one in found)
             better = sum(one.is_sure for one in found) - worse
             row.append(f"{better} / {worse} / {len(found) - better - worse}" if found else "not made")
         rows.append(row)
-    return table(["better / worse / none", *(NAMES[metric] for metric in COMPARED)], rows)
+    return Table(["better / worse / none", *(NAMES[metric] for metric in COMPARED)], rows).markdown()
 
 
 def questions_table(cells: Cells, views: ViewSet) -> str:
@@ -156,7 +130,7 @@ def questions_table(cells: Cells, views: ViewSet) -> str:
                 bases = [cells.spread(views, column, against, metric) for column in columns]
                 texts = [difference_text(*pair, metric) for pair in zip(found, bases, strict=True)]
                 rows.append([question, NAMES[metric], *texts])
-    return table(["", "", *counted(cells, views)], rows) if rows else ""
+    return Table(["", "", *counted(cells, views)], rows).markdown() if rows else ""
 
 
 def values_table(cells: Cells, views: ViewSet) -> str:
@@ -166,23 +140,12 @@ def values_table(cells: Cells, views: ViewSet) -> str:
         for variant in cells.variants():
             texts = value_texts(cells, views, variant, metric)
             rows.append([metric_title(metric), labels[variant], *texts])
-    return table(["", "", *columns], rows)
+    return Table(["", "", *columns], rows).markdown()
 
 
-def _columns(outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Cells, ViewSet, str]]:
-    """Every column of every set of views of every section."""
-    return [
-        (outcome, cells, views, column)
-        for outcome in outcomes
-        if outcome.compared is not None
-        for cells in [outcome.compared.results.cells]
-        for views in cells.view_sets()
-        for column in cells.columns(views)
-    ]
-
-
-def _behind(difference: Spread, metric: str) -> bool:
-    return difference.mean > 0 if metric in LOWER_IS_BETTER else difference.mean < 0
+def _compared(outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Cells]]:
+    """The sections that could be made, with their cells."""
+    return [(found, found.compared.results.cells) for found in outcomes if found.compared is not None]
 
 
 def _labels() -> dict[str, str]:
@@ -213,10 +176,10 @@ def _section(found: Outcome, origin: Origin) -> str:
         parts += [f"### {TITLES[views]}", values_table(cells, views), made]
         if questions := questions_table(cells, views):
             parts += ["Differences:", questions, made]
-    parts += ["### Work", work_table(cells, labels), made]
-    parts += ["### Roles of the frames", roles_table(results.roles, labels), made]
+    parts += ["### Work", work_table(cells, labels).markdown(), made]
+    parts += ["### Roles of the frames", roles_table(results.roles, labels).markdown(), made]
     if results.choices:
-        parts += ["### The choice against the truth", choices_table(results.choices, labels), made]
+        parts += ["### The choice against the truth", choices_table(results.choices, labels).markdown(), made]
     elif section.kind == "video":
         parts.append("Whether RIVR chose well cannot be said here: the repaired frames have no truth.")
     parts += [

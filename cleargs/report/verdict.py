@@ -1,4 +1,9 @@
-"""How a run went, in words, and what stands in the way of a better one, each with the setting to change."""
+"""How a run went, in words, and what stands in the way of a better one, each with the setting to change.
+
+None of the thresholds here is calibrated. They are round numbers, chosen by judgement: no set of captures of
+which people had said how good their scenes are was held against them. The figures behind the verdict are of
+training poses, so it says how well a scene explains what was filmed, and not how new views look.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +17,14 @@ from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
 from cleargs.report.words import count, decibel
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
-"""PSNR on the trusted frames from which a scene explains them closely, and below which only loosely. For
-orientation: what a number means depends on the noise and the texture of the capture."""
-
+"""Training PSNR from which a scene is said to follow its frames closely, and below which only loosely. What
+a number means depends on the noise and the texture of the capture."""
 FEW_PLACED = 0.8
+"""Share of frames with a pose, below which the others are cautioned about."""
 MANY_UNUSED = 0.4
+"""Share of placed frames with weight 0, above which they are cautioned about."""
 SOFT_PX = 6.0
+"""Motion while exposed, px, above which a frame counts as blurred."""
 
 Tone = Literal["good", "fair", "poor"]
 
@@ -76,14 +83,23 @@ def _setting(config: Config, section: str, name: str) -> Any:
 def _headline(manifests: Mapping[str, Manifest]) -> tuple[Tone, str]:
     if "g0" not in manifests:
         return "fair", "The capture is prepared; no scene is trained yet."
-    strong = _figure(manifests, "g0", "psnr_strong") or _figure(manifests, "g0", "psnr_active")
-    if strong is None:
+    psnr, frames = training_psnr(manifests)
+    if psnr is None:
         return "fair", "The scene is trained."
-    if strong >= CLOSE_DB:
-        return "good", "The scene follows the trusted frames closely."
-    if strong >= LOOSE_DB:
-        return "fair", "The scene follows the trusted frames, with fine detail missing."
-    return "poor", "The scene follows even the trusted frames only loosely."
+    follows = f"The first scene follows {frames}"
+    if psnr >= CLOSE_DB:
+        return "good", f"{follows} closely."
+    if psnr >= LOOSE_DB:
+        return "fair", f"{follows} fairly closely."
+    return "poor", f"{follows} only loosely."
+
+
+def training_psnr(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]:
+    """PSNR of the first scene on the best frames that it was trained on, dB, and what these are called."""
+    strong = _figure(manifests, "g0", "psnr_strong")
+    if strong is not None:
+        return strong, "the trusted training frames"
+    return _figure(manifests, "g0", "psnr_active"), "its training frames"
 
 
 def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> str:
@@ -112,7 +128,7 @@ def _harm(manifests: Mapping[str, Manifest]) -> str | None:
     change = after - before
     kind = "more" if change >= 0 else "less"
     return (
-        "after the repairs, the scene explains the frames kept aside for this check "
+        "after the repairs, the scene explains training frames that were kept aside from them "
         f"{abs(change):.1f} dB {kind} exactly ({decibel(before)} before, {decibel(after)} now)"
     )
 
@@ -124,11 +140,10 @@ def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Ite
     if "rva" in manifests:
         effective = _figure(manifests, "rva", "effective_frames")
         yield Figure(f"{active}", "frames train the scene", f"as much as {effective:.1f} whole ones together")
-    psnr = _figure(manifests, "g0", "psnr_strong")
+    psnr, frames = training_psnr(manifests)
     if psnr is not None:
-        yield Figure(
-            decibel(psnr), "on trusted frames", "PSNR of the first scene, on frames it was trained on"
-        )
+        rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
+        yield Figure(decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}")
     repairs = _figure(manifests, "consolidate", "repairs")
     if repairs is not None:
         yield Figure(
@@ -142,7 +157,7 @@ def _warnings(
     manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
 ) -> Iterator[Caution]:
     for stage, reason in stale.items():
-        yield Caution(f"{stage} is not from today's settings and input", reason, ())
+        yield Caution(f"{stage} is stale", reason, ())
     for manifest in manifests.values():
         for missing in manifest.missing:
             yield Caution(f"{manifest.stage} is done only in part", missing, ())

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cleargs.batch.folder import BatchFolder, Status
+from cleargs.batch.folder import BatchFolder, Plan, Status
 
 STAGE = """
 import json, os, signal, socket, sys, time
@@ -93,6 +93,22 @@ def test_the_end_of_a_stage_is_noted(
     assert (handle is not None) == finished
     if handle is not None:
         assert handle.digest == "abc"
+
+
+@pytest.mark.parametrize(
+    ("until", "report", "written"), [("g0", True, True), ("g0", False, False), ("rivr", True, False)]
+)
+def test_only_the_last_job_of_a_scene_writes_its_report(
+    tmp_path: Path, until: str, report: bool, written: bool
+) -> None:
+    stages: dict[str, tuple[str, ...]] = {"g0": (), "rivr": ("g0",)}
+    plan = Plan(
+        watcher=(), program=(), options=(), stages=stages, until=until, report=report, scenes={"room": {}}
+    )
+    BatchFolder(tmp_path).write_plan(plan)
+    assert Job(tmp_path, "0", "0", "complete").ended()[0] == 0
+    called = BatchFolder(tmp_path).log("room", "g0").read_text().splitlines()[0]
+    assert called.endswith(" complete --report" if written else " complete")
 
 
 def test_a_stage_killed_from_outside_is_a_failure_that_says_so(tmp_path: Path) -> None:

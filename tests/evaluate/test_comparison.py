@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -133,6 +134,22 @@ def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
     assert cells["rva", "observed"]["evaluation"] != cells["all-view", "observed"]["evaluation"]
     for name in ("comparison.md", "comparison.png", "sheet.png"):
         assert (out / name).stat().st_size > 0
+
+
+def test_the_page_shows_every_variant_at_every_pose(out: Path) -> None:
+    text = (out / "report/index.html").read_text()
+    poses = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])["frames"]
+    assert [len(pose["layers"]) for pose in poses] == [
+        6,
+        6,
+        6,
+        5,
+        5,
+        5,
+    ]  # filmed at the poses of the path only
+    assert "All were trained for as many steps" in text
+    for page in (text, (out / "comparison.md").read_text()):
+        assert "Training poses: the scenes were trained on the frames filmed from here" in page
 
 
 def test_variants_share_what_they_agree_on(out: Path) -> None:

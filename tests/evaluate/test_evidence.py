@@ -137,15 +137,16 @@ def outcome(*gains: float) -> Outcome:
 
 
 def test_losses_come_first_and_say_how_sure_they_are() -> None:
-    (sure,) = losses([outcome(-1.0, -1.1, -0.9)])
+    ((section, sure),) = losses([outcome(-1.0, -1.1, -0.9)])
+    assert section == "Rooms, by fault"
     assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
-    (chance,) = losses([outcome(-1.0, 0.5, -0.2)])
+    ((_, chance),) = losses([outcome(-1.0, 0.5, -0.2)])
     assert chance.verdict == "none"
-    (single,) = losses([outcome(-1.0)])
+    ((_, single),) = losses([outcome(-1.0)])
     assert single.verdict == "one sample"
     assert losses([outcome(1.0, 1.1, 0.9)]) == []
     ordered = [
-        loss.verdict for loss in losses([outcome(-1.0, 0.5), outcome(-1.0), outcome(-1.0, -1.1, -0.9)])
+        loss.verdict for _, loss in losses([outcome(-1.0, 0.5), outcome(-1.0), outcome(-1.0, -1.1, -0.9)])
     ]
     assert ordered == ["sure", "one sample", "none"]
 

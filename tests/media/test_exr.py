@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
-from OpenImageIO import HALF, ImageInput
+from OpenImageIO import HALF, ImageBuf, ImageInput
 
 from cleargs.errors import StoreError
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
@@ -64,6 +65,23 @@ def test_the_shown_layer_is_what_programs_without_layers_find(tmp_path: Path) ->
     assert set(back.layers) == set(NAMES), "the plain channels are no layer of their own"
     for name in NAMES:
         np.testing.assert_array_equal(back.layers[name], image.layers[name])
+
+
+def test_ordinary_programs_open_the_shown_layer(tmp_path: Path) -> None:
+    """FFmpeg, which knows R, G and B by name, and those that take the first three channels of a file."""
+    layers = {
+        name: np.full((16, 24, 3), value, np.float16) * np.array([1.0, 0.5, 0.25], np.float16)
+        for name, value in (("fused", 0.5), ("observed", 0.125), ("render", 1.0))
+    }
+    path = tmp_path / "a.exr"
+    write_exr(path, LayeredImage(layers, {}), shown="observed")
+    with av.open(str(path)) as container:
+        planes = next(container.decode(video=0)).planes
+        green, blue, red = (float(np.frombuffer(bytes(plane), np.float16)[0]) for plane in planes)
+    assert (red, green, blue) == (0.125, 0.0625, 0.03125)
+    buffer = ImageBuf(str(path))
+    assert buffer.spec().channelnames[:3] == ("R", "G", "B") and buffer.nsubimages == 1
+    assert tuple(buffer.getpixel(3, 3)[:3]) == (0.125, 0.0625, 0.03125)
 
 
 def test_equal_content_gives_equal_bytes_and_no_date(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,14 @@ from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.keys import KeyParts
+from cleargs.pipeline.keys import KeyParts, key_config
 from cleargs.pipeline.manifest import FileRecord, Manifest, published_files, write_manifest
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.report.scene import Renderer
-from cleargs.rivr.tables import Selection, write_selection
+from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
 from cleargs.splat.camera import Camera
@@ -74,13 +75,15 @@ def camera(index: int, height: float = HEIGHT, width: float = WIDTH) -> Camera:
 
 
 class FinishedRun:
-    """``folder`` as `cleargs run` leaves it, all five stages done."""
+    """``folder`` as `cleargs run` leaves it, all five stages done, the frames ``held_out`` for testing."""
 
-    def __init__(self, root: Path) -> None:
-        self.folder = root / "run"
+    def __init__(self, root: Path, name: str = "run", held_out: Sequence[int] = ()) -> None:
+        self.folder = root / name
         self.dag = installed()
         self.scenes = {"g0": wall(1), "consolidate": wall(2)}
-        config = load_config(self.dag, "smoke", ["rva.tau_R=0.61"])
+        self.held_out = held_out
+        overrides = ["rva.tau_R=0.61", *(["ingest.holdout=every:3"] if held_out else [])]
+        config = load_config(self.dag, "smoke", overrides)
         self.run = Run(self.folder, root / "gone & <away>.mp4", config, self.folder / ".store", "cpu")
         write_run_file(self.run)
         self._ingest()
@@ -107,7 +110,7 @@ class FinishedRun:
         parts = KeyParts(
             stage=stage,
             version=1,
-            config={},
+            config=key_config(self.run.config.sections[stage]),
             inputs={},
             externals={},
             seed=0,
@@ -160,7 +163,7 @@ class FinishedRun:
                     **{name: float(value) if placed else None for name, value in values.items()},
                     "registered": placed,
                     "n_points": 30,
-                    "split": "train",
+                    "split": "test" if index in self.held_out else "train",
                 }
             )
         write_table(folder / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
@@ -210,6 +213,8 @@ class FinishedRun:
         write_table(folder / "train.parquet", pa.Table.from_pylist(rows, TRAIN), TRAIN)
         gains = np.linspace(0.8, 1.2, 5)
         write_exposure(folder / "exposure.parquet", Exposure.from_gains(list(range(5)), gains))
+        if stage == "consolidate":
+            write_repairs(folder / "repairs.parquet", latest_accepted(self.selections))
         self.finish(stage, summary)
 
     def _rivr(self) -> None:
@@ -249,4 +254,5 @@ class FinishedRun:
                 )
             )
         write_selection(folder / "selection.parquet", rows)
+        self.selections = rows
         self.finish("rivr", {"published": "G0", "rounds": []})

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from browser import CHROMIUM, NO_CHROMIUM, Opened
 from report_run import HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames
@@ -17,12 +17,7 @@ from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 from cleargs.report.scene import Renderer, camera_of, level_camera
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium (apt-get install chromium)")
-
-PATIENCE_MS = 240_000  # software WebGL on a busy machine
-ALLOWED = ("file:", "data:", "blob:")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
 DIFFERENCE = 12.0
 """Mean absolute difference of a viewer's pixels from ours, in levels of 255. Measured: 9, nearly all of
@@ -30,22 +25,8 @@ it darkness at the rim of splats: PlayCanvas bends the Gaussian so that it ends 
 The same scene from the next camera, and the other scene from the same camera, by 35 to 42."""
 
 
-class Opened:
-    """A report in the browser, and all that it complained about or asked for."""
-
-    def __init__(self, page: Any, address: str) -> None:
-        self.page = page
-        self.complaints: list[str] = []
-        self.requests: list[str] = []
-        page.set_default_timeout(PATIENCE_MS)
-        page.on("console", self._heard)
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("request", lambda request: self.requests.append(request.url))
-        page.goto(address)
-
-    def _heard(self, message: Any) -> None:
-        if message.type in ("error", "warning"):
-            self.complaints.append(message.text)
+class Report(Opened):
+    """The report of a run, with its two viewers."""
 
     def scenes(self) -> None:
         """Wait until both scenes are drawn."""
@@ -103,34 +84,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    flags = [
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        "--ignore-gpu-blocklist",
-        "--no-sandbox",
-    ]
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def wide(browser: Any, run: FinishedRun) -> Iterator[Opened]:
+def wide(browser: Any, run: FinishedRun) -> Iterator[Report]:
     page = browser.new_page(
         viewport={"width": 1280, "height": 900}, device_scale_factor=0.5
     )  # a quarter of the work
-    opened = Opened(page, (run.folder / "report/index.html").as_uri())
+    opened = Report(page, (run.folder / "report/index.html").as_uri())
     opened.scenes()
     yield opened
     page.close()
 
 
 @pytest.fixture(scope="module")
-def phone(browser: Any, run: FinishedRun) -> Iterator[Opened]:
+def phone(browser: Any, run: FinishedRun) -> Iterator[Report]:
     page = browser.new_page(viewport={"width": 390, "height": 844}, color_scheme="dark", has_touch=True)
-    yield Opened(page, (run.folder / "report/index.html").as_uri())
+    yield Report(page, (run.folder / "report/index.html").as_uri())
     page.close()
 
 
@@ -144,7 +111,7 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.abs(first - second).mean())
 
 
-def test_both_viewers_show_their_scene_at_the_opening_pose(wide: Opened, run: FinishedRun) -> None:
+def test_both_viewers_show_their_scene_at_the_opening_pose(wide: Report, run: FinishedRun) -> None:
     start = 3  # of the frames with the greatest weight, the one in the middle
     for pane, stage, other in (("before", "g0", "consolidate"), ("after", "consolidate", "g0")):
         shown = wide.pixels(pane)
@@ -154,7 +121,7 @@ def test_both_viewers_show_their_scene_at_the_opening_pose(wide: Opened, run: Fi
         assert difference(shown, ours(run, stage, start + 1, shown.shape)) > 2.5 * DIFFERENCE
 
 
-def test_a_dot_of_the_path_moves_both_viewers_there(wide: Opened, run: FinishedRun) -> None:
+def test_a_dot_of_the_path_moves_both_viewers_there(wide: Report, run: FinishedRun) -> None:
     wide.page.locator('.mark[data-frame="1"]').focus()
     wide.page.keyboard.press("Enter")
     wide.settle()
@@ -168,7 +135,7 @@ def test_a_dot_of_the_path_moves_both_viewers_there(wide: Opened, run: FinishedR
 
 
 @pytest.mark.parametrize("pane", ["before", "after"])
-def test_dragging_either_side_turns_both(wide: Opened, pane: str) -> None:
+def test_dragging_either_side_turns_both(wide: Report, pane: str) -> None:
     standing = wide.camera("after")
     box = wide.page.locator(f'.pane[data-scene="{pane}"]').bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -181,12 +148,12 @@ def test_dragging_either_side_turns_both(wide: Opened, pane: str) -> None:
     assert np.allclose(wide.camera("before"), wide.camera("after"), atol=1e-6)
 
 
-def test_the_strip_opens_the_layers_under_a_slider(wide: Opened) -> None:
+def test_the_strip_opens_the_layers_under_a_slider(wide: Report) -> None:
     page = wide.page
-    page.locator('#filters [data-role="strong"]').click()
+    page.locator('#filters [data-kind="strong"]').click()
     assert page.locator("#strip li:visible").count() == 2
-    page.locator('#filters [data-role=""]').click()
-    page.locator('.card[data-frame="0"]').press("Enter")
+    page.locator('#filters [data-kind=""]').click()
+    page.locator('.card[data-opens="0"]').press("Enter")
     assert page.locator("#inspector").is_visible()
     assert page.locator("#inspector-title").inner_text() == f"Frame 0 · {HOSTILE[0]}"
     assert page.locator("#left").get_attribute("alt") == "Frame 0: As filmed"
@@ -207,13 +174,13 @@ def test_the_strip_opens_the_layers_under_a_slider(wide: Opened) -> None:
     assert not page.locator("#inspector").is_visible()
 
 
-def test_no_complaint_no_stranger_and_no_script_from_a_name(wide: Opened) -> None:
+def test_no_complaint_no_stranger_and_no_script_from_a_name(wide: Report) -> None:
     assert wide.complaints == []
-    assert [url for url in wide.requests if not url.startswith(ALLOWED)] == []
+    assert wide.strangers() == []
     assert wide.page.evaluate("window.hacked") is None
 
 
-def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Opened) -> None:
+def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Report) -> None:
     assert phone.page.evaluate("document.documentElement.scrollWidth") == 390
     assert phone.page.locator("#stage").get_attribute("data-mode") == "wipe"
     phone.page.locator("#wipe").fill("20")
@@ -223,7 +190,7 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Opened) -> None:
     assert phone.complaints == []
 
 
-def test_dark_and_light_keep_their_contrast(wide: Opened, phone: Opened) -> None:
+def test_dark_and_light_keep_their_contrast(wide: Report, phone: Report) -> None:
     """WCAG AA, 4.5, for text on the page and on its cards, and 3 for the faint notes."""
     script = """() => {
         const probe = document.body.appendChild(document.createElement('i'));
@@ -252,7 +219,7 @@ def luminance(rgb: list[float]) -> float:
 def test_without_webgl_the_stills_stay(browser: Any, run: FinishedRun) -> None:
     page = browser.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    opened = Opened(page, (run.folder / "report/index.html").as_uri())
+    opened = Report(page, (run.folder / "report/index.html").as_uri())
     page.evaluate("document.querySelector('#stage').scrollIntoView()")
     page.wait_for_function("document.documentElement.dataset.stage === 'failed'")
     assert "not available" in page.locator("#status").inner_text()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from OpenImageIO import HALF, ImageBuf
 from tiny_capture import (
     MASKED_FRAME,
     ROLES,
@@ -100,6 +101,8 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
         assert exr.attributes["cleargs:frame"] == row.frame_id
         assert exr.attributes["cleargs:round"] == row.round
         assert exr.attributes["cleargs:chosen"] == row.chosen
+        plain = ImageBuf(str(context.out / row.exr)).get_pixels(HALF)[..., :3]
+        np.testing.assert_array_equal(plain, exr.layers[row.chosen])  # what ordinary programs show
         assert exr.attributes["cleargs:primary_fused"] == row.primary_fused
         images = {name: from_layer(layer) for name, layer in exr.layers.items()}
         fused = fuse(images["render"], images["restored"], 2.0)

@@ -1,0 +1,77 @@
+"""What the pages have in common: templates, JSON for their scripts, and folders that appear whole."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import cleargs
+from cleargs.evaluate.tables import Bold
+from cleargs.files import PARTIAL_SUFFIX, disk_error
+from cleargs.pipeline.manifest import plain_json
+from cleargs.report.charts import weight_colour
+from cleargs.report.record import FOLDER, PAGE
+
+
+def write_page(folder: Path, template: str, **values: Any) -> None:
+    """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
+    html = _environment().get_template(template).render(version=cleargs.__version__, **values)
+    (folder / PAGE).write_bytes(html.encode())
+
+
+@contextmanager
+def new_report(parent: Path) -> Iterator[Path]:
+    """A folder to fill, which then becomes ``parent/report`` as a whole, in place of an older one.
+
+    Raises StoreError when it cannot be written.
+    """
+    folder = parent / f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{FOLDER}"
+    try:
+        folder.mkdir()
+        yield folder
+        old = folder.with_name(f"{folder.name}.old")
+        if (parent / FOLDER).exists():
+            (parent / FOLDER).rename(old)
+        folder.rename(parent / FOLDER)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise disk_error(error, parent / FOLDER) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def json_in_html(value: Any) -> Markup:
+    """``value`` as JSON that is inert inside a script element, whatever its strings hold."""
+    text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
+    for letter in "<>&":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("cleargs.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["json"] = json_in_html
+    environment.tests["bold"] = lambda text: isinstance(text, Bold)
+    environment.globals["static"] = _static
+    environment.globals["weight_colour"] = weight_colour
+    return environment
+
+
+def _static(name: str) -> Markup:
+    """A style sheet or script of ours, to stand in the page as it is."""
+    return Markup(files("cleargs.report").joinpath("static", name).read_text(encoding="utf-8"))

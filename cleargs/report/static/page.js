@@ -1,0 +1,40 @@
+// What all pages do: copying, and filters of what stands below them.
+"use strict";
+const one = (selector, root = document) => root.querySelector(selector);
+const all = (selector, root = document) => [...root.querySelectorAll(selector)];
+
+const make = (tag, text, className) => {
+  const element = document.createElement(tag);
+  if (text !== undefined) element.textContent = text;
+  if (className) element.className = className;
+  return element;
+};
+
+// -- copying ------------------------------------------------------------------------------------------------
+const copy = async (text) => {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch { // browsers that keep the clipboard from pages on a disk
+    const area = document.body.appendChild(make("textarea"));
+    area.value = text;
+    area.select();
+    document.execCommand("copy");
+    area.remove();
+  }
+};
+for (const button of all("[data-copy]")) {
+  button.addEventListener("click", async () => {
+    await copy(button.dataset.copy);
+    const before = button.textContent;
+    button.textContent = "Copied";
+    setTimeout(() => { button.textContent = before; }, 1200);
+  });
+}
+
+// -- filters -----------------------------------------------------------------------------------------------
+for (const pill of all("#filters button")) {
+  pill.addEventListener("click", () => {
+    for (const other of all("#filters button")) other.setAttribute("aria-pressed", String(other === pill));
+    for (const item of all("#strip li")) item.hidden = pill.dataset.kind !== "" && item.dataset.kind !== pill.dataset.kind;
+  });
+}

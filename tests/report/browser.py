@@ -1,0 +1,49 @@
+"""Pages in a real browser, from the disk: Debian's Chromium, WebGL in software."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+CHROMIUM = shutil.which("chromium")
+NO_CHROMIUM = "there is no chromium (apt-get install chromium)"
+
+PATIENCE_MS = 240_000  # software WebGL on a busy machine
+ALLOWED = ("file:", "data:", "blob:")
+FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """The browser."""
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+class Opened:
+    """A page in the browser, and all that it complained about or asked for."""
+
+    def __init__(self, page: Any, address: str) -> None:
+        self.page = page
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("console", self._heard)
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.goto(address)
+
+    def _heard(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.complaints.append(message.text)
+
+    def strangers(self) -> list[str]:
+        """What the page asked for that does not lie beside it."""
+        return [url for url in self.requests if not url.startswith(ALLOWED)]
