@@ -144,6 +144,8 @@ def render(
     from cleargs.splat.ply import read_ply
 
     reporter = make_reporter(quiet)
+    if warning:
+        reporter.warn(warning)
     on = resolve_device(device, reporter.info)
     set_threads(threads_or_all(threads))
     capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)
@@ -152,8 +154,6 @@ def render(
     scene = read_ply(run / stage / "scene.ply")
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
         write_shots(output, scene, shots, task, fps=fps, codec=codec, device=on)
-    if warning:
-        reporter.warn(warning)
     camera = shots[0].camera
     width = camera.width * (2 if side_by_side else 1)
     if as_json:

@@ -23,7 +23,7 @@ Size = tuple[int, int]
 class CaptureShots:
     """Makes shots from the frames in ``ingest``, which have a pose.
 
-    Pictures are of ``size``, or where that is None of the frames' size, an odd width or height less by one
+    Pictures are of ``size``, or where that is None of the frames' size, an odd width or height one larger
     where ``even``. Raises InputError when no frame has a pose.
     """
 
@@ -72,7 +72,7 @@ class CaptureShots:
         """All of one size, each with the frame beside it where that is asked for."""
         width, height = self._size or (cameras[0].width, cameras[0].height)
         if self._size is None and self._even:
-            width, height = max(2, width - width % 2), max(2, height - height % 2)
+            width, height = width + width % 2, height + height % 2
         if width * height > MAX_PIXELS:
             raise InputError(f"{width}x{height} pixels are too many", hint="give a smaller --size")
         images = [self._ingest / frame.image for frame in filmed] if self._beside else [None] * len(cameras)
