@@ -30,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "cleargs.cli.report",
         "Write a page that shows a run: the scene in 3D, and every frame.",
     ),
+    "watch": ("cleargs.cli.watch", "Show a run in the browser while it is at work, then its report."),
     "render": ("cleargs.cli.render", "Render the scene: stills, and films along a path."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),

@@ -68,8 +68,8 @@ def test_a_still_of_another_size(run: Path, tmp_path: Path) -> None:
     wide = read_rgb(tmp_path / "wide.png")
     assert wide.shape == (2 * HEIGHT, 3 * WIDTH, 3)
     middle = wide[:, WIDTH // 2 : -WIDTH // 2].reshape(HEIGHT, 2, WIDTH, 2, 3).mean(axis=(1, 3))
-    # Splats are widened by a third of a pixel, so that the larger picture is a little sharper: 0.3 levels, against
-    # 29 and more to the view of another frame.
+    # Splats are widened by a third of a pixel, so that the larger picture is a little sharper: 0.3 levels;
+    # the views of other frames are 29 and more away.
     assert np.abs(middle - picture(make_scene(), cameras()[2])).mean() < 1
 
 
@@ -103,8 +103,8 @@ def test_a_film_has_the_length_the_pace_and_the_size(run: Path, tmp_path: Path, 
     timeline, pictures = read_timeline(tmp_path / "film.mp4"), film(tmp_path / "film.mp4")
     assert len(pictures) == 18 and pictures[0].shape == (96, 128, 3)
     assert timeline.seconds(17) == pytest.approx(17 / 12)
-    # It begins at the first pose and ends at the last. The codec takes up to 1.7 levels; the next frame's view is
-    # 25 away, the next picture of the film 10.
+    # It begins at the first pose and ends at the last. The codec takes up to 1.7 levels; the next frame's
+    # view is 25 away, the next picture of the film 10.
     for shown, number in ((pictures[0], 0), (pictures[-1], 5)):
         assert render(run, tmp_path / f"{number}.png", "--frame", str(number), "--size", "128x96") == 0
         assert np.abs(shown.astype(float) - read_rgb(tmp_path / f"{number}.png")).mean() < 4
