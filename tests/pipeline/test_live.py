@@ -11,13 +11,14 @@ import pytest
 from test_interruption import start, wait_for
 from toy import Bench
 
+from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
 from cleargs.pipeline import live
 from cleargs.pipeline.live import NOTE, AtWork, at_work, noted, preview_of
 from cleargs.progress import SilentReporter
 
 
-def test_a_run_at_work_says_so_until_it_ends(bench: Bench) -> None:
+def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     hold = bench.root / "hold"
     hold.touch()
     assert at_work(bench.folder, bench.store) is None
@@ -34,6 +35,9 @@ def test_a_run_at_work_says_so_until_it_ends(bench: Bench) -> None:
     (work / "checkpoints" / "elsewhere" / "preview.png").symlink_to("/etc/passwd")
     preview = preview_of(found, bench.store)
     assert preview is not None and preview.read_bytes() == b"new"
+    assert invoke(["show", str(bench.folder)], bench.dag) == 0
+    said = capsys.readouterr().out
+    assert "square is at work: square" in said and f"preview: {preview}" in said
     hold.unlink()
     assert process.wait(60) == 0
     assert at_work(bench.folder, bench.store) is None and not (bench.folder / NOTE).exists()
