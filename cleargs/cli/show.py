@@ -214,7 +214,7 @@ def _print_work(run: Run) -> None:
     console, preview = _console(), preview_of(found, run.store)
     console.print(f"\n{found.stage} is at work: {words}", markup=False)
     if preview is not None:
-        console.print(f"preview: {preview}", markup=False, soft_wrap=True)
+        console.print(f"preview: {preview.path}", markup=False, soft_wrap=True)
 
 
 def _print_facts(console: Console, manifest: Manifest, stale: Reasons | None) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from cleargs.errors import StoreError
 from cleargs.files import write_json
@@ -56,14 +57,22 @@ def at_work(run: Path, store: Path) -> AtWork | None:
     return found if sound and writer_lives(store / "work" / found.work) else None
 
 
-def preview_of(found: AtWork, store: Path) -> Path | None:
+class Preview(NamedTuple):
+    """A picture of the work so far."""
+
+    version: int
+    """Grows with every new one: the time stamp, ns."""
+    path: Path
+
+
+def preview_of(found: AtWork, store: Path) -> Preview | None:
     """The youngest preview that the stage at work left; None where there is none."""
-    youngest: tuple[int, Path] | None = None
+    previews = []
     for path in (store / "work" / found.work / "checkpoints").rglob(PREVIEW):
         with suppress(OSError):  # replaced or removed meanwhile
             if path.is_file() and not path.is_symlink():
-                youngest = max(youngest or (0, path), (path.stat().st_mtime_ns, path))
-    return None if youngest is None else youngest[1]
+                previews.append(Preview(path.stat().st_mtime_ns, path))
+    return max(previews, default=None)
 
 
 @contextmanager

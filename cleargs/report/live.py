@@ -42,7 +42,7 @@ class Watched:
             "name": self.folder.name,
             "now": None if found is None else _now(found),
             "stages": stages,
-            "preview": None if picture is None else str(picture.stat().st_mtime_ns),
+            "preview": None if picture is None else str(picture.version),
             "report": page_of(self.folder).is_file(),
             "done": found is None and is_current(self.folder, manifests),
         }
@@ -50,7 +50,8 @@ class Watched:
     def preview(self) -> Path | None:
         """The youngest preview; None where there is none."""
         found = self._at_work()
-        return None if found is None else preview_of(found, self._run.store)
+        picture = None if found is None else preview_of(found, self._run.store)
+        return None if picture is None else picture.path
 
     def _at_work(self) -> AtWork | None:
         return at_work(self._run.folder, self._run.store)

@@ -75,9 +75,10 @@ class Server(ThreadingHTTPServer):
         return f"http://{name}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader that went away is no error."""
-        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
-            super().handle_error(request, client_address)
+        """One line for what went wrong; a reader that went away is no error."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            print(f"warning: a request failed: {error!r}", file=sys.stderr)
 
 
 class _Handler(BaseHTTPRequestHandler):

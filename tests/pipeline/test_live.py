@@ -34,10 +34,10 @@ def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.Captur
     (work / "checkpoints" / "elsewhere").mkdir()
     (work / "checkpoints" / "elsewhere" / "preview.png").symlink_to("/etc/passwd")
     preview = preview_of(found, bench.store)
-    assert preview is not None and preview.read_bytes() == b"new"
+    assert preview is not None and preview.path.read_bytes() == b"new"
     assert invoke(["show", str(bench.folder)], bench.dag) == 0
     said = capsys.readouterr().out
-    assert "square is at work: square" in said and f"preview: {preview}" in said
+    assert "square is at work: square" in said and f"preview: {preview.path}" in said
     hold.unlink()
     assert process.wait(60) == 0
     assert at_work(bench.folder, bench.store) is None and not (bench.folder / NOTE).exists()

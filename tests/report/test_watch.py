@@ -10,25 +10,18 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 from report_run import FinishedRun, camera, wall
+from watched import reported, serving, working
 
 from cleargs.errors import InputError
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.lease import lease
-from cleargs.pipeline.live import noted
-from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.store import Store
-from cleargs.progress import PREVIEW, SilentReporter
+from cleargs.progress import PREVIEW
 from cleargs.report.live import Watched
-from cleargs.report.page import write_report
 from cleargs.report.scene import Renderer
 from cleargs.report.serve import Server
 from cleargs.splat.preview import write_preview
@@ -43,26 +36,7 @@ class Answer:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    """A run with its report."""
-    made = FinishedRun(tmp_path_factory.mktemp("watch"))
-    root = made.folder / ".store"
-    root.mkdir()
-    with DigestMemo(root / "digests.sqlite") as memo:
-        write_report(made.planner(Store(root, memo)))
-    return made
-
-
-@contextmanager
-def serving(made: FinishedRun, host: str = "127.0.0.1") -> Iterator[int]:
-    """The port at which the run is served."""
-    with Server(Watched(made.dag, made.run), host, 0) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield int(server.server_address[1])
-        finally:
-            server.shutdown()
-            thread.join()
+    return reported(tmp_path_factory.mktemp("watch"))
 
 
 @pytest.fixture(scope="module")
@@ -84,18 +58,6 @@ def ask(port: int, path: str, method: str = "GET", headers: dict[str, str] | Non
     return found
 
 
-@contextmanager
-def working(made: FinishedRun, run: Run, stage: str) -> Iterator[Path]:
-    """A writer of ``stage`` at work; yields its checkpoints."""
-    work = run.store / "work" / "key@me"
-    (work / "checkpoints" / "round_01").mkdir(parents=True)
-    try:
-        with lease(run.store / "leases" / "me.json"), noted(SilentReporter(), run.folder, stage, work):
-            yield work / "checkpoints"
-    finally:
-        shutil.rmtree(work)
-
-
 # -- what it shows -----------------------------------------------------------------------------------------
 
 
@@ -114,7 +76,7 @@ def test_a_finished_run_is_its_report(finished: FinishedRun, port: int) -> None:
 
 def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun, port: int) -> None:
     assert ask(port, "/preview.png").status == 404
-    with working(finished, finished.run, "rivr") as checkpoints:
+    with working(finished, "rivr") as (_, checkpoints):
         page = ask(port, "/")
         assert page.status == 200 and b"/live.js" in page.body
         state = json.loads(ask(port, "/state.json").body)
