@@ -67,7 +67,6 @@ def write_view(
     image: Image,
     alpha: NDArray[np.float32],  # [H, W]
     depth: NDArray[np.float32],  # [H, W] along the optical axis
-    attributes: Mapping[str, Attribute],
 ) -> None:
     """Write one picture over black as the channels R, G, B, A (half) and Z (float), atomically.
 
@@ -75,7 +74,7 @@ def write_view(
     """
     layer = to_layer(image).astype(np.float32)
     pixels = np.concatenate([layer, alpha[..., None], depth[..., None]], axis=2)
-    _write(path, pixels, (*_CHANNELS, "A", "Z"), (HALF, HALF, HALF, HALF, FLOAT), attributes)
+    _write(path, pixels, (*_CHANNELS, "A", "Z"), (HALF, HALF, HALF, HALF, FLOAT), {})
 
 
 def _write(

@@ -65,7 +65,7 @@ class Photographer:
         assert render.depth is not None
         image, alpha, depth = (layer.cpu().numpy() for layer in (render.image, render.alpha, render.depth))
         depth = np.where(alpha >= _OPAQUE, depth / np.maximum(alpha, _OPAQUE), 0.0).astype(np.float32)
-        write_view(path, image, alpha, depth, {})
+        write_view(path, image, alpha, depth)
 
     def _render(self, camera: Camera, background: tuple[float, float, float], depth: bool = False) -> Render:
         scene = self._scene
@@ -116,13 +116,14 @@ def write_shots(
             f"{len(shots)} pictures do not fit into {output.name}",
             hint=f"number them (FOLDER/%04d{output.suffix}), or write a film (.mp4)",
         )
+    if kind == "film":
+        require_even(camera.width, camera.height)
     photographer = Photographer(scene, device)
     try:
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(error, output) from error
     if kind == "film":
-        require_even(camera.width, camera.height)
         write_video(output, _each(photographer, shots, task), fps, codec=codec)
     elif kind == "still":
         _write_still(output, photographer, shots[0])
@@ -148,8 +149,8 @@ def _write_folder(output: Path, photographer: Photographer, shots: Sequence[Shot
     """The stills in a folder beside its place, renamed when all are there."""
     folder = output.parent
     temporary = folder.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{folder.name}")
-    pattern = _NUMBER.split(output.name), _NUMBER.findall(output.name)[0]
-    names = [(pattern[1] % number).join(pattern[0]) for number in range(len(shots))]
+    (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
+    names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
     try:
         temporary.mkdir()
         for name, shot in zip(names, shots, strict=True):

@@ -217,7 +217,7 @@ def test_the_ending_says_what_is_written() -> None:
         ("a.png", ["--frame", "99"], "frame 99 is not in this capture"),
         ("a.png", ["--frame", "1", "--turntable"], "give one of them"),
         ("a.png", ["--turntable"], "pictures do not fit into a.png"),
-        ("a.mp4", ["--size", "95x54"], "even width"),
+        ("new/a.mp4", ["--size", "95x54"], "even width"),
         ("a.mp4", ["--size", "wide"], "WIDTHxHEIGHT"),
         ("a.mp4", ["--turntable", "--side-by-side"], "follow the path"),
         ("a.exr", ["--frame", "1", "--side-by-side"], "films and PNGs"),
