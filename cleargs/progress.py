@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
+
+PREVIEW = "preview.png"
+"""A picture of the work so far, which a stage may leave among its checkpoints."""
 
 
 class Task(Protocol):
@@ -28,6 +32,27 @@ class Reporter(Protocol):
 
     def warn(self, text: str) -> None:
         """Something the user should look at, although the work goes on."""
+
+
+class Pace:
+    """The time that a task of ``total`` steps will still take, by its pace since the first step was done.
+
+    What comes before that step (compiling kernels, reading a checkpoint) says nothing of those to come.
+    """
+
+    def __init__(self, total: int | None) -> None:
+        self._total = total
+        self._first: tuple[float, int] | None = None
+
+    def seconds_left(self, done: int) -> float | None:
+        """To be asked whenever ``done`` grows; None while there is nothing to go by."""
+        now = time.monotonic()
+        if self._first is None and done:
+            self._first = now, done
+        begin, first = self._first or (now, done)
+        if not self._total or done <= first:
+            return None
+        return (now - begin) * (self._total - done) / (done - first)
 
 
 class SilentTask:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,23 @@ class Similarity:
             "rotation": self.rotation.T.tolist(),
             "translation": self.origin.tolist(),
         }
+
+    @staticmethod
+    def from_json(noted: Any, ingest: Path) -> Similarity:
+        """What `to_json` noted, as the manifest of the finished folder ``ingest`` holds it.
+
+        Raises InputError when it does not.
+        """
+        try:
+            return Similarity(
+                np.array(noted["rotation"], np.float64).T,
+                np.array(noted["translation"], np.float64),
+                float(noted["scale"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{ingest} does not say how it was normalised", hint="run that stage with --force"
+            ) from error
 
 
 def normalise(poses: Sequence[Pose]) -> Similarity:

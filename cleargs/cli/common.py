@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -14,11 +15,15 @@ from typing import Any, Literal, TypeVar
 import click
 
 from cleargs.errors import InputError
+from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.store import Store
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+SCENE = "scene.ply"
+"""What a stage that trains leaves."""
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
@@ -39,6 +44,33 @@ stale_option = click.option(
     "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
 )
 run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
+
+
+def parse_size(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[int, int] | None:
+    """The callback of an option for a size of pictures; None where it is not given."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", value)
+    if not match or not all(16 <= int(side) <= 8192 for side in match.groups()):
+        raise click.BadParameter("write WIDTHxHEIGHT in pixels, 480x270 say (16 to 8192 a side)")
+    return int(match[1]), int(match[2])
+
+
+def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
+    """The stage whose scene to take: ``chosen``, or the last that has one.
+
+    Raises InputError when there is no such scene.
+    """
+    done = [name for name in dag.names if (run / name / SCENE).is_file()]
+    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
+    if stage is None:
+        raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
+    if stage not in done:
+        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs explain {run}"
+        raise InputError(f"{stage} has no scene in {run}", hint=there)
+    return stage
 
 
 def work_options(command: F) -> F:

@@ -7,14 +7,12 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import run_argument, stale_option
+from cleargs.cli.common import SCENE, run_argument, scene_stage, stale_option
 from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
-
-SCENE = "scene.ply"
 
 
 @click.command(
@@ -69,13 +67,7 @@ def export(
     for file in (output, cameras):
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
-    done = [name for name in dag.names if (run / name / SCENE).is_file()]
-    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
-    if stage is None:
-        raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
-    if stage not in done:
-        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs explain {run}"
-        raise InputError(f"{stage} has no scene in {run}", hint=there)
+    stage = scene_stage(dag, run, chosen)
     warning = require_fresh(dag, run, (stage,), stale=stale)
     similarity = _similarity(run, dag.names[0]) if world == "input" else {}
     from cleargs.capture.tables import load_frames

@@ -30,6 +30,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "cleargs.cli.report",
         "Write a page that shows a run: the scene in 3D, and every frame.",
     ),
+    "watch": ("cleargs.cli.watch", "Show a run in the browser while it is at work, then its report."),
+    "render": ("cleargs.cli.render", "Render the scene: stills, and films along a path."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
@@ -55,6 +57,7 @@ Examples:
   cleargs explain room                       what the same command would do again, and why
   cleargs settings g0                        what a stage can be told
   cleargs report room                        a page to look at: room/report/index.html
+  cleargs render room -o room.mp4            a film along the capture's path
   cleargs export room -o room.compressed.ply
 
 \b

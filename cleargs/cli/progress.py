@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cleargs.progress import Reporter, SilentTask, Task
+from cleargs.progress import Pace, Reporter, SilentTask, Task
 from cleargs.text import printable
 
 if TYPE_CHECKING:
@@ -58,11 +58,7 @@ class LineReporter(QuietReporter):
 
 
 class LineTask:
-    """Counted work that says every few seconds how far it is.
-
-    The time left is told from the pace since the first step was done: what comes before it (compiling
-    kernels, reading a checkpoint) says nothing of those to come.
-    """
+    """Counted work that says every few seconds how far it is."""
 
     def __init__(self, label: str, total: int | None) -> None:
         self.label = label
@@ -70,7 +66,7 @@ class LineTask:
         self.done = 0
         self.note = ""
         self._said = time.monotonic()
-        self._first: tuple[float, int] | None = None
+        self._pace = Pace(total)
 
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
@@ -78,20 +74,17 @@ class LineTask:
     def update(self, *, done: int | None = None, note: str | None = None) -> None:
         self.done = self.done if done is None else done
         self.note = self.note if note is None else printable(note)
-        now = time.monotonic()
-        if self._first is None and self.done:
-            self._first = now, self.done
+        now, left = time.monotonic(), self._pace.seconds_left(self.done)
         if now - self._said >= LINE_EVERY:
             self._said = now
-            click.echo(self._text(now), err=True)
+            click.echo(self._text(left), err=True)
 
-    def _text(self, now: float) -> str:
+    def _text(self, left: float | None) -> str:
         words = [f"{self.label}: {self.done}" + (f"/{self.total}" if self.total else "")]
         if self.note:
             words.append(self.note)
-        begin, first = self._first or (now, self.done)
-        if self.total and self.done > first:
-            words.append(f"{(now - begin) * (self.total - self.done) / (self.done - first):.0f} s left")
+        if left is not None:
+            words.append(f"{left:.0f} s left")
         return ", ".join(words)
 
 

@@ -15,8 +15,9 @@ from cleargs.cli.words import headlines, in_words, text_of
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import Reasons, require_fresh, stale_stages
+from cleargs.pipeline.live import at_work, preview_of
 from cleargs.pipeline.manifest import Manifest, linked_manifest
-from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.run_file import Run, read_run_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -93,13 +94,15 @@ def show(
     if frame is not None:
         _show_frame(dag, run, frame, output or run / f"frame-{frame:06d}.png", stale, as_json)
         return
-    old = stale_stages(dag, read_run_file(run, dag))
+    settings = read_run_file(run, dag)
+    old = stale_stages(dag, settings)
     if stage is None:
         manifests = {name: linked_manifest(run, name) for name in dag.names}
         if as_json:
             print_json({name: _facts(manifest, old.get(name)) for name, manifest in manifests.items()})
         else:
             _print_run(manifests, old)
+            _print_work(settings)
         return
     dag.check(stage)
     manifest = linked_manifest(run, stage)
@@ -243,6 +246,19 @@ def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons])
     console.print(table)
     for name, reasons in stale.items():
         console.print(f"{name} is stale: {'; '.join(reasons)}", markup=False)
+
+
+def _print_work(run: Run) -> None:
+    """What the run does now, and where the picture of it lies."""
+    found = at_work(run.folder, run.store)
+    if found is None:
+        return
+    count = f"{found.done} of {found.total}" if found.total else str(found.done or "")
+    words = ", ".join(filter(None, (found.label, count, found.note)))
+    console, preview = _console(), preview_of(found, run.store)
+    console.print(f"\n{found.stage} is at work: {words}", markup=False)
+    if preview is not None:
+        console.print(f"preview: {preview.path}", markup=False, soft_wrap=True)
 
 
 def _print_facts(console: Console, manifest: Manifest, stale: Reasons | None) -> None:

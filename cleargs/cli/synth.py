@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import click
 
-from cleargs.cli.common import json_option, print_json
+from cleargs.cli.common import json_option, parse_size, print_json
 from cleargs.cli.progress import make_reporter
 
 PROTOCOL_HELP = (
     "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
     "gsotm-mb-rs, gsotm-pn, phone."
 )
-
-
-def _size(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)x(\d+)", value)
-    if not match or not all(16 <= int(side) <= 8192 for side in match.groups()):
-        raise click.BadParameter("write WIDTHxHEIGHT in pixels, 480x270 say (16 to 8192 a side)")
-    return int(match[1]), int(match[2])
 
 
 @click.command(
@@ -38,7 +30,7 @@ Example:
 @click.option(
     "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
 )
-@click.option("--size", default="480x270", show_default=True, callback=_size, help="Image size.")
+@click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another room and walk.")
 @click.option(
     "--scene",

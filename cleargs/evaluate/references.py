@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -108,7 +108,7 @@ def reference_of(
             listed if align is None else _listed(align), own, run_folder, align or directory, reporter
         )
     else:
-        similarity = _similarity(manifest.summary.get("similarity"), ingest)
+        similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
     views = [_view(stem, image, similarity.pose(_pose(image))) for stem, image in listed.items()]
     return _reference(directory, views, poses, alignment)
@@ -288,20 +288,6 @@ def _load(
 
 
 # -- worlds ------------------------------------------------------------------------------------------------
-
-
-def _similarity(noted: Any, ingest: Path) -> Similarity:
-    """From the input's world to the normalised one, as ingest noted it (the way back)."""
-    try:
-        return Similarity(
-            np.array(noted["rotation"], np.float64).T,
-            np.array(noted["translation"], np.float64),
-            float(noted["scale"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{ingest} does not say how it was normalised", hint="run that stage with --force"
-        ) from error
 
 
 def _aligned(

@@ -1,23 +1,32 @@
-"""Frames to an H.264 video, through PyAV."""
+"""Frames to an MP4 video (H.264 or AV1), through PyAV."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
+from typing import Literal
 
 import av
 import numpy as np
 from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.media.colour import LUMA
 
+Codec = Literal["h264", "av1"]
+
 _BT709, _LIMITED = 1, 1
-_CRF = "12"
-"""x264's constant rate factor: no visible loss."""
+_ENCODERS: Mapping[Codec, tuple[str, Mapping[str, str]]] = {
+    "h264": ("libx264", {"preset": "medium", "crf": "12"}),
+    "av1": ("libsvtav1", {"preset": "8", "crf": "20"}),
+}
+"""Encoder and its settings: constant quality, no visible loss."""
 _AS_IT_COMES = "threads=1:mbtree=0:rc-lookahead=0:bframes=0"
 """Each frame is coded as it comes, as a phone does. With look-ahead at a held rate x264 gave other bytes from
 call to call, one thread or not."""
@@ -33,39 +42,57 @@ def require_even(width: int, height: int) -> None:
 
 def write_video(
     path: Path,
-    frames: Sequence[NDArray[np.uint8]],  # [H, W, 3] sRGB each
+    frames: Iterable[NDArray[np.uint8]],  # [H, W, 3] sRGB each
     fps: float,
     bits_per_pixel: float | None = None,
+    *,
+    codec: Codec = "h264",
 ) -> None:
-    """Write ``frames`` as an MP4: H.264, 4:2:0, BT.709, limited range, ``fps`` frames a second.
+    """Write ``frames`` (at least one, taken one by one) as an MP4: 4:2:0, BT.709, limited range, ``fps``
+    frames a second.
 
-    Without visible loss, or at ``bits_per_pixel`` bits a pixel of each frame, held over a second, by one
-    thread, so that equal frames give equal bytes.
+    Without visible loss, or in H.264 at ``bits_per_pixel`` bits a pixel of each frame, held over a second, by
+    one thread, so that equal frames give equal bytes.
 
-    Raises InputError like `require_even`, StoreError when the disk is full or not writable.
+    Raises InputError like `require_even` and where this PyAV has no such encoder, StoreError when the disk is
+    full or not writable.
     """
-    height, width = frames[0].shape[:2]
+    _require_encoder(codec)
+    frames = iter(frames)
+    first = next(frames)
+    height, width = first.shape[:2]
     require_even(width, height)
     rate = Fraction(fps).limit_denominator(1001)
     with atomic_path(path) as temporary, av.open(temporary, "w") as container:
-        options = {"preset": "medium"}
-        if bits_per_pixel is None:
-            options["crf"] = _CRF
-        else:
+        encoder, options = _ENCODERS[codec][0], dict(_ENCODERS[codec][1])
+        if bits_per_pixel is not None:
+            del options["crf"]
             bits = str(round(bits_per_pixel * width * height * fps))
             options |= {"b": bits, "maxrate": bits, "bufsize": bits, "x264-params": _AS_IT_COMES}
-        stream = container.add_stream("libx264", rate=rate, options=options)
+        stream = container.add_stream(encoder, rate=rate, options=options)
+        assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = _BT709
         context.color_range = _LIMITED
-        for number, rgb in enumerate(frames):
+        for number, rgb in enumerate(chain([first], frames)):
             frame = _planar(rgb).reformat(
                 format="yuv420p", src_color_range=_LIMITED, dst_color_range=_LIMITED, interpolation="BICUBIC"
             )
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def _require_encoder(codec: Codec) -> None:
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 tells all its settings on stderr
+    try:
+        av.codec.Codec(_ENCODERS[codec][0], "w")
+    except av.codec.codec.UnknownCodecError:
+        raise InputError(
+            f"this PyAV is built without {_ENCODERS[codec][0]}",
+            hint="choose another --codec, or install the wheel of PyAV (pip install --force-reinstall av)",
+        ) from None
 
 
 def _planar(rgb: NDArray[np.uint8]) -> VideoFrame:

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from OpenImageIO import HALF, ImageInput, ImageOutput, ImageSpec, geterror
+from OpenImageIO import FLOAT, HALF, ImageInput, ImageOutput, ImageSpec, geterror
 
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path
@@ -58,14 +58,42 @@ def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> N
     """
     plain = [] if shown is None else [image.layers[shown]]
     pixels = np.concatenate([*plain, *image.layers.values()], axis=2)
-    height, width, channels = pixels.shape
-    spec = ImageSpec(width, height, channels, HALF)
     layered = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
-    spec.channelnames = (*_CHANNELS[: 3 * len(plain)], *layered)
+    _write(path, pixels, (*_CHANNELS[: 3 * len(plain)], *layered), (), image.attributes)
+
+
+def write_view(
+    path: Path,
+    image: Image,
+    alpha: NDArray[np.float32],  # [H, W]
+    depth: NDArray[np.float32],  # [H, W] along the optical axis
+) -> None:
+    """Write one picture over black as the channels R, G, B, A (half) and Z (float), atomically.
+
+    Raises StoreError when the disk is full or not writable.
+    """
+    layer = to_layer(image).astype(np.float32)
+    pixels = np.concatenate([layer, alpha[..., None], depth[..., None]], axis=2)
+    _write(path, pixels, (*_CHANNELS, "A", "Z"), (HALF, HALF, HALF, HALF, FLOAT), {})
+
+
+def _write(
+    path: Path,
+    pixels: NDArray[Any],  # [H, W, C]
+    channels: tuple[str, ...],
+    formats: tuple[Any, ...],
+    attributes: Mapping[str, Attribute],
+) -> None:
+    """Write ``pixels``; ``formats`` are those of the channels, empty where all are half floats."""
+    height, width, count = pixels.shape
+    spec = ImageSpec(width, height, count, HALF)
+    spec.channelnames = channels
+    if formats:
+        spec.channelformats = formats
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", "lin_rec709")
     spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
-    for name, value in image.attributes.items():
+    for name, value in attributes.items():
         spec.attribute(name, value)
     with atomic_path(path) as temporary:
         output = ImageOutput.create(str(temporary))

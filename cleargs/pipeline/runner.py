@@ -13,6 +13,7 @@ from typing import Literal
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import file_digest, tree_digest
+from cleargs.pipeline.live import noted
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.manifest import (
     FileRecord,
@@ -207,7 +208,8 @@ class Runner:
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:
-            result = stage.run(context)
+            with noted(self.reporter, self.run.folder, name, work.folder) as reporter:
+                result = stage.run(replace(context, reporter=reporter))
         except BaseException:  # an interruption too: what it had done counts when it goes on
             work.note_seconds(earlier + time.monotonic() - clock)
             raise

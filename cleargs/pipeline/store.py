@@ -395,6 +395,12 @@ def last_saved(root: Path, pid: int) -> int:
     return youngest
 
 
+def writer_lives(work: Path) -> bool:
+    """Whether somebody is at work in the work folder ``work``."""
+    lease_of = work.parent.parent / "leases" / f"{work.name.partition('@')[2]}.json"
+    return work.is_dir() and living_holder(lease_of) is not None
+
+
 def _process_name(host: str, pid: int) -> str:
     """How the name of a writer begins."""
     return f"{host}-{pid}-"

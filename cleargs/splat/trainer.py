@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cleargs.errors import InputError, StageError
-from cleargs.progress import Reporter, Task
+from cleargs.progress import PREVIEW, Reporter, Task
 from cleargs.splat import strategy
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
@@ -33,6 +33,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.optimiser import Moments, Rates, step_gaussians
+from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog
@@ -82,7 +83,7 @@ def train(
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
     otherwise with what the formation makes of it, which goes on learning in place. A share ``pseudo_share``
     of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Goes on from
-    ``checkpoint`` where there is one, to the same result bit for bit.
+    ``checkpoint`` where there is one, to the same result bit for bit. Beside each checkpoint lies a preview.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
     loss ceases to be finite.
@@ -114,6 +115,7 @@ def train(
                 trainer.check_finite()
             if due:
                 save_state(checkpoint, trainer.state())
+                write_preview(checkpoint.with_name(PREVIEW), trainer.preview())
         trainer.check_finite()
         progress.show()
     state = {name: tensor.cpu() for name, tensor in trainer.state().items()}
@@ -208,6 +210,11 @@ class Trainer:
         self.done += 1
         if config.densify:
             self._densify()
+
+    def preview(self) -> Tensor:
+        """The scene so far [H, W, 3], at the view that counts most, reduced; valid until the next step."""
+        view = max(self._real or self._pseudo, key=lambda view: view.weight)
+        return self._render(preview_camera(view.camera), depth=False).image
 
     def check_finite(self) -> None:
         """Raise StageError, naming the step and the group, when a parameter is NaN or infinite."""

@@ -17,11 +17,14 @@ from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.colour import Exposure, centred
 from cleargs.formation.photograph import evaluate_views, photograph
-from cleargs.progress import SilentReporter
+from cleargs.media.image import read_rgb, to_uint8
+from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer
 from cleargs.splat.config import FormationConfig, TrainConfig
+from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.losses import PhotometricLoss, photometric_loss
+from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state
 from cleargs.splat.tables import TRAIN
@@ -278,6 +281,24 @@ def test_the_last_good_checkpoint_survives_not_a_number(
     assert saved is not None
     assert int(saved["step"]) == 14
     assert all(torch.isfinite(tensor.float()).all() for name, tensor in saved.items() if name != "log")
+
+
+def test_a_preview_beside_the_checkpoint_changes_no_bit(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is the view of the largest weight, as the scene at the checkpoint shows it."""
+    weighted = views(pictures, weights=[0.5, 0.5, 0.9, 0.5, 0.5, 0.5])
+    with_previews = run(weighted, tmp_path / "a")
+    shown = read_rgb(tmp_path / "a" / PREVIEW)
+    state = load_state(tmp_path / "a" / "state.safetensors", SilentReporter())
+    assert state is not None
+    kept = Gaussians(**{name: state[f"parameter.{name}"] for name in start().gaussians.tensors()})
+    expected = render(kept, weighted[2].camera, background=start().background).image
+    assert 20 < shown.mean() < 235
+    np.testing.assert_array_equal(shown, to_uint8(expected.detach().numpy()))
+
+    monkeypatch.setattr(Trainer, "preview", lambda trainer: torch.zeros(2, 2, 3))
+    assert_same(with_previews, run(weighted, tmp_path / "b"))
 
 
 def test_relocation_does_not_hide_not_a_number(

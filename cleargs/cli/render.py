@@ -1,0 +1,215 @@
+"""``cleargs render``: stills and films of a finished scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from cleargs.cli.common import (
+    DeviceChoice,
+    json_option,
+    parse_size,
+    print_json,
+    quiet_option,
+    resolve_device,
+    run_argument,
+    scene_stage,
+    stale_option,
+    threads_or_all,
+    work_options,
+)
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import InputError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.freshness import require_fresh
+
+if TYPE_CHECKING:
+    from cleargs.render.output import Kind, Shot
+    from cleargs.render.shots import CaptureShots
+
+SECONDS = 10.0
+"""Of a film, unless told otherwise."""
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs render room -o room.mp4                       along the capture's path, made smooth
+  cleargs render room -o room.mp4 --side-by-side        what was filmed on the left, the scene on the right
+  cleargs render room -o turn.mp4 --turntable --size 1920x1080 --seconds 8 --codec av1
+  cleargs render room -o still.png --frame 12           at the pose of frame 12
+  cleargs render room -o still.exr --frame 12           scene-linear RGB, alpha and depth
+  cleargs render room -o shots/%04d.exr --poses shots.json
+
+\b
+FILE.mp4 is a film, FILE.png and FILE.exr are stills, FOLDER/%04d.png and .exr numbered stills with their
+cameras.json. EXRs hold R, G, B, A over black and Z, the depth along the optical axis in the units of the run.
+--poses takes cameras.json as `cleargs export` writes it, and transforms.json as nerfstudio does: a picture
+for each pose.
+"""
+)
+@run_argument
+@click.option("--frame", type=click.IntRange(min=0), metavar="N", help="A still at the pose of this frame.")
+@click.option("--turntable", is_flag=True, help="A full turn around what the cameras look at.")
+@click.option(
+    "--poses",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE.json",
+    help="The poses of this file, a picture for each.",
+)
+@click.option(
+    "--world",
+    type=click.Choice(["normalised", "input"]),
+    help="Whose world the poses of --poses are in: the run's, or that of the capture's own poses.  [default: "
+    "normalised for cameras.json, input for transforms.json]",
+)
+@click.option("--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]")
+@click.option(
+    "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: that of the frames]"
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(1, 240),
+    default=30.0,
+    show_default=True,
+    help="Pictures a second.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0, min_open=True, max=36_000),
+    help=f"Length of the path or the turn.  [default: {SECONDS:g}]",
+)
+@click.option(
+    "--side-by-side",
+    is_flag=True,
+    help="The nearest frame of the capture on the left, along its path or at --frame: twice the width.",
+)
+@click.option(
+    "--codec",
+    type=click.Choice(["h264", "av1"]),
+    default="h264",
+    show_default=True,
+    help="Of a film: h264 plays everywhere, av1 takes less space.",
+)
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The new file; its ending says what to write: .mp4 .png .exr",
+)
+@click.option("--force", is_flag=True, help="Replace the file where it exists.")
+@stale_option
+@work_options
+@json_option
+@quiet_option
+@click.pass_obj
+def render(
+    dag: Dag,
+    run: Path,
+    frame: int | None,
+    turntable: bool,
+    poses: Path | None,
+    world: Literal["normalised", "input"] | None,
+    chosen: str | None,
+    size: tuple[int, int] | None,
+    fps: float,
+    seconds: float | None,
+    side_by_side: bool,
+    codec: Literal["h264", "av1"],
+    output: Path,
+    force: bool,
+    stale: bool,
+    device: DeviceChoice,
+    threads: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Render the scene of RUN: a film along the capture's path, a turntable, stills.
+
+    Without --frame, --turntable and --poses, a film and numbered stills follow the path of the capture, and
+    a still is taken in its middle.
+    """
+    _check_choices(frame, turntable, poses, world, seconds, side_by_side, output)
+    from cleargs.render.output import kind_of, require_free, write_shots
+
+    kind = kind_of(output)
+    require_free(output, force=force)
+    stage = scene_stage(dag, run, chosen)
+    warning = require_fresh(dag, run, (stage,), stale=stale)
+    from cleargs.render.shots import CaptureShots
+    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.ply import read_ply
+
+    reporter = make_reporter(quiet)
+    if warning:
+        reporter.warn(warning)
+    on = resolve_device(device, reporter.info)
+    set_threads(threads_or_all(threads))
+    capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)
+    count = max(2, round(fps * (seconds or SECONDS)))
+    shots = _shots(capture, kind, frame, turntable, poses, world, count)
+    scene = read_ply(run / stage / "scene.ply")
+    with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
+        write_shots(output, scene, shots, task, fps=fps, codec=codec, device=on)
+    camera = shots[0].camera
+    width = camera.width * (2 if side_by_side else 1)
+    if as_json:
+        facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
+        print_json({**facts, "width": width, "height": camera.height})
+    else:
+        pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
+        click.echo(f"{output}: {pictures} of {width}x{camera.height} of the scene of {stage}")
+
+
+def _shots(
+    capture: CaptureShots,
+    kind: Kind,
+    frame: int | None,
+    turntable: bool,
+    poses: Path | None,
+    world: Literal["normalised", "input"] | None,
+    count: int,
+) -> list[Shot]:
+    """The shots that the options ask for."""
+    if poses is not None:
+        return capture.poses(poses, world)
+    if turntable:
+        return capture.turntable(count)
+    if frame is not None or kind == "still":
+        return capture.still(frame)
+    return capture.path(count)
+
+
+def _check_choices(
+    frame: int | None,
+    turntable: bool,
+    poses: Path | None,
+    world: str | None,
+    seconds: float | None,
+    side_by_side: bool,
+    output: Path,
+) -> None:
+    """Raise InputError where options contradict each other."""
+    if (frame is not None) + turntable + (poses is not None) > 1:
+        raise InputError(
+            "--frame, --turntable and --poses say each where the camera is", hint="give one of them"
+        )
+    if frame is not None and output.suffix.lower() == ".mp4":
+        raise InputError("--frame is a still", hint="end --output with .png or .exr, or leave out --frame")
+    if world is not None and poses is None:
+        raise InputError("--world is that of the poses in a file", hint="give --poses, or leave it out")
+    if seconds is not None and (poses is not None or frame is not None):
+        raise InputError(
+            "--seconds is the length of the path or of a turn",
+            hint="leave it out; --fps sets the pace of --poses",
+        )
+    if side_by_side and (turntable or poses is not None):
+        raise InputError(
+            "--side-by-side shows frames of the capture, which has none there",
+            hint="follow the path, or give --frame",
+        )
+    if side_by_side and output.suffix.lower() == ".exr":
+        raise InputError("--side-by-side is for films and PNGs", hint="end --output with .mp4 or .png")

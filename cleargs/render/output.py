@@ -1,0 +1,178 @@
+"""What is written of a scene: a still, a folder of stills, or a film. Pictures are made one by one."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.errors import InputError
+from cleargs.files import PARTIAL_SUFFIX, disk_error, sync_tree, write_json
+from cleargs.media.encode import Codec, require_even, write_video
+from cleargs.media.exr import write_view
+from cleargs.media.image import read_rgb, to_uint8, write_rgb
+from cleargs.progress import Task
+from cleargs.splat.camera import Camera
+from cleargs.splat.cameras_json import cameras_json
+from cleargs.splat.engine import Engine, Render
+from cleargs.splat.scene import Scene
+
+Kind = Literal["film", "still", "folder"]
+Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
+
+_FILM = frozenset({".mp4"})
+_STILLS = frozenset({".png", ".exr"})
+_NUMBER = re.compile(r"%0?\d*d")
+_OPAQUE = 1 / 255
+"""Alpha from which a pixel has a depth."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to make."""
+
+    camera: Camera
+    filmed: Path | None = None
+    """The frame of the capture to lay on its left."""
+
+
+class Photographer:
+    """Renders one scene."""
+
+    def __init__(self, scene: Scene, device: str = "cpu") -> None:
+        self._scene = scene.to(device)
+        self._engine = Engine(device)
+
+    def picture(self, shot: Shot) -> Picture:
+        """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
+        rendered = to_uint8(self._render(shot.camera, self._scene.background).image.cpu().numpy())
+        if shot.filmed is None:
+            return rendered
+        return np.concatenate([_fitted(read_rgb(shot.filmed), *rendered.shape[:2]), rendered], axis=1)
+
+    def write_layers(self, path: Path, shot: Shot) -> None:
+        """The view over black with its alpha and the mean depth along the optical axis in world units, 0
+        where nothing is seen."""
+        render = self._render(shot.camera, (0.0, 0.0, 0.0), depth=True)
+        assert render.depth is not None
+        image, alpha, depth = (layer.cpu().numpy() for layer in (render.image, render.alpha, render.depth))
+        depth = np.where(alpha >= _OPAQUE, depth / np.maximum(alpha, _OPAQUE), 0.0).astype(np.float32)
+        write_view(path, image, alpha, depth)
+
+    def _render(self, camera: Camera, background: tuple[float, float, float], depth: bool = False) -> Render:
+        scene = self._scene
+        return self._engine.forward(
+            scene.gaussians, camera, background=background, antialias=scene.antialias, depth=depth
+        )
+
+
+def kind_of(output: Path) -> Kind:
+    """What the name of ``output`` asks for: FILE.mp4, FILE.png or .exr, FOLDER/%04d.png or .exr.
+
+    Raises InputError for any other.
+    """
+    suffix = output.suffix.lower()
+    if suffix in _FILM and not _NUMBER.search(output.name):
+        return "film"
+    if suffix in _STILLS and len(_NUMBER.findall(output.name)) < 2:
+        return "folder" if _NUMBER.search(output.name) else "still"
+    raise InputError(
+        f"{output} has no ending that says what to write",
+        hint="end it with .mp4 (a film), .png or .exr (a still); FOLDER/%04d.png numbers stills",
+    )
+
+
+def require_free(output: Path, *, force: bool) -> None:
+    """Raise InputError when something is at ``output`` already that ``force`` does not replace.
+
+    A folder is never replaced: there may be more in it than our stills.
+    """
+    if kind_of(output) == "folder":
+        if output.parent.exists():
+            raise InputError(f"{output.parent} exists already", hint="choose a folder that is not there yet")
+    elif output.exists() and not force:
+        raise InputError(f"{output} exists already", hint="choose another name, or give --force")
+
+
+def write_shots(
+    output: Path, scene: Scene, shots: Sequence[Shot], task: Task, *, fps: float, codec: Codec, device: str
+) -> None:
+    """Write ``shots`` (of one size) to ``output``, which appears whole or not at all.
+
+    Beside the stills of a folder lies their ``cameras.json``. Raises InputError when ``output`` cannot hold
+    them, StoreError when the disk is full or not writable.
+    """
+    kind, camera = kind_of(output), shots[0].camera
+    if kind == "still" and len(shots) > 1:
+        raise InputError(
+            f"{len(shots)} pictures do not fit into {output.name}",
+            hint=f"number them (FOLDER/%04d{output.suffix}), or write a film (.mp4)",
+        )
+    if kind == "film":
+        require_even(camera.width, camera.height)
+    photographer = Photographer(scene, device)
+    try:
+        (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(error, output) from error
+    if kind == "film":
+        write_video(output, _each(photographer, shots, task), fps, codec=codec)
+    elif kind == "still":
+        _write_still(output, photographer, shots[0])
+        task.advance()
+    else:
+        _write_folder(output, photographer, shots, task)
+
+
+def _each(photographer: Photographer, shots: Sequence[Shot], task: Task) -> Iterator[Picture]:
+    for shot in shots:
+        yield photographer.picture(shot)
+        task.advance()
+
+
+def _write_still(path: Path, photographer: Photographer, shot: Shot) -> None:
+    if path.suffix.lower() == ".exr":
+        photographer.write_layers(path, shot)
+    else:
+        write_rgb(path, photographer.picture(shot))
+
+
+def _write_folder(output: Path, photographer: Photographer, shots: Sequence[Shot], task: Task) -> None:
+    """The stills in a folder beside its place, renamed when all are there."""
+    folder = output.parent
+    temporary = folder.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{folder.name}")
+    (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
+    names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
+    try:
+        temporary.mkdir()
+        for name, shot in zip(names, shots, strict=True):
+            _write_still(temporary / name, photographer, shot)
+            task.advance()
+        cameras = cameras_json([(name, shot.camera) for name, shot in zip(names, shots, strict=True)])
+        write_json(temporary / "cameras.json", cameras)
+        sync_tree(temporary)
+        temporary.rename(folder)
+    except OSError as error:
+        raise disk_error(error, folder) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _fitted(image: Picture, height: int, width: int) -> Picture:
+    """``image`` at the place that `cleargs.render.paths.framed` gives its content, black around it."""
+    scale = min(width / image.shape[1], height / image.shape[0])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    small = image if scale == 1 else cv2.resize(image, size, interpolation=way)
+    left, top = (width - size[0]) // 2, (height - size[1]) // 2
+    canvas = np.zeros((height, width, 3), np.uint8)
+    canvas[top : top + size[1], left : left + size[0]] = small
+    return canvas

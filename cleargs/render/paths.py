@@ -1,0 +1,183 @@
+"""Where the camera goes: the capture's path made smooth, and a circle around what the cameras look at.
+
+Pure functions from the poses of a capture to new ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from cleargs.errors import InputError
+from cleargs.splat.camera import Camera
+
+Array = NDArray[np.float64]
+
+_SMOOTHING = (0.025, 0.1)
+"""Sigma of the filter along the path, as a share of its length: at least, and at most. Between the two it is
+three quarters of the way between two frames. The corners at few frames go, and the tremor of a hand."""
+_SAMPLES = 2000
+"""Least places at which a path is filtered."""
+_PARALLEL = 0.003
+"""Mean squared sine of the angle between the optical axes and their mean (3 degrees) below which they do not
+meet at a point that could be trusted."""
+_FLATTEST = 0.25
+"""Smallest radius of a turntable, as a share of the distance to its centre: cameras straight above it give no
+circle."""
+_PULL = 0.003
+"""Weight of the cameras' mean up, against their horizontal axes, in what is up."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A camera on its way."""
+
+    poses: Array  # [K, 4, 4] world to camera
+    nearest: NDArray[np.int64]  # [K] the frame of the capture that is nearest along the way, by position
+
+
+def smooth_path(cameras: Sequence[Camera], count: int) -> CameraPath:
+    """The way of ``cameras`` (in the order of their frames) from the first pose to the last, made smooth and
+    cut into ``count`` poses of equal steps.
+
+    A step's length is the distance over the extent of the path plus the angle over pi, so that a camera
+    which only turns takes its time as well. Positions and quaternions go through one Gaussian filter along
+    the path, mirrored through its ends, which therefore stay where they are.
+
+    Raises InputError when no camera moves.
+    """
+    centres = np.stack([camera.centre for camera in cameras])
+    turns = Rotation.from_matrix([camera.world_to_camera[:3, :3].T for camera in cameras])
+    motion = _motion(centres, turns)
+    kept = np.concatenate([[True], np.diff(motion) > 1e-9])
+    if kept.sum() < 2:
+        raise InputError(
+            "the cameras of this capture do not move: there is no path to follow",
+            hint="render one of its frames with --frame, or give --poses",
+        )
+    numbers, motion = np.flatnonzero(kept), motion[kept]
+    samples = np.linspace(0, motion[-1], max(_SAMPLES, 20 * len(cameras)))
+    width = len(samples) * np.clip(0.75 / (len(numbers) - 1), *_SMOOTHING)
+    centres = _filtered(_at(samples, motion, centres[kept]), width)
+    quaternions = Slerp(motion, turns[kept])(samples).as_quat()
+    jumps = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0  # q and -q are the same turn
+    quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
+    turns = Rotation.from_quat(_filtered(quaternions, width))
+    passed = np.interp(samples, motion, numbers)
+
+    motion = _motion(centres, turns)
+    even = np.linspace(0, motion[-1], count)
+    nearest = np.rint(np.interp(even, motion, passed)).astype(np.int64)
+    return CameraPath(_poses(_at(even, motion, centres), Slerp(motion, turns)(even)), nearest)
+
+
+def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
+    """A full turn in ``count`` equal steps around the point that ``cameras`` look at, from the first one's
+    side, at their median distance from the axis and median height. The axis is that of `upright`.
+
+    Raises InputError when they all look the same way.
+    """
+    centre = seen_point(cameras)
+    up = upright(cameras)
+    offsets = np.stack([camera.centre for camera in cameras]) - centre
+    heights = offsets @ up
+    away = offsets - heights[:, None] * up
+    distance = float(np.median(np.linalg.norm(offsets, axis=1)))
+    radius = max(float(np.median(np.linalg.norm(away, axis=1))), _FLATTEST * distance)
+    ahead = _unit(away[np.argmax(np.linalg.norm(away, axis=1) > 1e-6 * distance)])
+    aside = np.cross(up, ahead)
+    angles = 2 * np.pi * np.arange(count) / count
+    around = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
+    places = centre + radius * around + np.median(heights) * up
+    return np.stack([look_at(place, centre, up) for place in places])
+
+
+def seen_point(cameras: Sequence[Camera]) -> Array:  # [3]
+    """The point nearest to all optical axes, by least squares. Raises InputError when they are parallel."""
+    axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [N, 3, 3] projections along each axis
+    total = across.mean(axis=0)
+    if np.linalg.eigvalsh(total)[0] < _PARALLEL:
+        raise InputError(
+            "the cameras of this capture all look the same way: there is nothing to circle around",
+            hint="follow their path instead: leave out --turntable",
+        )
+    centres = np.stack([camera.centre for camera in cameras])
+    point: Array = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(cameras))
+    return point
+
+
+def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
+    """Up: what the horizontal axes of ``cameras`` are perpendicular to, as nerfstudio finds it.
+
+    The mean of their own ups would lean over, where they look down and stand on one side. Cameras whose
+    horizontal axes are all alike leave it open; a small pull towards that mean settles it.
+    """
+    rights = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
+    mean = _unit(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
+    level = rights.T @ rights / len(rights) - _PULL * np.outer(mean, mean)
+    up: Array = np.linalg.eigh(level)[1][:, 0]
+    return up if up @ mean > 0 else -up
+
+
+def look_at(place: Array, target: Array, up: Array) -> Array:  # [4, 4] world to camera
+    """A camera at ``place`` whose axis goes through ``target``, without roll. OpenCV axes."""
+    forward = _unit(target - place)
+    right = _unit(np.cross(forward, up))
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(forward, right), forward]
+    pose[:3, 3] = -pose[:3, :3] @ place
+    return pose
+
+
+def framed(camera: Camera, width: int, height: int) -> Camera:
+    """``camera`` with a picture of ``width`` x ``height``, not stretched: it shows all that it showed, and
+    more on two sides where the shape differs."""
+    scale = min(width / camera.width, height / camera.height)
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=scale * camera.fx,
+        fy=scale * camera.fy,
+        cx=width / 2 + scale * (camera.cx - camera.width / 2),
+        cy=height / 2 + scale * (camera.cy - camera.height / 2),
+    )
+
+
+def _motion(centres: Array, turns: Rotation) -> Array:  # [N], from 0
+    """Motion up to each pose; see `smooth_path`."""
+    distance = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    angle = (turns[:-1].inv() * turns[1:]).magnitude()
+    return np.concatenate([[0.0], np.cumsum(distance / max(extent, 1e-12) + angle / np.pi)])
+
+
+def _at(places: Array, motion: Array, values: Array) -> Array:
+    """``values`` [N, C] given at ``motion`` [N], at ``places`` [K]."""
+    return np.stack([np.interp(places, motion, column) for column in values.T], axis=1)
+
+
+def _filtered(values: Array, sigma: float) -> Array:
+    """``values`` [N, C] through a Gaussian of ``sigma`` samples, mirrored through the first and the last."""
+    border = int(4 * sigma) + 1
+    padded = np.pad(values, ((border, border), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.asarray(gaussian_filter1d(padded, sigma, axis=0)[border:-border], np.float64)
+
+
+def _poses(centres: Array, turns: Rotation) -> Array:  # [K, 4, 4] world to camera
+    """Poses from centres [K, 3] and camera-to-world rotations."""
+    poses = np.tile(np.eye(4), (len(centres), 1, 1))
+    poses[:, :3, :3] = turns.inv().as_matrix()
+    poses[:, :3, 3] = -np.einsum("kij,kj->ki", poses[:, :3, :3], centres)
+    return poses
+
+
+def _unit(vector: Array) -> Array:
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit

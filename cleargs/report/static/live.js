@@ -1,0 +1,59 @@
+// Asks how far the run is, and shows it; when the run is done, its report takes over.
+"use strict";
+{
+  const EVERY_MS = 2000;
+  const one = (id) => document.getElementById(id);
+
+  const duration = (seconds) => {
+    if (seconds < 90) return `${Math.round(seconds)} s`;
+    const minutes = Math.round(seconds / 60);
+    return minutes < 90 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+  };
+
+  const row = ({ name, state, seconds }) => {
+    const item = document.createElement("li");
+    item.dataset.state = state;
+    for (const text of [name, seconds === null ? state : `${state} in ${duration(seconds)}`]) {
+      item.append(Object.assign(document.createElement("span"), { textContent: text }));
+    }
+    return item;
+  };
+
+  const figures = ({ done, total, note, seconds_left: left }) => [
+    total ? `${done} of ${total}` : done || "", note, left === null ? "" : `${duration(left)} left`,
+  ].filter(Boolean).join(" · ");
+
+  const show = ({ name, now, stages, preview, report }) => {
+    document.title = `${now ? now.stage : "idle"} · ${name} · ClearGS`;
+    one("name").textContent = name;
+    one("label").textContent = now ? now.label : "Nothing is at work";
+    one("progress").hidden = !now;
+    if (now && now.total) one("progress").value = now.done / now.total;
+    else one("progress").removeAttribute("value");
+    one("figures").textContent = now
+      ? figures(now)
+      : "cleargs run continues it, cleargs report writes the page of these results.";
+    one("preview").hidden = preview === null;
+    if (preview !== null && one("picture").dataset.version !== preview) {
+      one("picture").dataset.version = preview;
+      one("picture").src = `/preview.png?${preview}`;
+    }
+    one("stages").replaceChildren(...stages.map(row));
+    one("report").hidden = !report;
+  };
+
+  const look = async () => {
+    try {
+      const state = await (await fetch("/state.json")).json();
+      if (state.done) {
+        location.replace("/report/");
+        return;
+      }
+      show(state);
+    } catch {
+      one("figures").textContent = "cleargs watch has ended; start it again to go on.";
+    }
+    setTimeout(look, EVERY_MS);
+  };
+  look();
+}

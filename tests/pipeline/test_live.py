@@ -1,0 +1,126 @@
+"""The note of what a run is at work on: there while it works, gone afterwards, and in nobody's way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_interruption import start, wait_for
+from toy import Bench
+
+from cleargs.cli.main import invoke
+from cleargs.errors import StoreError
+from cleargs.pipeline import live
+from cleargs.pipeline.live import NOTE, AtWork, at_work, noted, preview_of
+from cleargs.progress import SilentReporter
+
+
+def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    hold = bench.root / "hold"
+    hold.touch()
+    assert at_work(bench.folder, bench.store) is None
+    process = start(bench, f"square.hold={hold}")
+    wait_for(bench, "held")
+    found = at_work(bench.folder, bench.store)
+    assert found is not None and (found.stage, found.label) == ("square", "square")
+    work = bench.store / "work" / found.work
+    assert preview_of(found, bench.store) is None
+    (work / "checkpoints" / "deep").mkdir()
+    (work / "checkpoints" / "preview.png").write_bytes(b"old")
+    (work / "checkpoints" / "deep" / "preview.png").write_bytes(b"new")
+    (work / "checkpoints" / "elsewhere").mkdir()
+    (work / "checkpoints" / "elsewhere" / "preview.png").symlink_to("/etc/passwd")
+    preview = preview_of(found, bench.store)
+    assert preview is not None and preview.path.read_bytes() == b"new"
+    assert invoke(["show", str(bench.folder)], bench.dag) == 0
+    said = capsys.readouterr().out
+    assert "square is at work: square" in said and f"preview: {preview.path}" in said
+    hold.unlink()
+    assert process.wait(60) == 0
+    assert at_work(bench.folder, bench.store) is None and not (bench.folder / NOTE).exists()
+
+
+def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
+    hold = bench.root / "hold"
+    hold.touch()
+    process = start(bench, f"square.hold={hold}")
+    wait_for(bench, "held")
+    process.kill()
+    process.wait()
+    assert (bench.folder / NOTE).exists() and at_work(bench.folder, bench.store) is None
+    hold.unlink()
+    assert [outcome.how for outcome in bench.run()] == ["found", "made", "made"]
+    assert not (bench.folder / NOTE).exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"work": "../../outside"},
+        {"work": 3},
+        {"done": "x"},
+        {"total": [1]},
+        {"seconds_left": "x"},
+        {"more": 1},
+    ],
+)
+def test_a_damaged_note_says_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(live, "writer_lives", lambda work: True)
+    whole = asdict(AtWork("g0", "key@host-1-a", "G0", 1, 2, "", None))
+    (tmp_path / NOTE).write_text(json.dumps(whole))
+    assert at_work(tmp_path, tmp_path) is not None
+    (tmp_path / NOTE).write_text(json.dumps(whole | change))
+    assert at_work(tmp_path, tmp_path) is None
+    (tmp_path / NOTE).write_text("{")
+    assert at_work(tmp_path, tmp_path) is None
+
+
+def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "EVERY", 0.0)
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with noted(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
+
+        def note() -> dict[str, Any]:
+            found: dict[str, Any] = json.loads((tmp_path / NOTE).read_text())
+            return found
+
+        assert note()["stage"] == note()["label"] == "g0" and note()["work"] == "key@me"
+        with reporter.task("G0", total=100) as outer:
+            now[0] = 50.0  # before the first step kernels are compiled
+            outer.update(done=10, note="20 dB")
+            now[0] = 55.0
+            outer.update(done=20)
+            expected = {"label": "G0", "done": 20, "total": 100, "note": "20 dB", "seconds_left": 40.0}
+            assert expected.items() <= note().items()
+            with reporter.task("inner") as inner:
+                inner.advance(3)
+                assert (note()["label"], note()["done"], note()["total"]) == ("inner", 3, None)
+            outer.advance()
+            assert (note()["label"], note()["done"]) == ("G0", 21)
+    assert not (tmp_path / NOTE).exists()
+
+
+def test_a_note_that_cannot_be_written_stops_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, value: Any) -> None:
+        raise StoreError("no space left", hint="")
+
+    monkeypatch.setattr(live, "write_json", full)
+    assert [outcome.how for outcome in bench.run()] == ["made"] * 3
+
+
+def test_a_note_is_no_sign_of_a_checkpoint(bench: Bench) -> None:
+    """A job near its time limit is stopped when its work folder has a younger file."""
+    hold = bench.root / "hold"
+    hold.touch()
+    process = start(bench, f"square.hold={hold}")
+    wait_for(bench, "held")
+    files = {file.name for file in (bench.store / "work").rglob("*") if file.is_file()}
+    assert NOTE not in files and "state.txt" in files
+    hold.unlink()
+    assert process.wait(60) == 0

@@ -1,0 +1,203 @@
+"""Camera paths: ends at ends, equal steps, rotations that are rotations, circles around what is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cleargs.errors import InputError
+from cleargs.render.paths import Array, framed, look_at, seen_point, smooth_path, turntable, upright
+from cleargs.splat.camera import Camera
+
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def camera(pose: Array) -> Camera:
+    return Camera(96, 54, 90.0, 90.0, 47.0, 28.0, pose)
+
+
+def around(target: Array, angles: Array, radius: float = 2.0, height: float = 0.5) -> list[Camera]:
+    """Cameras on a circle about the vertical through ``target``, which they look at."""
+    places = [target + np.array([radius * np.cos(a), -height, radius * np.sin(a)]) for a in angles]
+    return [camera(look_at(place, target, UP)) for place in places]
+
+
+def handheld(seed: int, count: int = 40) -> list[Camera]:
+    """A walk whose hand trembles from frame to frame."""
+    chance = np.random.default_rng(seed)
+    cameras = []
+    for t in np.linspace(0, 1, count):
+        turn = Rotation.from_euler("yxz", [90 * t, 10 * np.sin(5 * t), 0], degrees=True)
+        turn *= Rotation.from_rotvec(chance.normal(0, 0.01, 3))
+        pose = np.eye(4)
+        pose[:3, :3] = turn.inv().as_matrix()
+        pose[:3, 3] = -pose[:3, :3] @ (
+            np.array([3 * t, 0.2 * np.sin(9 * t), t * t]) + chance.normal(0, 0.01, 3)
+        )
+        cameras.append(camera(pose))
+    return cameras
+
+
+def centres(poses: Array) -> Array:
+    return -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def steps(poses: Array) -> Array:
+    """Length of each step as `smooth_path` counts it: distance over the extent, and angle over pi."""
+    places, turns = centres(poses), Rotation.from_matrix(poses[:, :3, :3])
+    distance = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.linalg.norm(np.ptp(places, axis=0))
+    return np.asarray(distance + (turns[1:] * turns[:-1].inv()).magnitude() / np.pi)
+
+
+def bends(places: Array) -> float:
+    """Mean second difference, over the mean step: how much a path trembles."""
+    return float(np.abs(np.diff(places, 2, axis=0)).mean() / np.abs(np.diff(places, axis=0)).mean())
+
+
+def as_poses(cameras: Sequence[Camera]) -> Array:
+    return np.stack([each.world_to_camera for each in cameras])
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 10**6), frames=st.integers(2, 60), count=st.integers(2, 200))
+def test_the_path_begins_and_ends_where_the_capture_does(seed: int, frames: int, count: int) -> None:
+    cameras = handheld(seed, frames)
+    path = smooth_path(cameras, count)
+    assert path.poses.shape == (count, 4, 4)
+    np.testing.assert_allclose(path.poses[0], cameras[0].world_to_camera, atol=1e-9)
+    np.testing.assert_allclose(path.poses[-1], cameras[-1].world_to_camera, atol=1e-9)
+    assert path.nearest[0] == 0 and path.nearest[-1] == frames - 1
+    assert (np.diff(path.nearest) >= 0).all()
+    turns = path.poses[:, :3, :3]
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(turns), 1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_camera_keeps_its_pace(seed: int) -> None:
+    """Whatever the frames' own pace was: here it is three times as fast in the second half."""
+    cameras = handheld(seed, 60)
+    made = steps(smooth_path(cameras[:30] + cameras[30::3], 50).poses)
+    # Steps are chords of a smooth curve: they fall short of its length by some thousandths.
+    np.testing.assert_allclose(made, made.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tremor_is_gone_and_the_way_is_kept(seed: int) -> None:
+    cameras = handheld(seed, 60)
+    raw = np.stack([each.centre for each in cameras])
+    made = centres(smooth_path(cameras, 60).poses)
+    assert bends(made) < 0.2 * bends(raw)
+    # The tremor is 0.01 a axis; what the filter cuts from the bends of the way is of the same size.
+    nearest = np.linalg.norm(made[:, None] - raw, axis=2).min(axis=1)
+    assert nearest.max() < 0.08
+
+
+def test_a_camera_that_stops_and_turns_takes_its_time() -> None:
+    """Half a turn on the spot, then a straight walk: no picture turns by more than the pace allows."""
+    turning = [Rotation.from_euler("y", angle, degrees=True) for angle in np.linspace(0, 180, 20)]
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:20, :3, :3] = [turn.as_matrix() for turn in turning]
+    poses[20:, :3, :3] = turning[-1].as_matrix()
+    walked = np.stack([np.linspace(0.1, 2, 20), np.zeros(20), np.zeros(20)], 1)
+    poses[20:, :3, 3] = -np.einsum("kij,kj->ki", poses[20:, :3, :3], walked)
+    made = smooth_path([camera(pose) for pose in poses], 100).poses
+    turns = Rotation.from_matrix(made[:, :3, :3])
+    assert np.degrees((turns[1:] * turns[:-1].inv()).magnitude()).max() < 5
+    np.testing.assert_allclose(steps(made), steps(made).mean(), rtol=0.02)
+
+
+def test_frames_at_one_place_and_repeated_frames() -> None:
+    cameras = handheld(0, 5)
+    twice = [cameras[0], cameras[0], *cameras[1:], cameras[-1]]
+    np.testing.assert_allclose(smooth_path(twice, 20).poses[-1], cameras[-1].world_to_camera, atol=1e-9)
+    with pytest.raises(InputError, match="do not move"):
+        smooth_path([cameras[0]] * 4, 20)
+
+
+def test_opposite_signs_of_a_quaternion_are_one_turn() -> None:
+    """Two and a half turns about one axis: every step goes the same way round."""
+    angles = np.linspace(0, 900, 60)
+    cameras = []
+    for index, angle in enumerate(angles):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+        pose[:3, 3] = -pose[:3, :3] @ [0.01 * index, 0, 0]
+        cameras.append(camera(pose))
+    made = Rotation.from_matrix(smooth_path(cameras, 200).poses[:, :3, :3])
+    turned = (made[1:] * made[:-1].inv()).as_rotvec(degrees=True)
+    np.testing.assert_allclose(turned[:, 1], 900 / 199, rtol=0.05)
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    target=st.tuples(*[st.floats(-5, 5)] * 3).map(np.array),
+    first=st.floats(0, 6),
+    count=st.integers(3, 100),
+)
+def test_a_turntable_looks_at_the_centre(target: Array, first: float, count: int) -> None:
+    cameras = around(target, first + 2 * np.pi * np.arange(12) / 12)
+    np.testing.assert_allclose(seen_point(cameras), target, atol=1e-6)
+    poses = turntable(cameras, count)
+    ahead = target - centres(poses)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    np.testing.assert_allclose(poses[:, 2, :3], ahead, atol=1e-6)
+    np.testing.assert_allclose(centres(poses)[0], cameras[0].centre, atol=1e-6)
+    offsets = centres(poses) - target
+    np.testing.assert_allclose(offsets[:, 1], -0.5, atol=1e-6)  # y points down
+    np.testing.assert_allclose(np.linalg.norm(offsets[:, [0, 2]], axis=1), 2.0, atol=1e-6)
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    angles = (turns * Rotation.concatenate([turns[1:], turns[:1]]).inv()).magnitude()
+    # Equal steps, the one from the last to the first too: the film may be looped. The cameras look down by 14
+    # degrees, so that they turn a little less than the table.
+    np.testing.assert_allclose(angles, angles[0], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+    assert (poses[:, 1, :3] @ UP < 0).all()  # upright
+
+
+def test_cameras_on_one_side_that_look_down_do_not_tilt_the_table() -> None:
+    """Half a circle: the mean of their own ups leans over by some 9 degrees."""
+    cameras = around(np.zeros(3), np.linspace(0, np.pi, 12))
+    own = -np.mean([each.world_to_camera[1, :3] for each in cameras], axis=0)
+    assert np.degrees(np.arccos(own @ UP / np.linalg.norm(own))) > 8
+    assert np.degrees(np.arccos(upright(cameras) @ UP)) < 0.2
+    # The same axis for all: nothing but their own ups to go by.
+    same = [look_at(np.array([x, 0.0, 0]), np.array([x, 0.0, 1]), UP) for x in range(4)]
+    np.testing.assert_allclose(upright([camera(pose) for pose in same]), UP, atol=1e-9)
+
+
+def test_a_turntable_of_cameras_straight_above() -> None:
+    target = np.array([0.5, 0.0, 2.0])
+    above = [target + np.array([x, -3.0, z]) for x, z in ((-0.3, 0), (0.3, 0), (0, 0.3))]
+    ahead = np.array([0.0, 0, 1])
+    poses = turntable([camera(look_at(place, target, ahead)) for place in above], 10)
+    assert np.isfinite(poses).all()
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+
+
+def test_parallel_axes_have_nothing_to_circle_around() -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = np.arange(5)
+    with pytest.raises(InputError, match="look the same way"):
+        turntable([camera(pose) for pose in poses], 10)
+
+
+@pytest.mark.parametrize("size", [(48, 27), (192, 54), (96, 200), (95, 53)])
+def test_another_size_shows_no_less_and_stretches_nothing(size: tuple[int, int]) -> None:
+    pose = camera(np.eye(4))
+    other = framed(pose, *size)
+    assert (other.width, other.height) == size and other.fx == pytest.approx(other.fy)
+
+    def seen(each: Camera) -> list[float]:
+        """Left, right, top and bottom edge, as slopes of rays."""
+        across = [-each.cx / each.fx, (each.width - each.cx) / each.fx]
+        return [*across, -each.cy / each.fy, (each.height - each.cy) / each.fy]
+
+    for before, after in zip(seen(pose), seen(other), strict=True):
+        assert abs(after) >= abs(before) - 1e-9
+    assert any(before == pytest.approx(after) for before, after in zip(seen(pose), seen(other), strict=True))

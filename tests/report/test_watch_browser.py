@@ -1,0 +1,61 @@
+"""The page of a run at work in a real browser: it renews itself, and gives way to the report."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from report_run import camera, wall
+from watched import reported, serving, working
+
+from cleargs.pipeline import live
+from cleargs.progress import PREVIEW
+from cleargs.report.scene import Renderer
+from cleargs.splat.preview import write_preview
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium (apt-get install chromium)")
+
+PATIENCE_MS = 120_000
+
+
+def until(page: Any, condition: str) -> None:
+    """Asked from outside: the page's own policy lets nothing evaluate text in it."""
+    for _ in range(PATIENCE_MS // 50):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(condition)
+
+
+def test_the_page_follows_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "EVERY", 0.0)
+    made = reported(tmp_path)
+    picture = torch.from_numpy(Renderer(wall(1))(camera(1)) / 255)
+    complaints: list[str] = []
+    with sync_api.sync_playwright() as playwright, serving(made) as port:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        with working(made, "g0") as (reporter, checkpoints), reporter.task("<b>G0</b>", total=200) as task:
+            page.goto(f"http://127.0.0.1:{port}/")
+            until(page, "document.title.startsWith('g0 ')")
+            assert page.is_hidden("#preview")
+            task.update(done=50, note="20.5 dB, 1000 Gaussians")
+            write_preview(checkpoints / PREVIEW, picture)
+            until(page, "document.querySelector('#picture').naturalWidth === 96")
+            assert page.inner_text("#label") == "<b>G0</b>"  # no markup
+            assert page.inner_text("#figures") == "50 of 200 · 20.5 dB, 1000 Gaussians"
+            assert page.evaluate("document.querySelector('#progress').value") == 0.25
+            assert page.inner_text("li[data-state='at work']").split() == ["g0", "at", "work"]
+            first = page.get_attribute("#picture", "src")
+            write_preview(checkpoints / PREVIEW, picture.flip(0))
+            until(page, f"document.querySelector('#picture').getAttribute('src') !== '{first}'")
+        page.wait_for_url("**/report/")
+        assert page.inner_text("h1") and not complaints
+        browser.close()

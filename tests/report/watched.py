@@ -1,0 +1,58 @@
+"""A finished run that is served, and that may be at work again."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from report_run import FinishedRun
+
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.lease import lease
+from cleargs.pipeline.live import noted
+from cleargs.pipeline.store import Store
+from cleargs.progress import Reporter, SilentReporter
+from cleargs.report.live import Watched
+from cleargs.report.page import write_report
+from cleargs.report.serve import Server
+
+
+def reported(root: Path) -> FinishedRun:
+    """A run with its report."""
+    made = FinishedRun(root)
+    store = made.folder / ".store"
+    store.mkdir()
+    with DigestMemo(store / "digests.sqlite") as memo:
+        write_report(made.planner(Store(store, memo)))
+    return made
+
+
+@contextmanager
+def serving(made: FinishedRun) -> Iterator[int]:
+    """The port at which the run is served."""
+    with Server(Watched(made.dag, made.run), "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield int(server.server_address[1])
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def working(made: FinishedRun, stage: str) -> Iterator[tuple[Reporter, Path]]:
+    """A writer of ``stage`` at work: its reporter and its checkpoints."""
+    store, work = made.run.store, made.run.store / "work" / "key@me"
+    (work / "checkpoints" / "round_01").mkdir(parents=True)
+    try:
+        with (
+            lease(store / "leases" / "me.json"),
+            noted(SilentReporter(), made.folder, stage, work) as reporter,
+        ):
+            yield reporter, work / "checkpoints"
+    finally:
+        shutil.rmtree(work)
