@@ -20,6 +20,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.sog import write_sog
 from cleargs.splat.spz import spz
 from cleargs.splat.usd import write_usd
 
@@ -40,6 +41,7 @@ class Format:
 FORMATS: Mapping[str, Format] = {
     "compressed.ply": Format(write_compressed_ply, _AS_IS),
     "ply": Format(write_ply, _AS_IS),
+    "sog": Format(write_sog, _AS_IS),
     "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
     "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z),
     "usdc": Format(write_usd, _ABOUT_Z),
