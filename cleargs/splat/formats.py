@@ -61,12 +61,28 @@ def format_of(path: Path) -> str:
     return kind
 
 
-def write_scene(path: Path, scene: Scene, kind: str) -> None:
-    """Write ``scene`` (our axes) to ``path`` as ``kind`` of `FORMATS`, atomically."""
+def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
+    """Raise InputError for what files of ``kind`` do not have."""
+    if up not in (None, "y") and FORMATS[kind].axes != _AS_IS:
+        raise InputError(f"in a .{kind} y is always up", hint="give --up y, or leave it out")
+    if spz_version is not None and kind != "spz":
+        raise InputError(f"a .{kind} has no SPZ version", hint="leave out --spz-version")
+
+
+def write_scene(
+    path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
+) -> None:
+    """Write ``scene`` to ``path`` as ``kind`` of `FORMATS`, atomically.
+
+    The scene has our axes, or with ``turned`` those that the file is to have.
+    """
     target = FORMATS[kind]
-    if target.axes != _AS_IS:
+    if target.axes != _AS_IS and not turned:
         scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
-    target.write(path, scene)
+    if spz_version is not None:
+        write_bytes(path, spz(scene, spz_version))
+    else:
+        target.write(path, scene)
 
 
 def padded(scene: Scene, sh_degree: int) -> Scene:
