@@ -36,6 +36,8 @@ class Format:
     write: Callable[[Path, Scene], None]
     axes: tuple[float, float, float]
     """Signs of our axes in the file: half a turn, or none."""
+    y_up: bool = False
+    """Whether the format's own text leaves no other up."""
 
 
 FORMATS: Mapping[str, Format] = {
@@ -43,8 +45,8 @@ FORMATS: Mapping[str, Format] = {
     "ply": Format(write_ply, _AS_IS),
     "sog": Format(write_sog, _AS_IS),
     "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
-    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z),
-    "usdc": Format(write_usd, _ABOUT_Z),
+    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z, y_up=True),
+    "usdc": Format(write_usd, _ABOUT_Z, y_up=True),
 }
 """Ending -> format; a longer ending stands before the one that it ends with."""
 
@@ -63,7 +65,7 @@ def format_of(path: Path) -> str:
 
 def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
     """Raise InputError for what files of ``kind`` do not have."""
-    if up not in (None, "y") and FORMATS[kind].axes != _AS_IS:
+    if up not in (None, "y") and FORMATS[kind].y_up:
         raise InputError(f"in a .{kind} y is always up", hint="give --up y, or leave it out")
     if spz_version is not None and kind != "spz":
         raise InputError(f"a .{kind} has no SPZ version", hint="leave out --spz-version")
