@@ -28,7 +28,7 @@ Examples:
   cleargs export room -o room.sog                  the same, for the web: SuperSplat, PlayCanvas
   cleargs export room -o room.ply --sh-degree 3    for the viewer of the Inria code
   cleargs export room -o room.ply --up z           for Blender; --up y for Spark and three.js
-  cleargs export room -o room.sog --prune contribution:0.5 --crop percentile:98
+  cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
 """
 )
 @run_argument
