@@ -4,6 +4,7 @@
 # make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
 # make test-convert  the tests of those conversions
 # make browser       what the tests of the report in a browser need beside Debian's chromium
+# make oracles       .oracles, npm's programs that read exported scenes in the tests
 # make cluster       .venv-cluster, the Snakemake that `cleargs batch` uses
 # TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
 
@@ -13,7 +14,7 @@ PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c cons
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test test-gpu-kernels lint convert-env test-convert cluster browser clean
+.PHONY: demo test test-gpu-kernels lint convert-env test-convert cluster browser oracles clean
 
 demo: .venv/demo.stamp demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
@@ -35,6 +36,13 @@ test-convert: convert-env
 	.venv-convert/bin/python -m pytest tests/models
 
 browser: .venv/browser.stamp
+
+oracles: .oracles/stamp
+
+.oracles/stamp: Makefile
+	npm install --prefix .oracles --ignore-scripts --silent \
+		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+	touch $@
 
 # An environment of its own: the engine wants numpy and pandas of its own choosing.
 cluster: .venv-cluster/stamp
@@ -80,4 +88,4 @@ demo/capture/transforms.json: | .venv/demo.stamp
 	touch $@
 
 clean:
-	rm -rf demo build dist *.egg-info .venv .venv-convert .venv-cluster
+	rm -rf demo build dist *.egg-info .venv .venv-convert .venv-cluster .oracles

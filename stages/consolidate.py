@@ -32,6 +32,7 @@ OUTPUTS = (
     "state.safetensors",
     "before_after.png",
 )
+LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = (
     "torch",
     "triton",

@@ -22,6 +22,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "rva": ("frames.parquet",),
 }
 OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet", "state.safetensors")
+LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "triton", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
 _SECONDS_PER_STEP = 0.02

@@ -14,6 +14,7 @@ VERSION = 4
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
+LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy")
 
 

@@ -34,6 +34,7 @@ OUTPUTS = (
     "state.safetensors",
     "candidates.png",
 )
+LEFTOVERS = ("round_*/*.exr",)
 LIBRARIES = (
     "torch",
     "triton",

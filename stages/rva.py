@@ -14,6 +14,7 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
 }
 OUTPUTS = ("frames.parquet", "bins.parquet")
+LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
 
 _FRAMES_PER_MINUTE = 600  # frames of about 1 MP on one core, decoding included

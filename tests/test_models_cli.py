@@ -242,4 +242,6 @@ def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.Monk
 
     assert installed_file("musiq", "expert") is None  # a scorer is no expert
     assert expert_path("nets/own.onnx") == Path("nets/own.onnx").absolute()
-    assert scorer_path("nonesuch") is None
+    for named in (scorer_path, expert_path):
+        with pytest.raises(InputError, match="'nonesuch'"):
+            named("nonesuch")

@@ -43,13 +43,16 @@ class Preparation:
     """Whether every scene ends with its report."""
 
     def conflicts(self, scenes: Sequence[Scene]) -> list[Problem]:
-        """Scenes whose run folder was made for another input."""
+        """Scenes whose run folder was made for another input, or whose settings name a model that is not
+        there: hours of jobs are not to end in a missing file."""
         found = []
         with DigestMemo(self.folder.store / "digests.sqlite") as memo:
             store = Store(self.folder.store, memo)
             for scene in scenes:
                 try:
                     check_same_input(self._run(scene), self.dag, store)
+                    for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
+                        self.dag.load(stage).externals(scene.config.sections[stage], scene.source)
                 except InputError as error:
                     found.append(Problem(scene.line, f"{error}; {error.hint}"))
         return found

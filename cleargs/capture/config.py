@@ -22,7 +22,12 @@ class IngestConfig(BaseModel):
         description="frames per second to take from a video; unset: max_frames alone decides",
     )
     max_frames: int = Field(150, ge=3, description="at most so many frames, evenly in time")
-    max_size: int = Field(960, ge=64, description="long side of the published images, px; never enlarged")
+    max_size: int = Field(
+        960,
+        ge=64,
+        description="long side of the published images, px; never enlarged. Images, masks and videos of more "
+        "than 2^28 pixels are refused",
+    )
     holdout: str = Field(
         "none",
         description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "

@@ -17,7 +17,7 @@ from cleargs.capture.prepare import WorkFrame, resumable
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.errors import StageError
-from cleargs.files import make_folder
+from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.progress import Reporter
 from cleargs.tables import write_table
@@ -47,8 +47,14 @@ def publish(
     Points take their colour from train frames; a point that no train frame shows (or fewer than two frames in
     all, after undistortion cropped them) is left out. Returns the published model.
     """
-    for folder in ("images", *(["masks"] if any(frame.masked for frame in frames) else [])):
-        make_folder(out / folder)
+    make_folder(out / "images")
+    remove(out / "masks")  # written anew, and without any the folder says that no frame has one
+    if any(frame.masked for frame in frames):
+        make_folder(out / "masks")
+    ours = {frame.image for frame in frames}
+    for file in (out / "images").iterdir():
+        if file.name not in ours:
+            remove(file)
     views: list[_View] = []
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)

@@ -10,6 +10,7 @@ seeded, and mapping and triangulation (whose least squares sum in thread order) 
 from __future__ import annotations
 
 import copy
+import filecmp
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -49,6 +50,13 @@ def main() -> int:
         channel.error(
             "no features were found in any frame",
             "the frames need texture and light, and masks must leave some of them",
+        )
+        return 3
+    first, *others = (Path(job["images"]) / name for name in job["names"])
+    if all(filecmp.cmp(first, other, shallow=False) for other in others):
+        channel.error(
+            f"all {len(job['names'])} frames show the same picture",
+            "the camera must move while it records; look whether the video froze",
         )
         return 3
     _match(job, database, channel)

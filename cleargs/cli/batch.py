@@ -96,11 +96,13 @@ def batch(
     place = profile_folder(profile)
     root = batch_folder(sheet, folder)
     command = _engine(root, place, cores or usable_cores(), dry_run=dry_run)
-    resolved: Device = "cuda" if device == "cuda" and not is_local(place) else resolve_device(device)
+    reporter = make_reporter(quiet)
+    elsewhere = device == "cuda" and not is_local(place)
+    resolved: Device = "cuda" if elsewhere else resolve_device(device, reporter.info)
     options = ("--allow-partial",) if allow_partial else ()
     preparation = Preparation(dag, root, resolved, until, options, report=wants_report)
     scenes = checked_scenes(sheet, preparation)
-    return run_batch(preparation, scenes, command, make_reporter(quiet), dry_run=dry_run, as_json=as_json)
+    return run_batch(preparation, scenes, command, reporter, dry_run=dry_run, as_json=as_json)
 
 
 def _engine(root: BatchFolder, place: Path, cores: int, *, dry_run: bool) -> list[str]:

@@ -102,7 +102,7 @@ def splat(
 def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, quiet: bool) -> None:
     import dataclasses
 
-    resolve_device("cuda")
+    resolve_device("cuda", click.echo)
     import torch
 
     from cleargs.bench.plan import device_plan, quick_device_plan

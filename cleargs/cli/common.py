@@ -43,6 +43,7 @@ partial_option = click.option(
 stale_option = click.option(
     "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
 )
+UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
 run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
 
 
@@ -101,7 +102,7 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def resolve_device(choice: DeviceChoice, say: Callable[[str], None] | None = None) -> Device:
+def resolve_device(choice: DeviceChoice, say: Callable[[str], None]) -> Device:
     """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
 
     Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
@@ -109,8 +110,8 @@ def resolve_device(choice: DeviceChoice, say: Callable[[str], None] | None = Non
     """
     obstacle = None if choice == "cpu" else cuda_obstacle()
     if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
-        if choice == "auto" and obstacle is None and say is not None:
-            say("there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does")
+        if choice == "auto" and obstacle is None:
+            say(UNUSED_GPU)
         return "cpu"
     if obstacle is not None:
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")

@@ -157,7 +157,8 @@ def compare(
     out = out.absolute()
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
-    recipe = Recipe(dag, workflow, overrides, resolve_device(device), threads_or_all(threads), options, steps)
+    place = resolve_device(device, reporter.info)
+    recipe = Recipe(dag, workflow, overrides, place, threads_or_all(threads), options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])

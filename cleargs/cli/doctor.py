@@ -14,7 +14,7 @@ from typing import Literal
 import click
 
 import cleargs
-from cleargs.cli.common import cuda_obstacle, json_option, print_json, usable_cores
+from cleargs.cli.common import UNUSED_GPU, cuda_obstacle, json_option, print_json, usable_cores
 
 LIBRARIES = (
     "torch",
@@ -95,8 +95,9 @@ def _disk(folder: Path) -> Finding:
 
 def _device() -> Finding:
     obstacle = cuda_obstacle()
-    found = "cpu; --device cuda uses the GPU" if obstacle is None else f"cpu ({obstacle})"
-    return Finding("device", "ok", found)
+    if obstacle is None:
+        return Finding("device", "note", f"cpu; {UNUSED_GPU}")
+    return Finding("device", "ok", f"cpu ({obstacle})")
 
 
 def _writable(what: str, folder: Path) -> Finding:

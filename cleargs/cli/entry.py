@@ -6,12 +6,17 @@
 from __future__ import annotations
 
 import signal
+import sys
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def main() -> None:
-    """Run the command line and exit."""
+    """Run the command line and exit; with 2 where this is not Linux."""
+    if not sys.platform.startswith("linux"):
+        print(f"error: ClearGS runs on Linux, this is {sys.platform}", file=sys.stderr)
+        print("hint: use a Linux machine or container; on Windows, WSL 2", file=sys.stderr)
+        sys.exit(2)
     from cleargs.cli.main import main as run
 
     run()

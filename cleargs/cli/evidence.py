@@ -96,7 +96,7 @@ def evidence(
     page = (page or out / "results.md").absolute()
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
-    recipe = Recipe(dag, RECIPE, (), resolve_device(device), threads_or_all(threads), options)
+    recipe = Recipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options)
     found: list[Outcome] = []
     with opened_store(out / STORE_FOLDER) as store:
         shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)

@@ -14,6 +14,8 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
 
+MODEL = "colmap/sparse/0"
+
 
 @click.command(
     epilog="""\b
@@ -22,7 +24,10 @@ Examples:
   cleargs export room --world input -o room.ply    the world of the capture's own poses
   cleargs export room -o room.compressed.ply       a quarter of the size: SuperSplat, Spark, Brush
   cleargs export room -o room.spz                  a tenth of the size; room.glb and room.usdc as well
+  cleargs export room -o room.sog                  the same, for the web: SuperSplat, PlayCanvas
   cleargs export room -o room.ply --sh-degree 3    for the viewer of the Inria code
+  cleargs export room -o room.ply --up z           for Blender; --up y for Spark and three.js
+  cleargs export room -o room.sog --prune contribution:0.1 --crop percentile:98
 """
 )
 @run_argument
@@ -38,15 +43,40 @@ Examples:
     show_default=True,
     help="input: undo the normalisation, so that the scene fits the capture's own poses.",
 )
+@click.option(
+    "--up",
+    type=click.Choice(["-y", "y", "z"]),
+    help="Turn the scene so that this axis of the file points up and the first frame's camera stands at the "
+    "origin and looks ahead: y for Spark and three.js, z for Blender.  [default: as SuperSplat takes it]",
+)
+@click.option(
+    "--prune",
+    "rules",
+    multiple=True,
+    metavar="opacity:O|contribution:P",
+    help="Leave out Gaussians that are fainter than O (0 to 1), or that in no training frame make up P "
+    "pixels; tells what that costs in PSNR. May be given twice.",
+)
+@click.option(
+    "--crop",
+    metavar="box:X,Y,Z,X,Y,Z|percentile:P",
+    help="Keep the Gaussians between two corners, in the coordinates of cameras.json, or in the box that "
+    "holds the middle P percent along each axis.",
+)
+@click.option(
+    "--spz-version",
+    type=click.Choice(["3", "4"]),
+    help="Of a .spz: 4 is the newer, 3 what more programs read.  [default: 3]",
+)
 @click.option("--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]")
 @click.option(
     "-o",
     "--output",
     required=True,
     type=click.Path(dir_okay=False, path_type=Path),
-    help="The new file; its ending says what to write: .ply .compressed.ply .spz .glb .usdc",
+    help="The new file; its ending says what to write: .ply .compressed.ply .sog .spz .glb .usdc",
 )
-@click.option("--force", is_flag=True, help="Replace the file where it exists.")
+@click.option("--force", is_flag=True, help="Replace the files where they exist.")
 @stale_option
 @click.pass_obj
 def export(
@@ -54,46 +84,80 @@ def export(
     run: Path,
     sh_degree: int | None,
     world: str,
+    up: str | None,
+    rules: tuple[str, ...],
+    crop: str | None,
+    spz_version: str | None,
     chosen: str | None,
     output: Path,
     force: bool,
     stale: bool,
 ) -> None:
-    """Write the scene of RUN to a file, its cameras beside it (FILE.cameras.json)."""
-    from cleargs.splat.formats import format_of, padded, write_scene
+    """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
+    beside it."""
+    from cleargs.cli.selection import cropped, parse_crop, parse_prune, pruned
+    from cleargs.splat.formats import check_options, format_of, padded, write_scene
 
-    kind = format_of(output)
-    cameras = output.with_name(f"{output.name[: -len(kind) - 1]}.cameras.json")
-    for file in (output, cameras):
+    kind, version = format_of(output), None if spz_version is None else int(spz_version)
+    check_options(kind, up=up, spz_version=version)
+    if up is not None and world == "input":
+        raise InputError("--up turns a scene away from the input's world", hint="give one of the two")
+    thresholds, region = parse_prune(rules), parse_crop(crop)
+    stem = output.name[: -len(kind) - 1]
+    cameras, model = output.with_name(f"{stem}.cameras.json"), output.with_name(f"{stem}.colmap")
+    for file in (output, cameras, model):
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
     warning = require_fresh(dag, run, (stage,), stale=stale)
-    similarity = _similarity(run, dag.names[0]) if world == "input" else {}
-    from cleargs.capture.tables import load_frames
+    from cleargs.capture.model import read_model, write_model
+    from cleargs.capture.moved import moved
+    from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.splat.cameras_json import cameras_json
     from cleargs.splat.export import transform_scene
     from cleargs.splat.ply import read_ply
     from cleargs.splat.views import view_of
 
+    ingest = run / dag.names[0]
+    posed = [frame for frame in load_frames(ingest) if frame.registered]
+    named = [(frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed]
+    similarity: dict[str, Any] = {}
+    if world == "input":
+        similarity = _similarity(run, dag.names[0])
+    elif up is not None:
+        from cleargs.splat.upright import upright
+
+        similarity = upright(named[0][1], up)
+
     scene = read_ply(run / stage / SCENE)
+    remarks = [] if warning is None else [warning]
+    if thresholds:
+        scene, remark = pruned(scene, thresholds, run, stage)
+        remarks.append(remark)
     if sh_degree is not None:
         scene = padded(scene, sh_degree)
     if similarity:
         scene = transform_scene(scene, **similarity)
+    if region is not None:
+        scene, remark = cropped(scene, region)
+        remarks.append(remark)
+    if scene.gaussians.num == 0:
+        raise InputError("no Gaussian is left", hint="prune or crop less")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(error, output) from error
-    write_scene(output, scene, kind)
-    ingest = run / dag.names[0]
-    posed = [frame for frame in load_frames(ingest) if frame.registered]
-    named = [(frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed]
+    write_scene(output, scene, kind, turned=up is not None, spz_version=version)
     write_json(cameras, cameras_json(named, **similarity))
-    if warning:
-        click.echo(warning)
-    click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {world} world")
+    sparse = read_model(ingest / MODEL)
+    write_model(
+        model / "sparse" / "0", moved(sparse, **similarity) if similarity else sparse, load_points(ingest).rgb
+    )
+    for remark in remarks:
+        click.echo(remark)
+    where = f"{up} is up" if up is not None else f"{world} world"
+    click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {where}")
 
 
 def _similarity(run: Path, first: str) -> dict[str, Any]:

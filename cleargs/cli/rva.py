@@ -103,7 +103,7 @@ def agree(
     from cleargs.rva.agreement import compare
 
     reporter = make_reporter(quiet)
-    settings = read_run_file(run, dag, device=resolve_device(device))
+    settings = read_run_file(run, dag, device=resolve_device(device, reporter.info))
     if linked_manifest(run, "ingest") is None:
         raise InputError(f"ingest is not done in {run}", hint=f"first: cleargs stage ingest {run}")
     ingest = (run / "ingest").resolve()

@@ -62,7 +62,7 @@ def stage(
     The stages before it must be done.
     """
     dag.check(name)
-    resolved = None if device == "auto" else resolve_device(device)
+    resolved = None if device == "auto" else resolve_device(device, click.echo)
     settings = read_run_file(run, dag, store=store, device=resolved)
     with opened_store(settings.store) as opened:
         runner = Runner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet))

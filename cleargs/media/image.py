@@ -105,7 +105,8 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     image, size = None, stated_size(content)
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         raise InputError(
-            f"{path} has {size[0]}x{size[1]} pixels; at most {MAX_PIXELS} are read", hint="reduce the image"
+            f"{path} has {size[0]}x{size[1]} pixels; at most {MAX_PIXELS} are read",
+            hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
         )
     # libpng would tell of a file that breaks off on stderr.
     if size is not None and not (content.startswith(PNG) and b"IEND" not in content):

@@ -136,11 +136,11 @@ class LearnedScorer:
         return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
 
 
-def scorer_path(spec: str) -> Path | None:
-    """The file, absolute, that holds the weights of the scorer that a setting names; None for no such name.
+def scorer_path(spec: str) -> Path:
+    """The file, absolute, that holds the weights of the scorer that a setting names.
 
-    Its content stands for the scorer in the keys of the store. A path need not exist; raises InputError when
-    a scorer of the registry is not installed.
+    Its content stands for the scorer in the keys of the store. A path need not exist; raises InputError for
+    any other name, and when a scorer of the registry is not installed.
     """
     models = Path(str(files("cleargs.models"))).absolute()
     if spec == CLARITY:
@@ -149,7 +149,13 @@ def scorer_path(spec: str) -> Path | None:
         return models / COEFFICIENTS
     if spec.endswith(".onnx"):
         return Path(spec).absolute()
-    return installed_file(spec, "scorer")
+    path = installed_file(spec, "scorer")
+    if path is None:
+        known = [model.name for model in load_registry() if model.role == "scorer"]
+        raise InputError(
+            f"no scorer is called {spec!r}", hint=f"use {', '.join(known)} or the path of an .onnx file"
+        )
+    return path
 
 
 def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
@@ -165,11 +171,6 @@ def _load(spec: str, device: Device) -> Scorer:
     path = scorer_path(spec)
     if spec == NATURALNESS:
         return StatisticsScorer(NATURALNESS)
-    if path is None:
-        known = [model.name for model in load_registry() if model.role == "scorer"]
-        raise InputError(
-            f"no scorer is called {spec!r}", hint=f"use {', '.join(known)} or the path of an .onnx file"
-        )
     if model := installable(spec, "scorer"):
         verify(model, path.parent)
         if model.converter == "musiq":

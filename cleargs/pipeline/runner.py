@@ -201,7 +201,7 @@ class Runner:
         """Let the stage do its work and publish it. The key's lock is held."""
         name = recipe.parts.stage
         stage = self.dag.load(name)
-        work = self.store.open_work(recipe.key, fresh=forced, entry=entry)
+        work = self.store.open_work(recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS)
         for place in work.thrown_away:
             self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)

@@ -78,6 +78,9 @@ class Stage(Protocol):
     """Upstream stage -> files and folders in it that this stage reads; their digests enter the key."""
     OUTPUTS: tuple[str, ...]
     """Files and folders that exist when the stage is done."""
+    LEFTOVERS: tuple[str, ...]
+    """Patterns of the files in ``out`` from which it goes on after a killed try (``*`` within one name).
+    Whatever else such a try left there is thrown away."""
     LIBRARIES: tuple[str, ...]
     """Distributions whose version changes results; their versions enter the key."""
 

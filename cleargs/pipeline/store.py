@@ -19,9 +19,10 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
 
@@ -214,8 +215,9 @@ class Store:
             with suppress(OSError):  # something left is there already: ours stays until this process ends
                 folder.rename(folder.with_name(f"{folder.name.partition('@')[0]}@left"))
 
-    def open_work(self, key: str, *, fresh: bool, entry: Entry | None) -> Work:
-        """The work folder of ``key``, ready to go on: leftovers of dead writers removed.
+    def open_work(self, key: str, *, fresh: bool, entry: Entry | None, leftovers: Sequence[str] = ()) -> Work:
+        """The work folder of ``key``, ready to go on: of the outputs that dead writers left, only those stay
+        that match one of the patterns ``leftovers``.
 
         A forced rebuild (``fresh``) has a folder of its own, which goes on only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
@@ -223,6 +225,7 @@ class Store:
         work = Work(self._claim(f"{key}.forced" if fresh else key))
         try:
             work = replace(work, thrown_away=tuple(_only_files(work.folder)))
+            _keep_only(work.out, leftovers)
             if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
                 _link_files(entry.folder, work.out)
             work.out.mkdir(parents=True, exist_ok=True)
@@ -422,6 +425,18 @@ def _only_files(folder: Path) -> Iterator[str]:
         if place.is_symlink() or not (place.is_dir() or (place.is_file() and ours)):
             place.unlink(missing_ok=True)
             yield place.relative_to(folder).as_posix()
+
+
+def _keep_only(out: Path, patterns: Sequence[str]) -> None:
+    """Leave nothing in ``out`` but files that match a pattern, part by part, and their folders."""
+    for place in sorted(out.rglob("*"), reverse=True):  # what is in a folder before the folder
+        parts = place.relative_to(out).parts
+        known = (pattern.split("/") for pattern in patterns)
+        if place.is_dir():
+            if not any(place.iterdir()):
+                place.rmdir()
+        elif not any(len(parts) == len(names) and all(map(fnmatchcase, parts, names)) for names in known):
+            place.unlink()
 
 
 def _link_files(source: Path, target: Path) -> None:

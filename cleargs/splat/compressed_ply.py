@@ -22,7 +22,9 @@ CHUNK = 256
 """Gaussians that share their ranges."""
 
 _C0 = 0.28209479177387814  # Y_00, the constant spherical harmonic
-_LOG_SCALE_MAX = 20.0
+LOG_SCALE_MAX = 20.0
+"""Log scales beyond this would spoil the range of the others."""
+
 _MORTON_BITS = 21  # a coordinate; three of them fit into 63 bits
 _RANGES = [
     f"{end}_{name}"
@@ -96,7 +98,7 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
     chunks = -(-count // CHUNK)
     rows = np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0))
     colours = gaussians.sh.numpy()[:, 0] * np.float32(_C0) + np.float32(0.5)
-    scales = gaussians.log_scales.numpy().clip(-_LOG_SCALE_MAX, _LOG_SCALE_MAX)
+    scales = gaussians.log_scales.numpy().clip(-LOG_SCALE_MAX, LOG_SCALE_MAX)
     ranges, places = [], []
     for values in (gaussians.means.numpy(), scales, colours):
         chunked = values[rows].reshape(chunks, CHUNK, 3)
@@ -127,10 +129,19 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
 
 def _pack_rotation(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] -> [N]
     """Which of w, x, y, z is largest (2 bits), and the other three in their order, times sqrt(1/2)."""
+    largest, smaller = smaller_parts(quaternions)
+    places = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
+    packed: NDArray[np.uint32] = (largest.astype(np.uint32) << np.uint32(30)) | places
+    return packed
+
+
+def smaller_parts(
+    quaternions: NDArray[np.float32],  # [N, 4]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Which part of each unit quaternion is largest [N], and the others in their order [N, 3], with the sign
+    that makes the largest positive: all that is needed to find it again."""
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    smaller = np.take_along_axis(unit, others, axis=1) * np.sqrt(0.5) + 0.5
-    packed: NDArray[np.uint32] = (largest.astype(np.uint32) << np.uint32(30)) | _pack(smaller, (10, 10, 10))
-    return packed
+    return largest, np.take_along_axis(unit, others, axis=1)

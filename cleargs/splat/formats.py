@@ -20,6 +20,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.sog import write_sog
 from cleargs.splat.spz import spz
 from cleargs.splat.usd import write_usd
 
@@ -35,14 +36,17 @@ class Format:
     write: Callable[[Path, Scene], None]
     axes: tuple[float, float, float]
     """Signs of our axes in the file: half a turn, or none."""
+    y_up: bool = False
+    """Whether the format's own text leaves no other up."""
 
 
 FORMATS: Mapping[str, Format] = {
     "compressed.ply": Format(write_compressed_ply, _AS_IS),
     "ply": Format(write_ply, _AS_IS),
+    "sog": Format(write_sog, _AS_IS),
     "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
-    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z),
-    "usdc": Format(write_usd, _ABOUT_Z),
+    "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z, y_up=True),
+    "usdc": Format(write_usd, _ABOUT_Z, y_up=True),
 }
 """Ending -> format; a longer ending stands before the one that it ends with."""
 
@@ -59,12 +63,28 @@ def format_of(path: Path) -> str:
     return kind
 
 
-def write_scene(path: Path, scene: Scene, kind: str) -> None:
-    """Write ``scene`` (our axes) to ``path`` as ``kind`` of `FORMATS`, atomically."""
+def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
+    """Raise InputError for what files of ``kind`` do not have."""
+    if up not in (None, "y") and FORMATS[kind].y_up:
+        raise InputError(f"in a .{kind} y is always up", hint="give --up y, or leave it out")
+    if spz_version is not None and kind != "spz":
+        raise InputError(f"a .{kind} has no SPZ version", hint="leave out --spz-version")
+
+
+def write_scene(
+    path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
+) -> None:
+    """Write ``scene`` to ``path`` as ``kind`` of `FORMATS`, atomically.
+
+    The scene has our axes, or with ``turned`` those that the file is to have.
+    """
     target = FORMATS[kind]
-    if target.axes != _AS_IS:
+    if target.axes != _AS_IS and not turned:
         scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
-    target.write(path, scene)
+    if spz_version is not None:
+        write_bytes(path, spz(scene, spz_version))
+    else:
+        target.write(path, scene)
 
 
 def padded(scene: Scene, sh_degree: int) -> Scene:

@@ -1,7 +1,9 @@
-"""``.spz``, Niantic's compressed splats, version 3: gzip over columns of fixed-point numbers.
+"""``.spz``, Niantic's compressed splats: columns of fixed-point numbers.
 
-24-bit positions, 8-bit opacities, colours and log scales, quaternions of their three smaller parts (10 bits
-each, sign and 9 bits), spherical harmonics of 8 bits from -1 to 1. Source: nianticlabs/spz, ``load-spz.cc``.
+Version 3 is one gzip stream; version 4 compresses every column by itself (zstd), behind a plain header and a
+table of their sizes. The columns are the same: 24-bit positions, 8-bit opacities,
+colours and log scales, quaternions of their three smaller parts (10 bits each, sign and 9 bits), spherical
+harmonics of 8 bits from -1 to 1. Source: nianticlabs/spz, ``load-spz.cc`` and the README's "File Format".
 """
 
 from __future__ import annotations
@@ -11,12 +13,17 @@ import struct
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
 from cleargs.splat.scene import Scene
 
-_MAGIC, _VERSION = 0x5053474E, 3
+VERSIONS = (3, 4)
+"""Those that can be written: 3 is what most programs read."""
+
+_MAGIC = 0x5053474E
+_HEADER_BYTES = 32  # of version 4; the table of sizes follows
 _ANTIALIASED = 1
 _COLOUR_SCALE = 0.15  # SH of degree 0 from -1/0.3 to 1/0.3 over the 8 bits
 _SH_STEPS = {
@@ -24,26 +31,22 @@ _SH_STEPS = {
     2: 16,
 }  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4, as the original does
 _POSITION_BITS_MAX = 12
+_ZSTD_LEVEL = 12  # the original's
 
 
-def spz(scene: Scene) -> bytes:
-    """The bytes of ``scene``; equal scenes give equal bytes. The viewers of the format know no background."""
+def spz(scene: Scene, version: int = 3) -> bytes:
+    """The bytes of ``scene``; equal scenes give equal bytes. The viewers of the format know no background.
+
+    ``version`` is one of `VERSIONS`.
+    """
     gaussians = scene.gaussians.to("cpu").detach()
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
     means = gaussians.means.numpy().astype(np.float64)
     reach = float(np.abs(means).max(initial=1e-9))
     # As fine as 24 bits with a sign reach, and at most what the original takes by default.
     fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _POSITION_BITS_MAX))
-    header = struct.pack(
-        "<IIIBBBB",
-        _MAGIC,
-        _VERSION,
-        count,
-        gaussians.sh_degree,
-        fraction,
-        _ANTIALIASED if scene.antialias else 0,
-        0,
-    )
+    flags = _ANTIALIASED if scene.antialias else 0
+    header = struct.pack("<IIIBBB", _MAGIC, version, count, gaussians.sh_degree, fraction, flags)
     steps = np.clip(np.rint(means * 2.0**fraction), -(2**23), 2**23 - 1).astype("<i4")
     positions = steps.view(np.uint8).reshape(count, 3, 4)[:, :, :3]
     alphas = _byte(torch.sigmoid(gaussians.logit_opacities).numpy() * 255.0)
@@ -58,7 +61,16 @@ def spz(scene: Scene) -> bytes:
     ]
     if coefficients > 1:
         columns.append(_harmonics(gaussians.sh.numpy()[:, 1:]))
-    return gzip.compress(header + b"".join(column.tobytes() for column in columns), 9, mtime=0)
+    contents = [column.tobytes() for column in columns]
+    if version == 3:
+        return gzip.compress(header + b"\0" + b"".join(contents), 9, mtime=0)
+    zstd = pa.Codec("zstd", compression_level=_ZSTD_LEVEL)
+    streams = [zstd.compress(content, asbytes=True) for content in contents]
+    sizes = [
+        struct.pack("<QQ", len(stream), len(content))
+        for stream, content in zip(streams, contents, strict=True)
+    ]
+    return b"".join([header, struct.pack("<BI12x", len(streams), _HEADER_BYTES), *sizes, *streams])
 
 
 def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

@@ -54,6 +54,31 @@ def test_a_scene_whose_folder_belongs_to_another_input(
     assert said(capsys)[0].startswith(f"{sheet}:2: {run} is a run of /elsewhere/hall.mp4")
 
 
+@pytest.mark.usefixtures("program")
+@pytest.mark.parametrize(
+    ("setting", "name", "words"),
+    [
+        ("rivr.primary_scorer", "nonesuch", "no scorer is called 'nonesuch'"),
+        ("rivr.expert", "nonesuch", "no restoration expert 'nonesuch'"),
+        ("rivr.expert", "maxim-gopro", "the model maxim-gopro is not installed"),
+    ],
+)
+def test_models_that_cannot_be_had_are_told_before_any_work(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    setting: str,
+    name: str,
+    words: str,
+) -> None:
+    monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path / "models"))
+    sheet = tmp_path / "sheet.csv"
+    (tmp_path / "hall.mp4").touch()
+    sheet.write_text(f"name,input,{setting}\nhall,hall.mp4,{name}\n")
+    assert invoke(["batch", str(sheet)]) == 2
+    assert any(line.startswith(f"{sheet}:2: ") and words in line for line in said(capsys))
+
+
 def test_no_engine_is_said_with_its_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

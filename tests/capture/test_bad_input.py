@@ -147,6 +147,18 @@ def test_textureless_frames(posed: Path, images: Path, ingest: Ingest, shade: in
         assert refused(caught)
 
 
+def test_frames_that_are_all_the_same(posed: Path, images: Path, ingest: Ingest) -> None:
+    """A camera that stood still, or a video that froze: with poses and without."""
+    for folder in (posed / "images", images):
+        first, *others = sorted(folder.iterdir())
+        for path in others:
+            path.write_bytes(first.read_bytes())
+    for number, source in enumerate((posed, images)):
+        with pytest.raises(StageError, match="10 frames show the same picture") as caught:
+            ingest(source, f"out{number}")
+        assert refused(caught)
+
+
 def test_png_that_breaks_off_is_told_once(images: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = images / "view3.png"
     path.write_bytes(path.read_bytes()[:-2000])

@@ -83,3 +83,16 @@ def test_a_damaged_database_is_made_again(
         remove(tmp_path / "out.work" / "model")
         damage(tmp_path / "out.work" / "database.db")
         assert digests(ingest(posed, **settings).out) == healthy
+
+
+def test_foreign_images_and_masks_are_not_published(
+    posed: Path, ingest: Ingest, tmp_path: Path, settings: dict[str, int]
+) -> None:
+    """A mask that this capture does not have would hide parts of its frame from every later stage."""
+    healthy = digests(ingest(posed, **settings).out)
+    out = tmp_path / "out"
+    (out / "masks").mkdir()
+    image = (out / "images" / "000003.png").read_bytes()
+    for place in ("images/000999.png", "images/notes.txt", "masks/000003.png"):
+        (out / place).write_bytes(image)
+    assert digests(ingest(posed, **settings).out) == healthy

@@ -451,6 +451,23 @@ def test_a_gpu_that_is_not_used_is_told_of(
     assert "--device cuda" not in shell.run("--device", "cpu")[2]
 
 
+def test_the_doctor_notes_a_gpu_that_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for obstacle, state, words in ((None, "note", "--device cuda"), ("no GPU", "ok", "cpu (no GPU)")):
+        monkeypatch.setattr("cleargs.cli.doctor.cuda_obstacle", lambda obstacle=obstacle: obstacle)
+        invoke(["doctor", "--json"])
+        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
+        assert found["state"] == state and words in found["text"]
+
+
+def test_elsewhere_than_on_linux_it_says_so() -> None:
+    script = "import sys; sys.platform = 'darwin'; from cleargs.cli.entry import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    cause, remedy = done.stderr.splitlines()
+    assert done.returncode == 2 and "runs on Linux" in cause and remedy.startswith("hint: ")
+
+
 def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("os.sched_getaffinity")
     monkeypatch.setattr("os.cpu_count", lambda: 6)

@@ -9,6 +9,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
 
+from colmap_model import write_sparse
 from eval_world import add_scene, cameras, make_scene, write_run
 
 from cleargs.cli.main import invoke
@@ -18,7 +19,9 @@ from cleargs.splat.ply import read_ply
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    return write_run(tmp_path / "run", make_scene(count=20), cameras())
+    run = write_run(tmp_path / "run", make_scene(count=20), cameras())
+    write_sparse(run / "ingest")
+    return run
 
 
 def export(run: Path, output: Path, *more: str) -> int:

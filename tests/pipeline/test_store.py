@@ -313,3 +313,21 @@ def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.Monk
     assert (bench.folder / "total" / "total.txt").exists() and sorted(shared.rglob("*")) == before
     with pytest.raises(StoreError, match="may only be read"):
         bench.run("square.power=3", store=shared)
+
+
+def test_foreign_files_among_leftovers_are_not_published(bench: Bench) -> None:
+    """Only what a stage says that it goes on from is left of a killed try."""
+    healthy = bench.digests()
+    manifests = {name: read_manifest(bench.folder / name) for name in ("count", "square")}
+    for name, places in {
+        "count": ("notes.txt", ".DS_Store", "masks/1.txt", "numbers/deep/1.txt", "numbers/1.png"),
+        "square": ("powers/extra.txt", "powers/total.txt", "total.txt"),
+    }.items():
+        shutil.rmtree(bench.store / name)
+        for place in places:
+            file = bench.store / "work" / f"{manifests[name].key}@left" / "out" / place
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text("99")
+    assert bench.digests() == healthy
+    for name, manifest in manifests.items():
+        assert set(read_manifest(bench.folder / name).files) == set(manifest.files)

@@ -66,6 +66,7 @@ class Count:
     CONFIG: type[BaseModel] = CountConfig
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     OUTPUTS: tuple[str, ...] = ("numbers", "log.txt")
+    LEFTOVERS: tuple[str, ...] = ("numbers/*.txt",)
     LIBRARIES: tuple[str, ...] = ("pydantic",)
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
@@ -109,6 +110,7 @@ class Square:
     CONFIG: type[BaseModel] = SquareConfig
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"count": ("numbers", "masks")})
     OUTPUTS: tuple[str, ...] = ("powers",)
+    LEFTOVERS: tuple[str, ...] = ("powers/?.txt",)
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
@@ -162,6 +164,7 @@ class Total:
         default_factory=lambda: {"count": ("log.txt",), "square": ("powers/total.txt",)}
     )
     OUTPUTS: tuple[str, ...] = ("total.txt",)
+    LEFTOVERS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from colmap_model import POINTS_XYZ, write_no_formation, write_sparse
 from report_run import FinishedRun
 
+from cleargs.capture.model import read_model
 from cleargs.cli.main import invoke
 from cleargs.splat.formats import FORMATS
 from cleargs.splat.ply import read_ply
@@ -16,7 +20,10 @@ from cleargs.splat.ply import read_ply
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return FinishedRun(tmp_path_factory.mktemp("export"))
+    run = FinishedRun(tmp_path_factory.mktemp("export"))
+    write_sparse(run.folder / "ingest")
+    write_no_formation(run.folder / "consolidate")
+    return run
 
 
 def export(run: FinishedRun, output: Path, *arguments: str) -> int:
@@ -34,6 +41,10 @@ def test_every_format_in_both_worlds(run: FinishedRun, kind: str, tmp_path: Path
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # as the run notes it
     moved = 2.5 * turn @ cameras[0][2]["position"] + [1.0, -2.0, 3.0]
     assert np.allclose(cameras[1][2]["position"], moved)
+    models = [read_model(tmp_path / f"{name}.colmap/sparse/0") for name in ("here", "there")]
+    assert np.allclose(models[1].images[3].pose.centre, moved) and len(models[1].images) == 6
+    assert np.allclose(models[1].xyz, 2.5 * models[0].xyz @ turn.T + [1.0, -2.0, 3.0])
+    assert np.allclose(models[0].xyz, POINTS_XYZ)
 
 
 def test_degree_three_for_the_inria_code(run: FinishedRun, tmp_path: Path) -> None:
@@ -51,6 +62,8 @@ def test_nothing_is_overwritten_unasked(
     assert export(run, tmp_path / "a.ply", "--force") == 0
     (tmp_path / "a.ply").unlink()
     assert export(run, tmp_path / "a.ply") == 2  # the cameras are still there
+    (tmp_path / "a.cameras.json").unlink()
+    assert export(run, tmp_path / "a.ply") == 2 and not (tmp_path / "a.ply").exists()  # the model too
 
 
 def test_an_unknown_ending_writes_nothing(
@@ -58,3 +71,93 @@ def test_an_unknown_ending_writes_nothing(
 ) -> None:
     assert export(run, tmp_path / "room.splat") == 2
     assert ".compressed.ply" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def told(capsys: pytest.CaptureFixture[str], pattern: str) -> list[float]:
+    """The numbers that a line of the output gives."""
+    found = re.search(pattern, capsys.readouterr().out)
+    assert found is not None
+    return [float(number) for number in found.groups()]
+
+
+PRUNED = r"pruned (\d+) of 4000 Gaussians; PSNR of 5 training frames ([\d.]+) -> ([\d.]+) dB"
+
+
+def test_pruning_tells_what_it_costs(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the wall lies outside every view, and a threshold of many pixels leaves little to see."""
+    assert export(run, tmp_path / "a.ply", "--prune", "contribution:0.0001") == 0
+    gone, before, after = told(capsys, PRUNED)
+    assert gone > 1000 and before == after  # what nobody sees costs nothing
+    assert read_ply(tmp_path / "a.ply").gaussians.num == 4000 - gone
+    assert export(run, tmp_path / "b.ply", "--prune", "contribution:20") == 0
+    more, same, worse = told(capsys, PRUNED)
+    assert more > gone and same == before and worse < before - 1.0
+    assert export(run, tmp_path / "c.ply", "--prune", "opacity:0.9", "--prune", "contribution:0.0001") == 0
+    both, _, _ = told(capsys, PRUNED)
+    kept = read_ply(tmp_path / "c.ply").gaussians
+    assert both > gone and float(torch.sigmoid(kept.logit_opacities).min()) >= 0.9
+
+
+def test_a_crop_keeps_what_lies_in_the_box_of_the_cameras_world(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(run, tmp_path / "a.ply", "--crop", "box:-1,-1,0,1,1,2") == 0
+    means = read_ply(tmp_path / "a.ply").gaussians.means
+    (gone,) = told(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians lie outside")
+    assert 0 < len(means) == 4000 - gone and float(means.abs().max()) <= 2.0
+    assert export(run, tmp_path / "b.ply", "--crop", "percentile:80", "--world", "input") == 0
+    kept = read_ply(tmp_path / "b.ply").gaussians.num
+    assert 0.45 * 4000 < kept < 0.6 * 4000  # 0.8 along each of three independent axes
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz"])
+def test_up(run: FinishedRun, kind: str, tmp_path: Path) -> None:
+    """The first frame's camera at the origin, looking along -z with y up, in scene, cameras and model."""
+    assert export(run, tmp_path / f"a.{kind}", "--up", "y") == 0
+    first = json.loads((tmp_path / "a.cameras.json").read_text())[0]
+    assert np.allclose(first["position"], 0.0) and np.allclose(np.array(first["rotation"])[:, 2], [0, 0, -1])
+    model = read_model(tmp_path / "a.colmap/sparse/0")
+    assert np.allclose(model.images[1].pose.centre, 0.0) and (model.xyz[:, 2] < -1.0).all()
+    if kind == "ply":
+        means = read_ply(tmp_path / "a.ply").gaussians.means
+    else:
+        means = torch.from_numpy(pytest.importorskip("gsply.spz").read_spz(str(tmp_path / "a.spz")).means)
+    assert float(means[:, 2].max()) < -1.0  # the wall is ahead, not behind
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "cause"),
+    [
+        ("a.ply", ("--up", "z", "--world", "input"), "--up"),
+        ("a.glb", ("--up", "z"), "y is always up"),
+        ("a.ply", ("--spz-version", "4"), "no SPZ version"),
+        ("a.ply", ("--prune", "opacity"), "--prune opacity"),
+        ("a.ply", ("--prune", "size:1"), "--prune size:1"),
+        ("a.ply", ("--prune", "opacity:0.1", "--prune", "opacity:0.2"), "--prune opacity:0.2"),
+        ("a.ply", ("--prune", "contribution:nan"), "--prune contribution:nan"),
+        ("a.ply", ("--prune", "opacity:1"), "no Gaussian is left"),
+        ("a.ply", ("--crop", "box:1,1,1,0,0,0"), "--crop box"),
+        ("a.ply", ("--crop", "percentile:101"), "--crop percentile"),
+        ("a.ply", ("--crop", "box:50,50,50,51,51,51"), "no Gaussian is left"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    run: FinishedRun,
+    name: str,
+    options: tuple[str, ...],
+    cause: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert export(run, tmp_path / name, *options) == 2 and not list(tmp_path.iterdir())
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("error", "hint"))]
+    assert len(said) == 2 and cause in said[0]
+
+
+def test_both_versions_of_spz(run: FinishedRun, tmp_path: Path) -> None:
+    for version in ("3", "4"):
+        assert export(run, tmp_path / f"{version}.spz", "--spz-version", version) == 0
+    assert (tmp_path / "3.spz").read_bytes()[:2] == b"\x1f\x8b"  # gzip
+    assert (tmp_path / "4.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"

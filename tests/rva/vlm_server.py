@@ -197,6 +197,7 @@ class PreparedIngest:
     CONFIG: type[BaseModel] = Nothing
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     OUTPUTS: tuple[str, ...] = ("frames.parquet", "observations.parquet", "images")
+    LEFTOVERS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:

@@ -30,10 +30,11 @@ def test_engine_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
     monkeypatch.setattr(Path, "exists", lambda self: False)
-    assert common.resolve_device("auto") == "cpu"
+    assert common.resolve_device("auto", said.append) == "cpu"
     with pytest.raises(InputError, match="no NVIDIA GPU"):
-        common.resolve_device("cuda")
+        common.resolve_device("cuda", said.append)
     monkeypatch.setattr(Path, "exists", lambda self: True)
     monkeypatch.setattr(common, "find_spec", lambda name: None)
     assert "Triton" in (common.cuda_obstacle() or "")
@@ -41,9 +42,11 @@ def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(common, "version", lambda name: "2.13.0+cpu")
     assert "CPU only" in (common.cuda_obstacle() or "")
     monkeypatch.setattr(common, "version", lambda name: "2.13.0")
-    assert common.resolve_device("cuda") == "cuda"
+    assert common.resolve_device("cuda", said.append) == "cuda"
+    assert not said
     # Not before the back end has passed its tests on a device.
-    assert common.resolve_device("auto") == common.resolve_device("cpu") == "cpu"
+    assert common.resolve_device("auto", said.append) == common.resolve_device("cpu", said.append) == "cpu"
+    assert said == [common.UNUSED_GPU]
 
 
 @pytest.mark.parametrize("stage", ["g0", "rivr", "consolidate"])

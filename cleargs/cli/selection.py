@@ -1,0 +1,109 @@
+"""``cleargs export --prune`` and ``--crop``: which Gaussians are left out, and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import torch
+
+from cleargs.capture.tables import load_frames
+from cleargs.cli.progress import make_reporter
+from cleargs.errors import InputError
+from cleargs.formation.colour import read_exposure
+from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.table import read_formation
+from cleargs.rva.tables import FRAMES
+from cleargs.splat.engine import Engine
+from cleargs.splat.scene import Scene
+from cleargs.splat.selection import central_box, contributions, inside
+from cleargs.splat.views import View, real_views
+from cleargs.tables import read_table
+
+PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P pixels"
+CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"
+
+
+def parse_prune(rules: Sequence[str]) -> dict[str, float]:
+    """Least ``opacity`` and least ``contribution``, of those that are given. Raises InputError."""
+    thresholds: dict[str, float] = {}
+    for rule in rules:
+        kind, value = _parsed(rule, "--prune", PRUNE_HINT)
+        if len(value) != 1 or kind not in ("opacity", "contribution") or kind in thresholds or value[0] < 0:
+            raise InputError(f"--prune {rule} cannot be understood", hint=PRUNE_HINT)
+        thresholds[kind] = value[0]
+    return thresholds
+
+
+def parse_crop(rule: str | None) -> tuple[float, ...] | None:
+    """The corners of a box (six numbers), or a percentage (one). Raises InputError."""
+    if rule is None:
+        return None
+    kind, value = _parsed(rule, "--crop", CROP_HINT)
+    box = kind == "box" and len(value) == 6 and all(value[axis] < value[axis + 3] for axis in range(3))
+    if not box and not (kind == "percentile" and len(value) == 1 and 0.0 < value[0] <= 100.0):
+        raise InputError(f"--crop {rule} cannot be understood", hint=CROP_HINT)
+    return value
+
+
+def _parsed(rule: str, option: str, hint: str) -> tuple[str, tuple[float, ...]]:
+    """KIND:NUMBER,NUMBER... in two parts."""
+    kind, _, numbers = rule.partition(":")
+    try:
+        values = tuple(float(number) for number in numbers.split(","))
+    except ValueError:
+        values = (np.nan,)
+    if not np.isfinite(values).all():
+        raise InputError(f"{option} {rule} cannot be understood", hint=hint)
+    return kind, values
+
+
+def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str) -> tuple[Scene, str]:
+    """``scene`` without the Gaussians below a threshold, and a line that tells what it cost.
+
+    The PSNR is that of the training frames, as their cameras saw the scene.
+    """
+    ingest, folder = run / "ingest", run / stage
+    allocation = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
+    views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
+    gaussians, reporter = scene.gaussians, make_reporter()
+    keep = torch.sigmoid(gaussians.logit_opacities) >= thresholds.get("opacity", 0.0)
+    if "contribution" in thresholds:
+        with reporter.task("contributions", len(views)) as task:
+            most = contributions(scene, (view.camera for view in views), task.advance)
+        keep &= most >= thresholds["contribution"]
+    smaller = replace(scene, gaussians=gaussians.select(keep))
+    with reporter.task("PSNR", 2 * len(views)) as task:
+        before, after = (_psnr(which, views, folder, task.advance) for which in (scene, smaller))
+    return smaller, (
+        f"pruned {gaussians.num - smaller.gaussians.num} of {gaussians.num} Gaussians; PSNR of {len(views)} "
+        f"training frames {before:.2f} -> {after:.2f} dB"
+    )
+
+
+def _psnr(scene: Scene, views: Sequence[View], folder: Path, seen: Callable[[], None]) -> float:
+    """Mean over ``views``, through the exposure and the motion that the stage in ``folder`` found, dB."""
+    exposure = read_exposure(folder / "exposure.parquet")
+    formations, _ = read_formation(folder / "formation.parquet")
+    engine, values = Engine(), []
+    for view in views:
+        values += evaluate_views(scene, [view], exposure, formations, engine=engine)
+        seen()
+    return fmean(values)
+
+
+def cropped(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
+    """``scene`` inside the ``region`` of `parse_crop`, and a line that tells what is left."""
+    means = scene.gaussians.means
+    if len(region) == 1:
+        low, high = central_box(means, region[0])
+    else:
+        low, high = np.array(region[:3]), np.array(region[3:])
+    smaller = scene.gaussians.select(inside(means, low, high))
+    box = ",".join(f"{value:.4g}" for value in (*low, *high))
+    return replace(scene, gaussians=smaller), (
+        f"cropped to the box {box}: {means.shape[0] - smaller.num} of {means.shape[0]} Gaussians lie outside"
+    )
