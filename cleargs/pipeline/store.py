@@ -432,7 +432,7 @@ def _keep_only(out: Path, patterns: Sequence[str]) -> None:
     for place in sorted(out.rglob("*"), reverse=True):  # what is in a folder before the folder
         parts = place.relative_to(out).parts
         known = (pattern.split("/") for pattern in patterns)
-        if place.is_dir():
+        if place.is_dir() and not place.is_symlink():
             if not any(place.iterdir()):
                 place.rmdir()
         elif not any(len(parts) == len(names) and all(map(fnmatchcase, parts, names)) for names in known):
