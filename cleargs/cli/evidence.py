@@ -33,7 +33,7 @@ RECIPE = "default"
 Examples:
   cleargs evidence -o evidence --quick                          a rough page, evidence/results.md
   cleargs evidence -o evidence --captures data --page docs/results.md
-  cleargs evidence -o evidence --quick --section rooms          one section alone
+  cleargs evidence -o evidence --quick --section mixed          one section alone
 """
 )
 @click.option(

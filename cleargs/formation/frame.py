@@ -217,7 +217,7 @@ def packed(frame: FrameFormation) -> NDArray[np.float64]:
             [motion.disc_px, motion.focus, motion.median_depth],
             [frame.misfit, frame.misfit_still],
             [frame.blur_px, frame.skew_px, frame.defocus_px, frame.reach_px],
-            [math.nan if frame.skew_gain is None else frame.skew_gain],
+            [-1.0 if frame.skew_gain is None else frame.skew_gain],
         ]
     )
 
@@ -236,6 +236,6 @@ def unpacked(row: NDArray[np.float64]) -> FrameFormation:
         skew_px,
         defocus_px,
         reach_px,
-        None if math.isnan(gain) else gain,
+        gain if gain >= 0.0 else None,
         draws,
     )

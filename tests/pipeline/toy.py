@@ -110,7 +110,7 @@ class Square:
     CONFIG: type[BaseModel] = SquareConfig
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"count": ("numbers", "masks")})
     OUTPUTS: tuple[str, ...] = ("powers",)
-    LEFTOVERS: tuple[str, ...] = ("powers/?.txt",)
+    LEFTOVERS: tuple[str, ...] = ("powers/[0-9]*.txt",)
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:

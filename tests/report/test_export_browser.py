@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from browser import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
 from colmap_model import write_sparse
 from report_run import FinishedRun
 
@@ -19,12 +18,8 @@ from cleargs.cli.main import invoke
 from cleargs.report.scene import Renderer, camera_of, level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium (apt-get install chromium)")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
-PATIENCE_MS = 240_000  # software WebGL on a busy machine
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
 SIZE = 320, 180
 FRAME = 3
 DIFFERENCE = 12.0
@@ -77,14 +72,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     run = FinishedRun(tmp_path_factory.mktemp("export"))
     write_sparse(run.folder / "ingest")
     return run
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.mark.parametrize("kind", ["ply", "compressed.ply", "sog"])

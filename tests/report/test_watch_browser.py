@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from browser import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
 from report_run import camera, wall
 from watched import reported, serving, working
 
@@ -16,11 +16,7 @@ from cleargs.progress import PREVIEW
 from cleargs.report.scene import Renderer
 from cleargs.splat.preview import write_preview
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium (apt-get install chromium)")
-
-PATIENCE_MS = 120_000
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
 
 def until(page: Any, condition: str) -> None:
@@ -32,13 +28,12 @@ def until(page: Any, condition: str) -> None:
     raise AssertionError(condition)
 
 
-def test_the_page_follows_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "EVERY", 0.0)
     made = reported(tmp_path)
     picture = torch.from_numpy(Renderer(wall(1))(camera(1)) / 255)
     complaints: list[str] = []
-    with sync_api.sync_playwright() as playwright, serving(made) as port:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with serving(made) as port:
         page = browser.new_page()
         page.set_default_timeout(PATIENCE_MS)
         page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -58,4 +53,4 @@ def test_the_page_follows_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             until(page, f"document.querySelector('#picture').getAttribute('src') !== '{first}'")
         page.wait_for_url("**/report/")
         assert page.inner_text("h1") and not complaints
-        browser.close()
+        page.close()

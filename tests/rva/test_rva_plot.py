@@ -66,8 +66,8 @@ def test_the_picture_can_go_elsewhere(shell: Shell) -> None:
     ("stage", "options", "words"),
     [
         ("ingest", ["--plot"], "--plot draws the stage rva"),
-        ("rva", ["-o", "a.png"], "--output names the PNG of --plot"),
-        ("rva", ["--plot", "-o", "a.jpg"], "--output names the PNG of --plot"),
+        ("rva", ["-o", "a.png"], "--output names the PNG of --plot or --frame"),
+        ("rva", ["--plot", "-o", "a.jpg"], "--output names the PNG of --plot or --frame"),
     ],
 )
 def test_wrong_usage(shell: Shell, stage: str, options: list[str], words: str) -> None:
@@ -87,5 +87,5 @@ def test_scores_of_another_ingest_are_not_drawn_over_this_one(shell: Shell, name
     link.unlink()
     link.symlink_to(other)
     code, _, err = shell.plot("--plot")
-    assert code == 2 and "rva is stale: input ingest/" in err and "cleargs explain" in err
+    assert code == 2 and "rva is stale: input ingest/" in err and "bring it up to date (cleargs run" in err
     assert not (shell.folder / "rva-plot.png").exists()
