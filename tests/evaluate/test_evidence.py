@@ -29,7 +29,7 @@ rooms_below = 100
 
 [[quick]]
 name = "rooms"
-title = "Rooms, by fault"
+title = "Motion blur"
 kind = "rooms"
 protocols = ["mixed", "flood"]
 seeds = [100]
@@ -136,7 +136,7 @@ def outcome(*gains: float) -> Outcome:
 
 def test_losses_come_first_and_say_how_sure_they_are() -> None:
     ((section, sure),) = losses([outcome(-1.0, -1.1, -0.9)])
-    assert section == "Rooms, by fault"
+    assert section == "Motion blur"
     assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
     ((_, chance),) = losses([outcome(-1.0, 0.5, -0.2)])
     assert chance.verdict == "none"
@@ -152,15 +152,15 @@ def test_losses_come_first_and_say_how_sure_they_are() -> None:
 def test_the_page_of_a_few_cells() -> None:
     page = results_page([outcome(-1.0, -1.1, -0.9)], ORIGIN)
     assert "1 of 2 comparisons, 1 of them sure." in page
-    row = "| Rooms, by fault | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
+    row = "| Motion blur | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
     assert row in page
-    assert page.index(row) < page.index("## In short") < page.index("## Rooms, by fault")
+    assert page.index(row) < page.index("## In short") < page.index("## Motion blur")
     assert (
         "| the whole method, against all-view training | 0 / 1 / 0 | not made | not made | 1 / 0 / 0 |"
         in page
     )
     assert "* phone: no protocol is called 'phone'" in page
-    assert "`cleargs evidence -o OUT --section rooms`, version 0.1.0, abc" in page
+    assert "`cleargs evidence -o OUT --section blur`, version 0.1.0, abc" in page
     assert "LPIPS (AlexNet) could not be measured" in page
     assert "| mixed (n = 3) |" in page
     assert "@" not in page, "every place of the template is filled"
