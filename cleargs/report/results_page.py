@@ -37,7 +37,7 @@ class Origin:
 
     version: str
     command: str
-    """Without the names of sections."""
+    """The names of sections last; below a section stands its own instead."""
     recipe: str
     quick: bool
     threads: int
@@ -46,7 +46,8 @@ class Origin:
     def made(self, section: Section | None = None) -> str:
         """The line under a table."""
         only = f" --section {section.name}" if section is not None else ""
-        return f"`{self.command}{only}`, version {self.version}"
+        command = self.command if section is None else self.command.split(" --section ")[0]
+        return f"`{command}{only}`, version {self.version}"
 
 
 def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
