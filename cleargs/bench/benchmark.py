@@ -9,21 +9,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from cleargs.bench import torch_flat, torch_tiles
-from cleargs.bench.iteration import WHOLE, Iteration, projected_frame, use_threads
+from cleargs.bench import torch_tiles
+from cleargs.bench.iteration import Iteration, projected_frame, use_threads
 from cleargs.bench.memory import peak_memory
 from cleargs.bench.oracle import Accuracy, Truth, accuracy, choose_pixels, oracle
 from cleargs.bench.peaks import measure_peaks
 from cleargs.bench.plan import Case, Plan
-from cleargs.bench.prototype import Prototype
 from cleargs.bench.results import (
     Benchmark,
-    Comparison,
     Rasterisers,
     Rooflines,
     Row,
     ScalingPoint,
-    TorchForm,
+    TorchTimes,
     describe_machine,
 )
 from cleargs.bench.roofline import roofline
@@ -39,22 +37,16 @@ RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagat
 """Our side of the comparison of rasterisers. The last adds the pairs up per Gaussian, which torch's side does
 too, and goes on to the raw parameters, which it does not."""
 
-TORCH_FORMS = ("stacked tiles", "gsplat's form")
-
 
 def run(plan: Plan, reporter: Reporter) -> Benchmark:
     """Measure everything that ``plan`` names."""
     load = os.getloadavg()[0]
-    steps = len(plan.cases) + (plan.prototype is not None) + (plan.roofline is not None) + 1
+    steps = len(plan.cases) + (plan.roofline is not None) + 1
     with reporter.task("measuring", steps) as task:
         rows = []
         for case in plan.cases:
             rows.append(measure(case, plan))
             task.update(done=len(rows), note=case.title)
-        compared = None
-        if plan.prototype is not None:
-            compared = compare_with_prototype(Prototype(plan.prototype), plan)
-            task.advance()
         roofs = None
         if plan.roofline is not None:
             roofs = measure_roofline(plan.roofline, plan)
@@ -63,11 +55,11 @@ def run(plan: Plan, reporter: Reporter) -> Benchmark:
             {"more splats": plan.more_splats, "larger splats": plan.larger_splats}, plan
         )
         task.advance()
-    return Benchmark(describe_machine(load), plan.threads, rows, compared, roofs, scaling)
+    return Benchmark(describe_machine(load), plan.threads, rows, roofs, scaling)
 
 
 def measure(case: Case, plan: Plan) -> Row:
-    """Times, memory and errors of one case, and the pure-torch rasterisers' where the plan compares it."""
+    """Times, memory and errors of one case; the pure-torch rasteriser's too where the plan compares it."""
     use_threads(max(plan.threads))
     iteration = _iteration(case)
     size = size_of(projected_frame(iteration.gaussians, iteration.camera))
@@ -88,28 +80,25 @@ def measure(case: Case, plan: Plan) -> Row:
 
 
 def compare_rasterisers(iteration: Iteration, truth: Truth, plan: Plan) -> Rasterisers:
-    """Rasteriser against rasteriser: ours and the forms of pure torch take turns on the same splats."""
-    forms = torch_forms(iteration)
+    """Rasteriser against rasteriser: ours and the one in pure torch take turns on the same splats."""
+    other = torch_rasteriser(iteration)
     variants: dict[str, Callable[[Clock], object]] = {}
     for count in plan.threads:
         variants[f"ours {count}"] = partial(iteration.run_on, count, plan.repetitions)
-        for name, form in forms.items():
-            variants[f"{name} {count}"] = partial(form.run_on, count, truth.grad_image)
+        variants[f"torch {count}"] = partial(other.run_on, count, truth.grad_image)
     clocks = take_turns(variants, plan.torch_rounds)
     ours = {count: clocks[f"ours {count}"].by_round(*RASTERISER) for count in plan.threads}
-    compared = {}
-    for name, form in forms.items():
-        theirs = {count: clocks[f"{name} {count}"].by_round("forward", "backward") for count in plan.threads}
-        compared[name] = TorchForm(
-            times={count: Quartiles.of(values) for count, values in theirs.items()},
-            ratio={count: ratio(theirs[count], ours[count]) for count in plan.threads},
-            accuracy=accuracy(truth, *form.image_and_gradients(truth.grad_image)),
-        )
+    theirs = {count: clocks[f"torch {count}"].by_round("forward", "backward") for count in plan.threads}
+    compared = TorchTimes(
+        times={count: Quartiles.of(values) for count, values in theirs.items()},
+        ratio={count: ratio(theirs[count], ours[count]) for count in plan.threads},
+        accuracy=accuracy(truth, *other.image_and_gradients(truth.grad_image)),
+    )
     return Rasterisers({count: Quartiles.of(values) for count, values in ours.items()}, compared)
 
 
-def torch_forms(iteration: Iteration) -> dict[str, TorchRasteriser]:
-    """The rasterisers in pure torch, ready to run on a scene: TORCH_FORMS."""
+def torch_rasteriser(iteration: Iteration) -> TorchRasteriser:
+    """The rasteriser in pure torch, ready to run on a scene."""
     tensors = iteration.gaussians.tensors()
     leaves = {name: tensor.double().requires_grad_() for name, tensor in tensors.items()}
     camera = iteration.camera
@@ -118,15 +107,7 @@ def torch_forms(iteration: Iteration) -> dict[str, TorchRasteriser]:
     size = (camera.width, camera.height)
     counts, ids = torch_tiles.tile_lists(detached, *size)
     stacked = torch_tiles.groups(counts, ids, len(detached.depths))
-    found = torch_flat.intersections(detached, counts, ids, *size)
-    renders: list[Callable[[Splats], Tensor]] = [
-        lambda splats: torch_tiles.rasterise(splats, stacked, *size),
-        lambda splats: torch_flat.accumulate(splats, found, *size),
-    ]
-    return {
-        name: TorchRasteriser(leaves, exact, render)
-        for name, render in zip(TORCH_FORMS, renders, strict=True)
-    }
+    return TorchRasteriser(leaves, exact, lambda splats: torch_tiles.rasterise(splats, stacked, *size))
 
 
 class TorchRasteriser:
@@ -152,36 +133,9 @@ class TorchRasteriser:
         image = self._render(self._splats)
         slopes = torch.autograd.grad(image, self._splats[:4], grad_image)
         gradients = torch.autograd.grad(
-            self._exact[:4],
-            list(self._leaves.values()),
-            [slope.double() for slope in slopes],
-            retain_graph=True,  # the forms share it
+            self._exact[:4], list(self._leaves.values()), [slope.double() for slope in slopes]
         )
         return image.detach(), Gaussians(*gradients)
-
-
-def compare_with_prototype(prototype: Prototype, plan: Plan) -> Comparison:
-    """A training iteration of the prototype's and ours, in turn, at its size; each with its error."""
-    case = Case(*prototype.size)
-    use_threads(max(plan.threads))
-    iteration = _iteration(case)
-    truth = _truth(iteration, plan.seed)
-    variants: dict[str, Callable[[Clock], object]] = {}
-    for count in plan.threads:
-        variants[f"ours {count}"] = partial(iteration.run_on, count, plan.repetitions)
-        variants[f"theirs {count}"] = partial(prototype.run_on, count, plan.repetitions)
-    clocks = take_turns(variants, plan.rounds)
-    ours = {count: clocks[f"ours {count}"].by_round(WHOLE) for count in plan.threads}
-    theirs = {count: clocks[f"theirs {count}"].by_round(WHOLE) for count in plan.threads}
-    theirs_checked = prototype.image_and_gradients(iteration.gaussians, iteration.camera, truth.grad_image)
-    return Comparison(
-        case=case,
-        ours={count: Quartiles.of(values) for count, values in ours.items()},
-        prototype={count: Quartiles.of(values) for count, values in theirs.items()},
-        ratio={count: ratio(ours[count], theirs[count]) for count in plan.threads},
-        accuracy=_accuracy(truth, iteration),
-        prototype_accuracy=accuracy(truth, *theirs_checked),
-    )
 
 
 def measure_roofline(case: Case, plan: Plan) -> Rooflines:

@@ -50,11 +50,11 @@ class Iteration:
         self._step += 1
         with clock.repetition(), clock.time(WHOLE):
             with clock.time("forward"):
-                render = self.engine.forward(self.gaussians, self.camera)
+                image = self.image()
             with clock.time("loss"):
-                slope = self.differentiate(render.image)
+                slope = self.differentiate(image)
             with clock.time("backward"):
-                gradients = self.engine.backward(slope).tensors()
+                gradients = self.backward(slope).tensors()
             with clock.time("adam"):
                 for name, tensor in self.gaussians.tensors().items():
                     adam_step(
@@ -65,6 +65,14 @@ class Iteration:
                         step=self._step,
                         lr=0.0,
                     )
+
+    def image(self) -> Tensor:
+        """What is compared with the target: [H, W, 3]."""
+        return self.engine.forward(self.gaussians, self.camera).image
+
+    def backward(self, slope: Tensor) -> Gaussians:
+        """Gradients of the parameters for that of the loss by `image` [H, W, 3]."""
+        return self.engine.backward(slope)
 
     def differentiate(self, image: Tensor) -> Tensor:
         """The gradient of the loss by the image [H, W, 3]."""
@@ -80,8 +88,8 @@ class Iteration:
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
         """Copies, on the CPU, of the rendered image [H, W, 3] and of the gradients for dL/d(image)
         [H, W, 3]."""
-        image = self.engine.forward(self.gaussians, self.camera).image.clone()
-        gradients = self.engine.backward(grad_image.to(image.device)).clone()
+        image = self.image().clone()
+        gradients = self.backward(grad_image.to(image.device)).clone()
         return image.cpu(), gradients.to("cpu")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from cleargs.bench.iteration import PARTS, WHOLE
 from cleargs.bench.oracle import MARGIN, Accuracy, Error
-from cleargs.bench.results import Benchmark, Comparison, Machine, Rooflines, Row, ScalingPoint
+from cleargs.bench.results import Benchmark, Machine, Rooflines, Row, ScalingPoint
 from cleargs.bench.scaling import straight_line
 from cleargs.bench.timing import Quartiles
 from cleargs.splat.kernels.cpu.simd import LANES
@@ -20,13 +20,12 @@ def markdown(benchmark: Benchmark) -> str:
     """Every table, with what its figures mean."""
     parts = [
         "# Speed against error of the splatting core",
-        _machine(benchmark.machine),
+        machine_line(benchmark.machine),
         "Times are milliseconds, median [quartiles]; variants of a table took turns in one process. Random "
         "splats of SH degree 3, evenly over the view, black background.",
         *_iterations(benchmark.rows),
         *_errors(benchmark.rows),
         *_rasterisers(benchmark.rows),
-        *_prototype(benchmark.prototype),
         *_roofline(benchmark.roofline),
         *_scaling(benchmark.scaling, max(benchmark.threads)),
     ]
@@ -53,7 +52,8 @@ def _error(error: Error) -> str:
     return f"{error.max:.1e} / {error.median:.1e}"
 
 
-def _machine(machine: Machine) -> str:
+def machine_line(machine: Machine) -> str:
+    """Where it was measured."""
     versions = ", ".join(f"{name} {number}" for name, number in machine.versions.items())
     return (
         f"{machine.processor}, {machine.cores} cores; {versions}. "
@@ -112,61 +112,30 @@ def accuracy_cells(found: Accuracy) -> list[str]:
 
 
 def _rasterisers(rows: list[Row]) -> list[str]:
-    forms = list(dict.fromkeys(form for row in rows if row.rasterisers for form in row.rasterisers.torch))
     lines = []
     for row in rows:
         for threads in row.times:
             if (found := row.rasterisers) is None:
-                lines.append([row.case.title, str(threads), *[NOT_RUN] * (2 + 4 * len(forms))])
+                lines.append([row.case.title, str(threads), *[NOT_RUN] * 6])
                 continue
-            cells = [milliseconds(found.ours[threads]), f"{row.accuracy.worst_gradient:.1e}"]
-            for form in found.torch.values():
-                cells += [
-                    milliseconds(form.times[threads]),
-                    milliseconds(form.ratio[threads]),
-                    f"{form.accuracy.image.max:.1e}",
-                    f"{form.accuracy.worst_gradient:.1e}",
-                ]
+            cells = [
+                milliseconds(found.ours[threads]),
+                f"{row.accuracy.worst_gradient:.1e}",
+                milliseconds(found.torch.times[threads]),
+                milliseconds(found.torch.ratio[threads]),
+                f"{found.torch.accuracy.image.max:.1e}",
+                f"{found.torch.accuracy.worst_gradient:.1e}",
+            ]
             lines.append([row.case.title, str(threads), *cells])
     head = ["splats", "threads", "ours", "gradient error"]
-    for name in forms:
-        head += [name, f"{name} / ours", "image error", "gradient error"]
+    head += ["torch", "torch / ours", "image error", "gradient error"]
     return [
         "## Rasteriser against rasteriser",
         "Forward and backward pass. Ours: both kernels, and all that follows to the raw parameters. Pure "
         "torch with autograd: from projected splats to the image and back to their means, conics, opacities "
-        "and colours. Stacked tiles: dense arithmetic over tiles, the lists of splats per tile given. "
-        "gsplat's form: `accumulate` of its torch code over a flat list of (pixel, splat) intersections, "
-        "the list given. Their errors are those behind the oracle's float64 projection.",
+        "and colours, dense over stacked tiles, the lists of splats per tile given. Its errors are those "
+        "behind the oracle's float64 projection.",
         table(head, lines),
-    ]
-
-
-def _prototype(found: Comparison | None) -> list[str]:
-    title = "## A training iteration against the prototype's"
-    if found is None:
-        return [title, f"{NOT_RUN.capitalize()}: its folder was not given (`--prototype DIR`)."]
-    lines = [
-        [
-            found.case.title,
-            str(threads),
-            milliseconds(found.ours[threads]),
-            milliseconds(found.prototype[threads]),
-            milliseconds(found.ratio[threads]),
-        ]
-        for threads in found.ours
-    ]
-    return [
-        title,
-        table(["splats", "threads", "ours", "prototype", "ours / prototype"], lines),
-        "Errors of both on the same splats, largest / median:",
-        table(
-            ["", "image", *GROUPS, "pixels", "not compared", "splats seen"],
-            [
-                ["ours", *accuracy_cells(found.accuracy)],
-                ["prototype", *accuracy_cells(found.prototype_accuracy)],
-            ],
-        ),
     ]
 
 

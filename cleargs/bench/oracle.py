@@ -7,7 +7,6 @@ nothing to their colours and gets exactly no gradient, so it is left out before 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,6 @@ from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
-
-Differentiable = Callable[[Tensor], tuple[Tensor, Gaussians]]
-"""From dL/d(image) [H, W, 3] to the image [H, W, 3] and the gradients of the parameters."""
 
 PIXELS = 1000
 """The oracle renders at most so many random pixels,"""

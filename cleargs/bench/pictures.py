@@ -44,25 +44,19 @@ def plot_speed_error(path: Path, benchmark: Benchmark) -> None:
             color=COLOURS[counts.index(row.case.gaussians) % len(COLOURS)],
             label=row.case.title,
         )
-    if (found := benchmark.prototype) is not None:
-        times = (found.ours[threads].median, found.prototype[threads].median)
-        errors = (found.accuracy.worst_gradient, found.prototype_accuracy.worst_gradient)
-        iterations.plot(times, errors, color="0.7", zorder=0)
-        iterations.plot(times[1], errors[1], "X", color="black", label=f"prototype, {found.case.title}")
-        iterations.plot(times[0], errors[0], "o", mfc="none", color="black", label="ours in turn with it")
     rasterisers.set_title("Rasteriser, forward and backward")
     iterations.set_title("Training iteration")
     for panel in (rasterisers, iterations):
         panel.set_xlabel(f"ms on {threads} threads" if threads > 1 else "ms on 1 thread")
         panel.set_ylabel("largest gradient error against float64")
-        _plain_numbers(panel.xaxis)
+        show_plain_numbers(panel.xaxis)
         low, high = panel.get_ylim()
         panel.set_ylim(min(low, LEAST_RANGE[0]), max(high, LEAST_RANGE[1]))
         panel.axhline(FLOAT32_ROUNDING, color="0.5", linestyle=":", label="rounding of a float32")
     _legend(rasterisers)
     handles, names = iterations.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside right center", fontsize=7, frameon=False)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _rasterisers(panel: Axes, rows: list[Row], threads: int) -> None:
@@ -71,8 +65,7 @@ def _rasterisers(panel: Axes, rows: list[Row], threads: int) -> None:
     markers: dict[str, str] = {}
     for (row, found), colour in zip(compared, cycle(COLOURS), strict=False):
         points = {"ours": (found.ours[threads].median, row.accuracy.worst_gradient)}
-        for name, form in found.torch.items():
-            points[f"torch, {name}"] = (form.times[threads].median, form.accuracy.worst_gradient)
+        points["torch"] = (found.torch.times[threads].median, found.torch.accuracy.worst_gradient)
         x, y = zip(*points.values(), strict=True)
         panel.plot(x, y, color=colour, linewidth=0.8, label=row.case.title)
         for (name, point), marker in zip(points.items(), MARKERS, strict=False):
@@ -87,8 +80,8 @@ def plot_scaling(path: Path, benchmark: Benchmark) -> None:
     figure, (times, memory) = _panels()
     times.set_ylabel("ms, forward and backward")
     memory.set_ylabel("peak memory, MB")
-    _plain_numbers(times.yaxis)
-    _plain_numbers(memory.yaxis)
+    show_plain_numbers(times.yaxis)
+    show_plain_numbers(memory.yaxis)
     for (name, points), marker, colour in zip(benchmark.scaling.items(), MARKERS, COLOURS, strict=False):
         measured = [(point.pairs, point.milliseconds.median) for point in points]
         known = [(point.pairs, point.memory / 1e6) for point in points if point.memory is not None]
@@ -102,7 +95,7 @@ def plot_scaling(path: Path, benchmark: Benchmark) -> None:
     for panel in (times, memory):
         panel.set_xlabel("(tile, splat) pairs")
         _legend(panel)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _line(panel: Axes, values: list[tuple[int, float]], colour: str) -> None:
@@ -132,7 +125,7 @@ def _panels() -> tuple[Figure, tuple[Axes, Axes]]:
     return figure, (left, right)
 
 
-def _plain_numbers(axis: Axis) -> None:
+def show_plain_numbers(axis: Axis) -> None:
     """1, 2, 5, 10, ... instead of powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -147,7 +140,8 @@ def _legend(panel: Axes) -> None:
     panel.legend(once.values(), once.keys(), fontsize=7)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG and close the figure."""
     from matplotlib import pyplot
 
     with atomic_path(path) as temporary:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import NamedTuple
 
 from cleargs.bench.scenes import MEDIAN_SIGMA
@@ -37,12 +36,11 @@ class Plan:
     more_splats: tuple[Case, ...] = ()  # scaling: the number of splats grows
     larger_splats: tuple[Case, ...] = ()  # scaling: each splat grows
     memory: bool = True
-    prototype: Path | None = None
     peak_repeats: int = 50
     seed: int = 0
 
     def compares_torch(self, case: Case) -> bool:
-        """Whether the pure-torch rasterisers run on this case too."""
+        """Whether the pure-torch rasteriser runs on this case too."""
         largest = self.torch_largest
         return (
             largest is not None
@@ -73,7 +71,7 @@ def quick_device_plan() -> DevicePlan:
     return DevicePlan((Case(4_000, 160, 90), Case(20_000, 320, 180)), rounds=3, repetitions=3)
 
 
-def full_plan(threads: tuple[int, ...], prototype: Path | None = None) -> Plan:
+def full_plan(threads: tuple[int, ...]) -> Plan:
     """10,000 to 400,000 splats, 320x180 to 1280x720."""
     counts = (10_000, 50_000, 200_000, 400_000)
     sizes = ((320, 180), (640, 360), (960, 540), (1280, 720))
@@ -86,11 +84,10 @@ def full_plan(threads: tuple[int, ...], prototype: Path | None = None) -> Plan:
             Case(count, 640, 360) for count in (10_000, 20_000, 50_000, 100_000, 200_000, 400_000)
         ),
         larger_splats=tuple(Case(50_000, 640, 360, MEDIAN_SIGMA * factor) for factor in (0.5, 1, 2, 4, 8)),
-        prototype=prototype,
     )
 
 
-def quick_plan(threads: tuple[int, ...], prototype: Path | None = None) -> Plan:
+def quick_plan(threads: tuple[int, ...]) -> Plan:
     """The same kinds of rows at sizes that take seconds: to try the command, not to quote."""
     return Plan(
         cases=(Case(1_000, 160, 90), Case(4_000, 160, 90), Case(4_000, 320, 180)),
@@ -102,6 +99,5 @@ def quick_plan(threads: tuple[int, ...], prototype: Path | None = None) -> Plan:
         roofline=Case(4_000, 320, 180),
         more_splats=tuple(Case(count, 160, 90) for count in (1_000, 2_000, 4_000)),
         larger_splats=tuple(Case(1_000, 160, 90, MEDIAN_SIGMA * factor) for factor in (1, 2, 4)),
-        prototype=prototype,
         peak_repeats=5,
     )

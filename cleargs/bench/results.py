@@ -33,8 +33,8 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class TorchForm:
-    """One pure-torch rasteriser, forward and backward, by the number of threads."""
+class TorchTimes:
+    """The pure-torch rasteriser, forward and backward, by the number of threads."""
 
     times: dict[int, Quartiles]  # ms
     ratio: dict[int, Quartiles]  # its time / ours, round by round
@@ -46,7 +46,7 @@ class Rasterisers:
     """Our rasteriser against pure torch, forward and backward, by the number of threads."""
 
     ours: dict[int, Quartiles]  # ms
-    torch: dict[str, TorchForm]
+    torch: TorchTimes
 
 
 @dataclass(frozen=True)
@@ -60,18 +60,6 @@ class Row:
     memory: int | None  # bytes; None where the system does not tell
     accuracy: Accuracy
     rasterisers: Rasterisers | None  # None: not run
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A training iteration of the prototype's and ours, by the number of threads."""
-
-    case: Case
-    ours: dict[int, Quartiles]  # ms
-    prototype: dict[int, Quartiles]  # ms
-    ratio: dict[int, Quartiles]  # ours / the prototype's, round by round
-    accuracy: Accuracy
-    prototype_accuracy: Accuracy
 
 
 @dataclass(frozen=True)
@@ -101,7 +89,6 @@ class Benchmark:
     machine: Machine
     threads: tuple[int, ...]
     rows: list[Row]
-    prototype: Comparison | None
     roofline: Rooflines | None
     scaling: dict[str, list[ScalingPoint]]  # series -> points
 

@@ -1,8 +1,7 @@
 """A tile rasteriser in pure torch, differentiated by autograd: what the kernels are compared with.
 
 Per tile it does the arithmetic of gsplat's torch code (``_torch_impl.accumulate``), dense over the tile's
-pixels and splats, with the cut-offs of our image formation. It is written to be fast as such code goes
-(``torch_flat`` is gsplat's own form):
+pixels and splats, with the cut-offs of our image formation. It is written to be fast as such code goes:
 
 * The lists of splats per tile are given, outside its time, and as short as can be: a splat is in a tile's
   list only when its alpha reaches 1/255 at one of the tile's pixels.

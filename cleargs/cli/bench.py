@@ -7,14 +7,9 @@ from typing import Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, resolve_device, threads_or_all
+from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress import make_reporter
-
-prototype_option = click.option(
-    "--prototype",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Folder of another trainer (train.py with main(threads, iters), TM) to measure in turn with ours.",
-)
+from cleargs.pipeline.session import resolve_device
 
 
 @click.group()
@@ -27,7 +22,6 @@ def bench() -> None:
 Examples:
   cleargs bench splat -o bench            all sizes; tables, JSON and pictures
   cleargs bench splat --quick             the same kinds of rows, small
-  cleargs bench splat -o bench --prototype DIR
   cleargs bench splat -o bench --device cuda   the GPU, beside gsplat where it imports
 
 How to read the tables: docs/speed.md.
@@ -44,7 +38,6 @@ How to read the tables: docs/speed.md.
 @click.option(
     "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="What to measure."
 )
-@prototype_option
 @json_option
 @quiet_option
 def splat(
@@ -53,7 +46,6 @@ def splat(
     threads: int | None,
     seed: int,
     device: Literal["cpu", "cuda"],
-    prototype: Path | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -67,8 +59,8 @@ def splat(
     splat-cuda.json.
     """
     if device == "cuda":
-        if threads is not None or prototype is not None:
-            raise click.UsageError("--threads and --prototype belong to --device cpu")
+        if threads is not None:
+            raise click.UsageError("--threads belongs to --device cpu")
         _splat_on_gpu(out, quick=quick, seed=seed, as_json=as_json, quiet=quiet)
         return
     import dataclasses
@@ -81,7 +73,7 @@ def splat(
     from cleargs.splat.kernels.runtime import warm_up
 
     counts = tuple(sorted({1, threads_or_all(threads)}))
-    plan = (quick_plan if quick else full_plan)(counts, prototype)
+    plan = (quick_plan if quick else full_plan)(counts)
     warm_up()
     benchmark = run(dataclasses.replace(plan, seed=seed), make_reporter(quiet))
     text, values = markdown(benchmark), benchmark.as_json()
@@ -147,7 +139,6 @@ Examples:
 )
 @click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
 @click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Rounds to measure.")
-@prototype_option
 @json_option
 def train(
     gaussians: int,
@@ -155,29 +146,18 @@ def train(
     height: int,
     threads: int | None,
     repeats: int,
-    prototype: Path | None,
     as_json: bool,
 ) -> None:
-    """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error.
-
-    With a prototype the two are measured in turn in one process: quote the ratio, not the milliseconds. It is
-    measured at its own size, and so are we for the ratio.
-    """
-    from cleargs.bench.benchmark import compare_with_prototype, measure
+    """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error."""
+    from cleargs.bench.benchmark import measure
     from cleargs.bench.iteration import PARTS, WHOLE
     from cleargs.bench.plan import Case, Plan
-    from cleargs.bench.prototype import Prototype
 
-    trainer = Prototype(prototype) if prototype is not None else None
     count = threads_or_all(threads)
     case = Case(gaussians, width, height)
     plan = Plan(cases=(case,), threads=(count,), rounds=repeats, repetitions=5)
     found = measure(case, plan)
     row: dict[str, float | None] = {part: found.times[count][part].median for part in (*PARTS, WHOLE)}
-    if trainer is not None:
-        comparison = compare_with_prototype(trainer, plan)
-        row["prototype"] = comparison.prototype[count].median
-        row["ratio"] = comparison.ratio[count].median
     row["memory_mb"] = None if found.memory is None else found.memory / 1e6
     row["image_error"] = found.accuracy.image.max
     row["gradient_error"] = found.accuracy.worst_gradient
@@ -188,9 +168,50 @@ def train(
         click.echo(f"{name:<14} {_with_unit(name, value)}")
 
 
+@bench.command(
+    epilog="""\b
+Examples:
+  cleargs bench formation -o bench                 formation.md, formation.json, formation.png
+  cleargs bench formation --quick --json
+"""
+)
+@click.option(
+    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
+)
+@click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
+@click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
+@json_option
+@quiet_option
+def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool, quiet: bool) -> None:
+    """What a blurred frame costs a training step, and how near the photograph is to the true exposure.
+
+    Blurs of 3, 10 and 30 px: a step that takes the frame for sharp, one through image formation, and the mean
+    of 3 to 17 renders along the path. The truth is the mean of many renders.
+    """
+    from cleargs.bench.formation import plan_of, run
+    from cleargs.bench.formation_report import formation_markdown, plot_formation
+    from cleargs.files import write_bytes, write_json
+    from cleargs.splat.kernels.runtime import warm_up
+
+    warm_up()
+    benchmark = run(plan_of(quick=quick, threads=threads_or_all(threads)), make_reporter(quiet))
+    text, values = formation_markdown(benchmark), benchmark.as_json()
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_bytes(out / "formation.md", text.encode())
+        write_json(out / "formation.json", values)
+        plot_formation(out / "formation.png", benchmark)
+    if as_json:
+        print_json(values)
+    elif out is None:
+        click.echo(text)
+    else:
+        click.echo(out / "formation.md")
+
+
 def _with_unit(name: str, value: float | None) -> str:
     if value is None:
         return " unknown"
     if name.endswith("error"):
         return f"{value:8.1e}"
-    return f"{value:8.2f}" + ("" if name in ("ratio", "memory_mb") else " ms")
+    return f"{value:8.2f}" + ("" if name == "memory_mb" else " ms")

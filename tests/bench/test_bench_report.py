@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 
 import cv2
 import pytest
@@ -13,7 +11,6 @@ from cleargs.bench import plan as plans
 from cleargs.bench.benchmark import run
 from cleargs.bench.markdown import NOT_RUN, markdown, milliseconds
 from cleargs.bench.memory import peak_memory
-from cleargs.bench.pictures import plot_speed_error
 from cleargs.bench.plan import Case, Plan, full_plan, quick_plan
 from cleargs.bench.results import Benchmark
 from cleargs.bench.timing import Quartiles
@@ -22,34 +19,8 @@ from cleargs.progress import SilentReporter
 
 SMALL, LARGE = Case(60, 40, 24), Case(90, 48, 32)
 
-FAKE_PROTOTYPE = """
-import torch
-from cleargs.splat.camera import Camera
-from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.render import render
 
-N, W, H = 60, 40, 24
-TM = {}
-
-def main(threads, iters):
-    TM["TOTAL"] = [0.5] * (iters - 5)
-    print("noise")
-
-def proj(means, scales, rotations, sh, view, intrinsics):
-    global camera
-    camera = Camera(W, H, *intrinsics, view.double().numpy())
-    return means, torch.cat([scales.log(), rotations], 1), sh, means[:, 2]
-
-class Raster:
-    @staticmethod
-    def apply(means, shape, sh, opacities, depths, background):
-        log_scales, rotations = (part.contiguous() for part in shape.split([3, 4], 1))
-        gaussians = Gaussians(means, log_scales, rotations, opacities.logit(), sh)
-        return render(gaussians, camera).image + 0.25, None
-"""
-
-
-def toy_plan(prototype: Path | None = None) -> Plan:
+def toy_plan() -> Plan:
     return Plan(
         cases=(SMALL, LARGE),
         threads=(1,),
@@ -61,20 +32,14 @@ def toy_plan(prototype: Path | None = None) -> Plan:
         more_splats=(SMALL, LARGE),
         larger_splats=(SMALL, Case(60, 40, 24, 5.0)),
         memory=False,
-        prototype=prototype,
         peak_repeats=1,
         seed=4,
     )
 
 
 @pytest.fixture(scope="module")
-def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Benchmark:
-    folder = tmp_path_factory.mktemp("prototype")
-    (folder / "train.py").write_text(FAKE_PROTOTYPE)
-    try:
-        return run(toy_plan(folder), SilentReporter())
-    finally:
-        sys.modules.pop("train", None)
+def benchmark() -> Benchmark:
+    return run(toy_plan(), SilentReporter())
 
 
 def test_every_row_has_its_errors_beside_its_times(benchmark):
@@ -87,21 +52,10 @@ def test_every_row_has_its_errors_beside_its_times(benchmark):
         assert row.pairs > 0 and row.times[1]["iteration"].median > 0
     small, large = benchmark.rows
     assert large.rasterisers is None
-    assert list(small.rasterisers.torch) == ["stacked tiles", "gsplat's form"]
-    for form in small.rasterisers.torch.values():
-        assert 0 < form.accuracy.worst_gradient < 1e-4
-        assert form.accuracy.image.max < 1e-5
-        assert form.ratio[1].median == pytest.approx(form.times[1].median / small.rasterisers.ours[1].median)
-
-
-def test_the_prototype_is_timed_and_its_error_seen(benchmark):
-    found = benchmark.prototype
-    assert found.case == SMALL
-    assert found.prototype[1].median == 500.0
-    assert found.ratio[1].median == pytest.approx(found.ours[1].median / 500.0)
-    assert found.accuracy.image.max < 1e-5
-    assert found.prototype_accuracy.image.median == pytest.approx(0.25, abs=1e-4)
-    assert found.prototype_accuracy.worst_gradient < 1e-4
+    other = small.rasterisers.torch
+    assert 0 < other.accuracy.worst_gradient < 1e-4
+    assert other.accuracy.image.max < 1e-5
+    assert other.ratio[1].median == pytest.approx(other.times[1].median / small.rasterisers.ours[1].median)
 
 
 def test_tables_say_what_was_not_run(benchmark):
@@ -110,7 +64,7 @@ def test_tables_say_what_was_not_run(benchmark):
     assert len(lines) == 1
     assert "seed 4" in text
     assert f"{benchmark.rows[0].accuracy.worst_gradient:.1e}" in text
-    assert milliseconds(benchmark.prototype.ratio[1]) in text
+    assert milliseconds(benchmark.rows[0].rasterisers.torch.ratio[1]) in text
     assert text.count("rasterise.backward") == 1
     assert "unknown" in text  # memory was not measured
     for table in text.split("\n\n"):
@@ -128,7 +82,7 @@ def test_json_is_complete(benchmark):
 
 
 def test_the_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(plans, "quick_plan", lambda threads, prototype: toy_plan())
+    monkeypatch.setattr(plans, "quick_plan", lambda threads: toy_plan())
     with pytest.raises(SystemExit) as end:
         main(
             [
@@ -147,26 +101,20 @@ def test_the_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
         )
     assert end.value.code == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["prototype"] is None
     assert {row["accuracy"]["seed"] for row in printed["rows"]} == {9}
     assert json.loads((tmp_path / "splat.json").read_text()) == printed
-    assert "Not run: its folder" in (tmp_path / "splat.md").read_text()
+    assert "torch / ours" in (tmp_path / "splat.md").read_text()
     for name in ("speed-error.png", "scaling.png"):
         picture = cv2.imread(str(tmp_path / name))
         assert picture.shape[0] > 300 and picture.std() > 5
 
 
 def test_the_command_prints_the_tables(monkeypatch, capsys):
-    monkeypatch.setattr(plans, "quick_plan", lambda threads, prototype: toy_plan())
+    monkeypatch.setattr(plans, "quick_plan", lambda threads: toy_plan())
     with pytest.raises(SystemExit) as end:
         main(["bench", "splat", "--quick", "--threads", "1", "-q"])
     assert end.value.code == 0
     assert capsys.readouterr().out.startswith("# Speed against error")
-
-
-def test_a_picture_with_the_prototype(benchmark, tmp_path):
-    plot_speed_error(tmp_path / "a.png", benchmark)
-    assert cv2.imread(str(tmp_path / "a.png")) is not None
 
 
 def test_memory_is_that_of_the_scene():
