@@ -11,11 +11,10 @@ from cleargs.splat.config import G0Config
 
 if TYPE_CHECKING:
     from cleargs.formation.colour import Exposure
-    from cleargs.splat.gaussians import Gaussians
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 6
+VERSION = 7
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
@@ -53,13 +52,13 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 
 def run(context: StageContext[G0Config]) -> StageResult:
     """Sparse points -> Gaussians -> trained on the active frames, each with its RVA weight."""
-    from cleargs.capture.tables import load_frames
+    from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.colour import Exposure, write_exposure
     from cleargs.formation.photograph import evaluate_views
     from cleargs.formation.table import write_formation
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
-    from cleargs.splat.initialise import sh_degree_from_views
+    from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.kernels.runtime import set_threads
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
@@ -74,10 +73,14 @@ def run(context: StageContext[G0Config]) -> StageResult:
     allocation = read_table(context.inputs["rva"] / "frames.parquet", RVA_FRAMES).to_pylist()
     views = real_views(load_frames(ingest), {row["frame_id"]: row["weight"] for row in allocation}, ingest)
     require_views(views)
-    sparse = _sparse_points(ingest, [view.frame_id for view in views])
+    points, frame_ids = load_points(ingest), [view.frame_id for view in views]
+    observations = load_observations(ingest)
+    sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
 
-    sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree
-    gaussians = _start(context, views, sparse, sh_degree)
+    def say(remark: str) -> None:
+        context.reporter.info(f"G0: {remark}")
+
+    gaussians = starting_gaussians(sparse, views, config, seed=context.seed, say=say)
     exposure, spread = _exposure(config, views, sparse)
     formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
     trained = train(
@@ -114,47 +117,12 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "gaussians_start": gaussians.num,
             "gaussians": trained.scene.gaussians.num,
             "steps": config.steps,
-            "sh_degree": sh_degree,
+            "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
             "exposure_spread": spread,
             "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
             "psnr_active": _mean(list(psnr.values())),
         }
-    )
-
-
-def _sparse_points(ingest: Path, frame_ids: list[int]) -> SparsePoints:
-    """The sparse points, and which of them each of these frames observes."""
-    import numpy as np
-
-    from cleargs.capture.tables import load_observations, load_points
-    from cleargs.splat.initialise import SparsePoints
-
-    points = load_points(ingest)
-    frame_id, point_id = load_observations(ingest)
-    order = np.argsort(points.point_id)
-    index = order[np.searchsorted(points.point_id, point_id, sorter=order)]
-    return SparsePoints(points.xyz, points.rgb, [index[frame_id == wanted] for wanted in frame_ids])
-
-
-def _start(
-    context: StageContext[G0Config], views: list[View], sparse: SparsePoints, sh_degree: int
-) -> Gaussians:
-    """One Gaussian a sparse point, and more behind random pixels until there are ``min_points``; never more
-    than ``budget``."""
-    from cleargs.splat.initialise import add_points, fewer_points, from_points
-
-    config = context.config
-    most = config.budget or max(config.min_points, len(sparse.xyz))
-    if len(sparse.xyz) > most:
-        context.reporter.info(f"G0: {most} of {len(sparse.xyz)} sparse points, which g0.budget allows")
-        sparse = fewer_points(sparse, most, seed=context.seed)
-    missing = min(config.min_points, most) - len(sparse.xyz)
-    if missing > 0:
-        context.reporter.info(f"G0: {len(sparse.xyz)} sparse points, {missing} are added between them")
-        sparse = add_points(sparse, views, missing, seed=context.seed)
-    return from_points(
-        sparse, sh_degree=sh_degree, init_scale=config.init_scale, init_opacity=config.init_opacity
     )
 
 

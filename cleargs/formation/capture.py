@@ -32,8 +32,9 @@ SEARCH_EVERY = 4
 ROLLING = 0.03
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
 docs/formation.md."""
-FEWEST_ASKED = 4
-"""Frames that must have been asked before a rolling shutter is believed."""
+FEWEST_ASKED, MOST_ASKED = 4, 16
+"""Frames that must have been asked before a rolling shutter is believed, and that are asked: half of the
+frames between these."""
 
 
 def rolls(frames: Iterable[FrameFormation]) -> bool:
@@ -67,6 +68,7 @@ class CaptureFormation:
         self._frames = {
             frame_id: replace(known.get(frame_id, FrameFormation(frame_id)), draws=0) for frame_id in real
         }
+        self._asked = {real[k] for k in _spread(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 
     @property
@@ -199,7 +201,14 @@ class CaptureFormation:
             factor=factor,
             warm=again,
             rolling=rolls(self._frames.values()),
+            asked=frame_id in self._asked,
         )
+
+
+def _spread(count: int) -> list[int]:
+    """Which of ``count`` frames in a row are asked whether the shutter rolls: evenly spread."""
+    asked = min(count, max(FEWEST_ASKED, min(MOST_ASKED, count // 2)))
+    return [(2 * k + 1) * count // (2 * asked) for k in range(asked)]
 
 
 def _affines(exposure: Exposure, views: Sequence[View], rate: float) -> AffineOptimiser:

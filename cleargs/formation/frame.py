@@ -84,6 +84,7 @@ def explain(
     factor: float = 1.0,
     warm: bool = False,
     rolling: bool = False,
+    asked: bool = False,
 ) -> FrameFormation:
     """How a raw frame was taken, in the light of the scene that ``render`` shows.
 
@@ -94,9 +95,11 @@ def explain(
         target, mask: the frame, [H, W, 3] sRGB and [H, W].
         warm: refine what is known instead of searching among all models.
         rolling: whether models with a skew are in the race.
+        asked: whether to tell, where they are not, what such a model would explain (`skew_gain`).
     """
     # What was found under the other belief about the shutter is searched for anew.
-    missed = rolling and _admitted(frame.model, rolling=False) and (frame.skew_gain or 0.0) > config.accept
+    untold = frame.skew_gain is None or frame.skew_gain > config.accept
+    missed = rolling and _admitted(frame.model, rolling=False) and untold
     warm = warm and _admitted(frame.model, rolling) and not missed
     margin = margin_for(frame.reach_px * factor, camera) if warm else _search_margin(camera)
     rendered = render(widened(camera, margin))
@@ -106,8 +109,8 @@ def explain(
         found = refine(sight, frame.model, known, pose=config.pose)
         best = found[-1]
     else:
-        found = search(sight, pose=config.pose)
-        frame = replace(frame, skew_gain=_skew_gain(found))
+        found = search(sight, skew=rolling or asked, pose=config.pose)
+        frame = replace(frame, skew_gain=_skew_gain(found) if rolling or asked else None)
         if frame.model != "none":
             found += refine(sight, frame.model, known, pose=config.pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
@@ -173,7 +176,6 @@ def _described(
         return fields_of(of, camera, depth, alpha, margin, factor)
 
     whole, turned = fields(motion), fields(replace(motion, pose=np.zeros(TWIST), blur=motion.skew))
-    ways = np.abs(whole.offset) + 0.5 * np.abs(whole.sweep) + whole.radius
     return replace(
         frame,
         motion=motion,
@@ -183,8 +185,14 @@ def _described(
         blur_px=_mean_length(whole.sweep) / factor,
         skew_px=_mean_length(turned.sweep) / factor,
         defocus_px=float(whole.radius.mean(dtype=np.float64)) / factor,
-        reach_px=float(np.quantile(ways.max(axis=0)[::4, ::4], 0.95)) / factor,
+        reach_px=reach_of(whole) / factor,
     )
+
+
+def reach_of(fields: Fields) -> float:
+    """See `FrameFormation.reach_px`."""
+    ways = np.abs(fields.offset) + 0.5 * np.abs(fields.sweep) + fields.radius
+    return float(np.quantile(ways.max(axis=0)[::4, ::4], 0.95))
 
 
 def _mean_length(field: Floats) -> float:

@@ -23,6 +23,8 @@ from cleargs.splat.kernels.cpu import launch
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
+NEAR_SIZE = 1.5
+"""An image that is larger than a level by less is that level itself."""
 WARM_STEPS = 2
 """Of a fit that goes on from the last one."""
 
@@ -108,17 +110,19 @@ def explained_share(misfit: float, misfit_still: float) -> float:
     return 1.0 - misfit / misfit_still if misfit_still > LEAST_MISFIT else 0.0
 
 
-def search(sight: Sight, *, pose: bool = False) -> list[Explanation]:
+def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Explanation]:
     """Every model at its best, from scratch. The first is ``none``.
 
+    skew: whether models with a rolling shutter are asked too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
     """
     levels = _levels(sight)
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
-    start = coarse.best(coarse.starts(still), "both", LEVELS[0][1], pose)
+    models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
+    start = coarse.best(coarse.starts(still), models[0], LEVELS[0][1], pose)
     found: dict[Model, FrameMotion] = {}
-    for model in ("both", "blur", "skew"):
+    for model in models:
         motion = _restricted(start, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             motion = level.best([motion, still], model, steps, pose)
@@ -158,7 +162,9 @@ def luminance(image: Floats) -> Floats:
 def _levels(sight: Sight) -> list[_Level]:
     longest = max(sight.observed.shape)
     sizes = [size for size, _ in LEVELS if size < longest] or [longest]
-    if sizes[-1] < longest <= LEVELS[-1][0]:
+    if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
+        sizes[-1] = longest
+    elif sizes[-1] < longest <= LEVELS[-1][0]:
         sizes.append(longest)
     return [_Level(sight, size / longest) for size in sizes]
 

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from cleargs.plugins import require_known
+
+STRATEGIES = ("mcmc", "adaptive")
+"""Densification strategies that ship with ClearGS."""
 
 
 class FormationConfig(BaseModel):
@@ -30,12 +35,36 @@ class FormationConfig(BaseModel):
     pose: bool = Field(False, description="correct the pose of a frame along with its motion")
 
 
+class AdaptiveConfig(BaseModel):
+    """The strategy ``adaptive``. Lengths are shares of the scene's radius; the values are those of 3DGS."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    grad: float = Field(
+        2e-4,
+        gt=0,
+        description="mean gradient by the place on a screen of 2 by 2 from which a Gaussian is copied",
+    )
+    dense: float = Field(
+        0.01, ge=0, description="largest scale of one that is copied as it is; a larger one is split in two"
+    )
+    large: float = Field(
+        0.1, gt=0, description="scale above which one is removed, once opacities have been lowered"
+    )
+    reset: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="share of the steps after which opacities are lowered again; 0: never",
+    )
+
+
 class TrainConfig(BaseModel):
     """How a scene is optimised.
 
-    Rates are those of 3DGS and gsplat but for the means, which get five times theirs, since a training here
-    has some thousand steps, not 30,000, and a fifth of the noise factor, so that the noise stays the same.
-    On the held-out frame 0026 of fox at a quarter of its width: 29.80 -> 30.55 dB after 800 steps.
+    Rates hold for 30,000 steps; a shorter training learns faster by ``rate_factor``. They are those of 3DGS
+    and gsplat but for the scales, which get twice theirs, and the means, which get 2.5 times theirs; their
+    noise is gsplat's at 3,200 steps. docs/training.md has what that is worth.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -47,9 +76,14 @@ class TrainConfig(BaseModel):
     )
     coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
 
-    densify: bool = Field(
-        True, description="move dead Gaussians, grow to the budget, add noise to the means (MCMC)"
+    densify: bool = Field(True, description="let the strategy change the number and places of the Gaussians")
+    strategy: str = Field(
+        "mcmc",
+        json_schema_extra={"plugin": "strategies"},
+        description="how the Gaussians change; mcmc: relocated and grown to the budget; adaptive: cloned and "
+        "split by their gradients on the screen, as in 3DGS; or one that another package brings",
     )
+    adaptive: AdaptiveConfig = Field(AdaptiveConfig(), description="the strategy adaptive")
     budget: int | None = Field(
         None,
         ge=1,
@@ -68,18 +102,26 @@ class TrainConfig(BaseModel):
     )
     min_opacity: float = Field(0.005, gt=0, lt=1, description="opacity at or below which a Gaussian is dead")
     noise: float = Field(
-        1e5, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
+        6.5e4, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
     )
     opacity_reg: float = Field(0.01, ge=0, description="factor on the mean opacity in the loss")
     scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
 
-    lr_means: float = Field(
-        8e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4, over 15 times the steps)"
-    )
+    lr_means: float = Field(4e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4)")
     lr_means_final: float = Field(
         0.01, gt=0, le=1, description="share of lr_means left at the last step, exponential decay"
     )
-    lr_scales: float = Field(5e-3, ge=0, description="rate of the log scales")
+    rate_factor: float | None = Field(
+        None,
+        gt=0,
+        le=20,
+        description="factor on the rates of means, scales, rotations and SH; unset = sqrt(30,000 / steps), 1 "
+        "to 6",
+    )
+    lr_final: float = Field(
+        0.1, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
+    )
+    lr_scales: float = Field(1e-2, ge=0, description="rate of the log scales (3DGS: 5e-3)")
     lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
     lr_opacities: float = Field(5e-2, ge=0, description="rate of the opacity logits")
     lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a twentieth")
@@ -104,6 +146,11 @@ class TrainConfig(BaseModel):
         description="memory for decoded images, MiB; changes no result",
         json_schema_extra={"key": False},
     )
+
+    @field_validator("strategy")
+    @classmethod
+    def _strategy_is_known(cls, name: str) -> str:
+        return require_known("strategies", name, STRATEGIES)
 
 
 class G0Config(TrainConfig):
@@ -142,12 +189,17 @@ class DistilConfig(TrainConfig):
     coarse_share: float = Field(
         0.0, ge=0, le=1, description="share of the steps that see reduced images; 0 = off"
     )
-    densify: bool = Field(
-        False, description="move dead Gaussians, grow to the budget, add noise to the means (MCMC)"
-    )
+    densify: bool = Field(False, description="let the strategy change the number and places of the Gaussians")
     opacity_reg: float = Field(0.0, ge=0, description="factor on the mean opacity in the loss")
     scale_reg: float = Field(0.0, ge=0, description="factor on the mean scale in the loss")
     lr_means: float = Field(8e-5, ge=0, description="rate of the means, at the first step")
+    lr_scales: float = Field(5e-3, ge=0, description="rate of the log scales")
+    rate_factor: float | None = Field(
+        1.0, gt=0, le=20, description="factor on the rates of means, scales, rotations and SH"
+    )
+    lr_final: float = Field(
+        1.0, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
+    )
     sh_interval: int = Field(
         0,
         ge=0,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from cleargs.errors import InputError
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import support
 
 
 class Render(NamedTuple):
@@ -20,45 +20,6 @@ class Render(NamedTuple):
     image: Tensor  # [H, W, 3] sRGB; not clamped above
     alpha: Tensor  # [H, W] 1 - final transmittance
     depth: Tensor | None  # [H, W] accumulated: the sum of weight * camera z, not divided by alpha
-
-
-class Rasteriser(Protocol):
-    """What a back end offers; outputs may be views that the next call overwrites."""
-
-    radii: Tensor
-
-    def forward(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        *,
-        sh_count: int,
-        background: tuple[float, float, float],
-        antialias: bool,
-        depth: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]: ...
-
-    def backward(
-        self, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
-    ) -> Gaussians: ...
-
-
-def rasteriser_for(device: torch.device) -> Rasteriser:
-    """The back end for a device.
-
-    Raises:
-        InputError: when there is none, or when it cannot run here.
-    """
-    if support.on_gpu(device):
-        support.require(device)
-        from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
-
-        return CudaRasteriser(device)
-    if device.type == "cpu":
-        from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
-
-        return CpuRasteriser()
-    raise InputError(f"there is no {device.type} back end for the splatting kernels", hint="use --device cpu")
 
 
 def sh_count(gaussians: Gaussians, sh_degree: int | None) -> int:
@@ -85,7 +46,7 @@ class Engine:
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
-        self._rasteriser = rasteriser_for(torch.device(device))
+        self._rasteriser = backend_for(device).rasteriser(torch.device(device))
 
     @property
     def radii(self) -> Tensor:
@@ -141,3 +102,7 @@ class Engine:
         Gaussians that are not visible, and SH coefficients above the degree in use, get exactly 0.
         """
         return self._rasteriser.backward(grad_image, grad_alpha, grad_depth)
+
+    def screen_gradients(self) -> Tensor:
+        """dL/d(projected mean) [N, 2] of the last ``backward``, by px; 0 where not visible. Own memory."""
+        return self._rasteriser.screen_gradients()

@@ -14,6 +14,7 @@ import torch
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
+from cleargs.plugins import load_part, plugins
 from cleargs.splat.compressed_ply import write_compressed_ply
 from cleargs.splat.export import transform_scene
 from cleargs.splat.gaussians import Gaussians
@@ -52,20 +53,27 @@ FORMATS: Mapping[str, Format] = {
 
 
 def format_of(path: Path) -> str:
-    """The ending of ``path`` in `FORMATS`. Raises InputError for any other."""
+    """The ending of ``path`` in `FORMATS`, or of a format that another package brings. Raises InputError for
+    any other."""
     name = path.name.lower()
-    kind = next((ending for ending in FORMATS if name.endswith(f".{ending}")), None)
-    if kind is None:
-        raise InputError(
-            f"{path} has no ending that says what to write",
-            hint=f"end it with one of .{', .'.join(FORMATS)}",
-        )
-    return kind
+    for endings in (FORMATS, brought := plugins("formats")):
+        for ending in endings:
+            if name.endswith(f".{ending}"):
+                return ending
+    raise InputError(
+        f"{path} has no ending that says what to write",
+        hint=f"end it with one of .{', .'.join((*FORMATS, *brought))}",
+    )
+
+
+def _format(kind: str) -> Format:
+    found: Format = FORMATS[kind] if kind in FORMATS else load_part("formats", kind)
+    return found
 
 
 def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None:
     """Raise InputError for what files of ``kind`` do not have."""
-    if up not in (None, "y") and FORMATS[kind].y_up:
+    if up not in (None, "y") and _format(kind).y_up:
         raise InputError(f"in a .{kind} y is always up", hint="give --up y, or leave it out")
     if spz_version is not None and kind != "spz":
         raise InputError(f"a .{kind} has no SPZ version", hint="leave out --spz-version")
@@ -74,11 +82,11 @@ def check_options(kind: str, *, up: str | None, spz_version: int | None) -> None
 def write_scene(
     path: Path, scene: Scene, kind: str, *, turned: bool = False, spz_version: int | None = None
 ) -> None:
-    """Write ``scene`` to ``path`` as ``kind`` of `FORMATS`, atomically.
+    """Write ``scene`` to ``path`` as `format_of` calls its kind, atomically.
 
     The scene has our axes, or with ``turned`` those that the file is to have.
     """
-    target = FORMATS[kind]
+    target = _format(kind)
     if target.axes != _AS_IS and not turned:
         scene = transform_scene(scene, scale=1.0, rotation=np.diag(target.axes), translation=np.zeros(3))
     if spz_version is not None:

@@ -71,6 +71,7 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
+        """Where the tensors lie."""
         return self.means.device
 
     def tensors(self) -> dict[str, Tensor]:

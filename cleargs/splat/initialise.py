@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.views import View
@@ -38,6 +39,45 @@ class SparsePoints:
     rgb: NDArray[np.uint8]  # [P, 3] sRGB
     observed: list[NDArray[np.int64]]
     """For each view, the rows of ``xyz`` that it observes."""
+
+    @classmethod
+    def seen_by(
+        cls,
+        frame_ids: Sequence[int],
+        point_id: NDArray[np.int64],  # [P]
+        xyz: NDArray[np.float64],  # [P, 3]
+        rgb: NDArray[np.uint8],  # [P, 3]
+        observations: tuple[NDArray[np.int32], NDArray[np.int64]],  # frame_id [M], point_id [M]
+    ) -> SparsePoints:
+        """All points, and which of them each of these frames observes."""
+        order = np.argsort(point_id)
+        frame, point = observations
+        index = order[np.searchsorted(point_id, point, sorter=order)]
+        return cls(xyz, rgb, [index[frame == wanted] for wanted in frame_ids])
+
+
+def starting_gaussians(
+    sparse: SparsePoints,
+    views: Sequence[View],
+    config: G0Config,
+    *,
+    seed: int,
+    say: Callable[[str], None] = lambda remark: None,
+) -> Gaussians:
+    """One Gaussian a sparse point, and more behind random pixels of the views until there are
+    ``config.min_points``; never more than ``config.budget``. ``say`` is told of points added or left out."""
+    most = config.budget or max(config.min_points, len(sparse.xyz))
+    if len(sparse.xyz) > most:
+        say(f"{most} of {len(sparse.xyz)} sparse points, which g0.budget allows")
+        sparse = fewer_points(sparse, most, seed=seed)
+    missing = min(config.min_points, most) - len(sparse.xyz)
+    if missing > 0:
+        say(f"{len(sparse.xyz)} sparse points, {missing} are added between them")
+        sparse = add_points(sparse, views, missing, seed=seed)
+    sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree
+    return from_points(
+        sparse, sh_degree=sh_degree, init_scale=config.init_scale, init_opacity=config.init_opacity
+    )
 
 
 def sh_degree_from_views(count: int) -> int:

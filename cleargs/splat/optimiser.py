@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -32,27 +33,46 @@ class Moments:
         )
 
 
+INRIA_STEPS = 30_000
+"""Steps of the training that the rates of 3DGS are made for."""
+MAX_RATE_FACTOR = 6.0
+
+
+def rate_factor(steps: int) -> float:
+    """How much faster means, scales, rotations and SH learn in a training of so many steps than in one of
+    `INRIA_STEPS`: a step of Adam is as long as its rate, so a short training with the rates of a long one
+    ends before they have got where they go (docs/training.md)."""
+    return min(MAX_RATE_FACTOR, max(1.0, math.sqrt(INRIA_STEPS / steps)))
+
+
 class Rates:
     """Learning rates by parameter name. The world is normalised, so the scene's extent is 1."""
 
     def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:
         self._config = config
-        sh = torch.full((coefficients * 3,), config.lr_sh / SH_REST_DIVISOR, device=device)
-        sh[:3] = config.lr_sh
-        self._fixed: dict[str, float | Tensor] = {
-            "log_scales": config.lr_scales,
-            "rotations": config.lr_rotations,
+        factor = rate_factor(config.steps) if config.rate_factor is None else config.rate_factor
+        self._factor = factor
+        sh = torch.full((coefficients * 3,), factor * config.lr_sh / SH_REST_DIVISOR, device=device)
+        sh[:3] = factor * config.lr_sh
+        self._first: dict[str, float | Tensor] = {
+            "log_scales": factor * config.lr_scales,
+            "rotations": factor * config.lr_rotations,
             "logit_opacities": config.lr_opacities,
             "sh": sh,
         }
 
     def means(self, step: int) -> float:
         """Rate of the means before step ``step``, counted from 0."""
-        return self._config.lr_means * float(self._config.lr_means_final ** (step / self._config.steps))
+        return (
+            self._factor
+            * self._config.lr_means
+            * float(self._config.lr_means_final ** (step / self._config.steps))
+        )
 
     def at(self, step: int) -> dict[str, float | Tensor]:
         """Every rate before step ``step``, counted from 0."""
-        return {"means": self.means(step), **self._fixed}
+        left = float(self._config.lr_final ** (step / self._config.steps))
+        return {"means": self.means(step), **{name: rate * left for name, rate in self._first.items()}}
 
 
 def step_gaussians(

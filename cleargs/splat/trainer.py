@@ -14,7 +14,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -23,10 +22,9 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Reporter, Task
-from cleargs.splat import strategy
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.densification import Densifier
 from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
@@ -36,11 +34,9 @@ from cleargs.splat.optimiser import Moments, Rates, step_gaussians
 from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
+from cleargs.splat.strategy import budget_from_pixels, make_strategy
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
-
-if TYPE_CHECKING:
-    from cleargs.splat.kernels.cuda.loss import Meter
 
 _REAL, _PSEUDO = range(2)
 """Purposes of random numbers; the next two are those of densification."""
@@ -156,13 +152,13 @@ class Trainer:
             )
         self._moments = Moments.zeros(self._gaussians)
         self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
-        budget = config.budget or strategy.budget_from_pixels(
+        budget = config.budget or budget_from_pixels(
             sum(view.camera.width * view.camera.height for view in self._real or self._pseudo)
         )
-        self._densifier = Densifier(config, budget, seed)
+        self._strategy = make_strategy(config, budget, seed)
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device)
-        self._meter = _meter(config, self._device)
+        self._meter = backend_for(self._device).meter(config.ssim_lambda)
         self._log = TrainLog(config.steps)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
@@ -201,7 +197,11 @@ class Trainer:
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
-        _regularise(self._gaussians, gradients, config)
+        if config.densify:
+            self._strategy.observe(self._engine, view.camera if formed is None else formed.camera)
+        backend_for(self._device).regularise(
+            self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
+        )
         step_gaussians(
             self._gaussians, gradients, self._moments, self._rates.at(self.done), step=self.done + 1
         )
@@ -234,6 +234,7 @@ class Trainer:
         groups = (self._gaussians.tensors(), self._moments.first, self._moments.second)
         for prefix, group in zip(("parameter", "first", "second"), groups, strict=True):
             state |= {f"{prefix}.{name}": tensor for name, tensor in group.items()}
+        state |= {f"strategy.{name}": tensor for name, tensor in self._strategy.state().items()}
         if self._formation is not None:
             state |= {f"formation.{name}": tensor for name, tensor in self._formation.state().items()}
         return state
@@ -254,6 +255,7 @@ class Trainer:
         self._log.restore(state["log"])
         self._gaussians = Gaussians(**group("parameter")).to(self._device)
         self._moments = Moments(*(self._on_device(group(prefix)) for prefix in ("first", "second")))
+        self._strategy.restore(self._on_device(group("strategy")))
         if self._formation is not None:
             self._formation.restore(group("formation"))
 
@@ -320,11 +322,13 @@ class Trainer:
             raise self._stopped("the loss is not finite")
 
     def _densify(self) -> None:
-        """Relocate and grow where a refinement is due, then shake the means."""
-        if self._densifier.due(self.done):
+        """What the strategy does, and its refinement where one is due."""
+        config = self._config
+        between = config.refine_start * config.steps <= self.done <= config.refine_stop * config.steps
+        if between and self.done % config.refine_interval == 0:
             self.check_finite()  # relocation takes a Gaussian whose opacity is NaN for dead, and hides it
-            self._gaussians, self._moments = self._densifier.refine(self._gaussians, self._moments, self.done)
-        self._densifier.shake(self._gaussians, self._rates.means(self.done), self.done)
+            self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, self.done)
+        self._strategy.after_step(self._gaussians, self._rates.means(self.done), self.done)
 
     def _on_device(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         return {name: tensor.to(self._device) for name, tensor in tensors.items()}
@@ -386,15 +390,6 @@ class _Progress:
         self._task.update(done=trainer.done, note=", ".join(words))
 
 
-def _meter(config: TrainConfig, device: torch.device) -> Meter | None:
-    """Keeps losses on the GPU until they are needed; None on the CPU, where they are known at once."""
-    if not support.on_gpu(device):
-        return None
-    from cleargs.splat.kernels.cuda.loss import Meter
-
-    return Meter(config.ssim_lambda)
-
-
 def _fingerprint(
     scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
@@ -405,23 +400,3 @@ def _fingerprint(
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
-
-
-def _regularise(gaussians: Gaussians, gradients: Gaussians, config: TrainConfig) -> None:
-    """Add to the gradients those of opacity_reg * mean(opacity) + scale_reg * mean(scale) (3DGS-MCMC)."""
-    if support.on_gpu(gaussians.device):
-        if config.opacity_reg > 0.0:
-            opacities = gaussians.logit_opacities.sigmoid()
-            gradients.logit_opacities += config.opacity_reg / gaussians.num * opacities * (1 - opacities)
-        if config.scale_reg > 0.0:
-            share = config.scale_reg / gaussians.log_scales.numel()
-            gradients.log_scales += share * gaussians.log_scales.exp()
-        return
-    if config.opacity_reg > 0.0:
-        opacity = strategy.sigmoid(gaussians.logit_opacities.numpy())
-        gradients.logit_opacities.numpy()[:] += (
-            np.float32(config.opacity_reg / gaussians.num) * opacity * (1 - opacity)
-        )
-    if config.scale_reg > 0.0:
-        scales = np.exp(gaussians.log_scales.numpy())
-        gradients.log_scales.numpy()[:] += np.float32(config.scale_reg / scales.size) * scales

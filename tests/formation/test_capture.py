@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from cleargs.formation.capture import CaptureFormation, rolls
+from cleargs.formation.capture import FEWEST_ASKED, MOST_ASKED, CaptureFormation, _spread, rolls
 from cleargs.formation.colour import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
@@ -167,15 +167,23 @@ def skewed(frames: list[int]) -> list[View]:
     return made
 
 
-@pytest.mark.parametrize("frames", [[0, 1, 2, 3, 4], [2]])
+@pytest.mark.parametrize("frames", [[0, 1, 2, 3, 4], [1]])
 def test_a_shutter_rolls_in_the_whole_capture_or_not_at_all(tmp_path: Path, frames: list[int]) -> None:
     """A single skewed frame has a wrong pose, or something moved in it."""
     formation = CaptureFormation(skewed(frames), FormationConfig(start=0.0, every=3))
     run(tmp_path, skewed(frames), formation)
-    gains = {k: frame.skew_gain or 0.0 for k, frame in formation.frames.items()}
-    assert all(gains[k] > 0.1 for k in frames), gains
+    gains = {k: frame.skew_gain for k, frame in formation.frames.items() if frame.skew_gain is not None}
+    assert 1 in gains and all(gain > 0.1 for k, gain in gains.items() if k in frames), gains
     found = {k for k, frame in formation.frames.items() if frame.model in ("skew", "both")}
     assert found == (set(range(FRAMES)) if len(frames) == FRAMES else set())
+
+
+def test_some_frames_spread_evenly_are_asked_whether_the_shutter_rolls(tmp_path: Path) -> None:
+    formation = CaptureFormation(views(), FormationConfig(start=0.0, every=3))
+    run(tmp_path, views(), formation)
+    assert sum(frame.skew_gain is not None for frame in formation.frames.values()) == FEWEST_ASKED
+    assert _spread(3) == [0, 1, 2] and _spread(10) == [1, 3, 5, 7, 9]
+    assert len(_spread(150)) == MOST_ASKED and _spread(150)[0] == 4 and _spread(150)[-1] == 145
 
 
 def test_few_frames_or_little_gain_tell_no_rolling_shutter() -> None:

@@ -16,6 +16,7 @@ from splat_scenes import BACKGROUND, compare, make_camera, make_gaussians
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import layout, support
 from cleargs.splat.render import render
 
@@ -201,3 +202,22 @@ def test_exhausted_memory_names_the_settings():
     with pytest.raises(StageError, match="memory") as caught, support.memory_errors():
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nMore.")
     assert "budget" in caught.value.hint
+
+
+def test_the_gradients_on_the_screen_are_the_cpus(device):
+    from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
+
+    camera = make_camera(36, 27)
+    doubles = make_gaussians(camera, 30)
+    gaussians = Gaussians(**{name: tensor.float() for name, tensor in doubles.tensors().items()})
+    upstream = torch.randn(27, 36, 3, generator=torch.Generator().manual_seed(0))
+    found = []
+    for rasteriser, place in ((CpuRasteriser(), "cpu"), (Engine(device)._rasteriser, device)):
+        rasteriser.forward(
+            gaussians.to(place), camera, sh_count=1, background=(0.0, 0.0, 0.0), antialias=False, depth=False
+        )
+        rasteriser.backward(upstream.to(place), None, None)
+        found.append(rasteriser.screen_gradients().cpu())
+    assert found[0].abs().max() > 1e-2 and not torch.isnan(found[1]).any()
+    # Two back ends in float32 over some hundred pixels a Gaussian.
+    torch.testing.assert_close(found[1], found[0], rtol=2e-3, atol=2e-4)

@@ -15,12 +15,12 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.colour import Exposure, affine_backward, apply_affine
 from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
-from cleargs.splat import strategy
 from cleargs.splat.adam import adam_step
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.losses import photometric_loss, psnr, ssim
 from cleargs.splat.state import load_state
+from cleargs.splat.strategy import mcmc
 from cleargs.splat.trainer import Trainer, train
 from cleargs.splat.views import ImageCache
 
@@ -140,7 +140,7 @@ def test_split_opacity_is_the_strategys(densify):
     rng = np.random.default_rng(0)
     opacity, copies = rng.uniform(0.01, 0.99, 200), rng.integers(2, 9, 200)
     split, factor = densify.split_opacity(torch.from_numpy(opacity), torch.from_numpy(copies))
-    expected = strategy.split_opacity(opacity, copies)
+    expected = mcmc.split_opacity(opacity, copies)
     # Alternating binomial sums lose digits with the number of copies: 2e-14 for two, 1e-10 for eight.
     np.testing.assert_allclose(split.numpy(), expected[0], rtol=1e-12)
     np.testing.assert_allclose(factor.numpy(), expected[1], rtol=1e-9)
@@ -208,7 +208,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     densify.shake(gaussians, amount=2.0, min_opacity=0.005, seed=11)
     offsets = (gaussians.means - start).double().cpu()
     assert not offsets[:10].any()
-    rotation = strategy.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
+    rotation = mcmc.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
     covariance = rotation @ np.diag(np.exp(2.0 * one.log_scales[0].double().numpy())) @ rotation.T
     # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ²; a sample's entries are good to some per cent.
     fade = 1.0 / (1.0 + math.exp(-100.0 * (0.005 - 1.0 / (1.0 + math.exp(9.0)))))

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 PROGRAM = """
 import hashlib, sys
 import torch
@@ -72,6 +74,7 @@ print(hashlib.sha256(project(make_gaussians(camera, 200), camera)[0].tobytes()).
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_compiled_just_now_rounds_like_one_from_the_cache(tmp_path: Path):
     here = Path(__file__).parent
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here)}

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from cleargs.cli import common
 from cleargs.cli.main import main
 from cleargs.errors import InputError
+from cleargs.pipeline import session
 from cleargs.pipeline.keys import KeyParts, key_config, library_versions
 from cleargs.splat.engine import Engine
 from cleargs.splat.kernels.cuda import support
@@ -32,21 +32,21 @@ def test_engine_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch)
 def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(Path, "exists", lambda self: False)
-    assert common.resolve_device("auto", said.append) == "cpu"
+    assert session.resolve_device("auto", said.append) == "cpu"
     with pytest.raises(InputError, match="no NVIDIA GPU"):
-        common.resolve_device("cuda", said.append)
+        session.resolve_device("cuda", said.append)
     monkeypatch.setattr(Path, "exists", lambda self: True)
-    monkeypatch.setattr(common, "find_spec", lambda name: None)
-    assert "Triton" in (common.cuda_obstacle() or "")
-    monkeypatch.setattr(common, "find_spec", lambda name: object())
-    monkeypatch.setattr(common, "version", lambda name: "2.13.0+cpu")
-    assert "CPU only" in (common.cuda_obstacle() or "")
-    monkeypatch.setattr(common, "version", lambda name: "2.13.0")
-    assert common.resolve_device("cuda", said.append) == "cuda"
+    monkeypatch.setattr(session, "find_spec", lambda name: None)
+    assert "Triton" in (session.cuda_obstacle() or "")
+    monkeypatch.setattr(session, "find_spec", lambda name: object())
+    monkeypatch.setattr(session, "version", lambda name: "2.13.0+cpu")
+    assert "CPU only" in (session.cuda_obstacle() or "")
+    monkeypatch.setattr(session, "version", lambda name: "2.13.0")
+    assert session.resolve_device("cuda", said.append) == "cuda"
     assert not said
     # Not before the back end has passed its tests on a device.
-    assert common.resolve_device("auto", said.append) == common.resolve_device("cpu", said.append) == "cpu"
-    assert said == [common.UNUSED_GPU]
+    assert session.resolve_device("auto", said.append) == session.resolve_device("cpu", said.append) == "cpu"
+    assert said == [session.UNUSED_GPU]
 
 
 @pytest.mark.parametrize("stage", ["g0", "rivr", "consolidate"])
@@ -68,7 +68,7 @@ def test_the_device_is_part_of_the_key(stage: str) -> None:
 def test_the_gpu_benchmark_says_what_it_needs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(common, "cuda_obstacle", lambda: "there is no NVIDIA GPU")
+    monkeypatch.setattr(session, "cuda_obstacle", lambda: "there is no NVIDIA GPU")
     with pytest.raises(SystemExit) as caught:
         main(["bench", "splat", "--device", "cuda"])
     assert caught.value.code == 2

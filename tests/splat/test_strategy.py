@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cleargs.splat.strategy import (
-    budget_from_pixels,
+from cleargs.splat.strategy import budget_from_pixels
+from cleargs.splat.strategy.mcmc import (
     grow,
     mean_noise,
     relocate,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +16,18 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
 from cleargs.splat.kernels.cpu.jit import Array, Floats
-from cleargs.splat.kernels.layout import MAX_PAIRS, PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH, TILE
+from cleargs.splat.kernels.layout import (
+    BEND_X,
+    BEND_Y,
+    MAX_PAIRS,
+    PAIR_COLUMNS,
+    SKEW,
+    SPLAT_COLUMNS,
+    SUM_DEPTH,
+    SUM_VU,
+    SUM_VY,
+    TILE,
+)
 from cleargs.splat.kernels.memory import available_memory
 
 PAIR_BUFFERS = ("pair_tiles", "pair_ids", "pair_slots", "pair_sums")
@@ -93,6 +105,7 @@ class CpuRasteriser:
     def __init__(self) -> None:
         self._buffers = Buffers()
         self._frame: Frame | None = None
+        self._pair_sums: Array | None = None
         self.radii: Tensor = torch.empty(0)
 
     def forward(
@@ -124,7 +137,7 @@ class CpuRasteriser:
                     frame.last,
                     depths,
                 )
-        self._frame = frame
+        self._frame, self._pair_sums = frame, None
         alpha = np.subtract(np.float32(1), frame.transmittance, out=self._buffers.take("alpha", shape))
         return (
             torch.from_numpy(image),
@@ -174,7 +187,25 @@ class CpuRasteriser:
                 pair_sums,
                 *outputs,
             )
+        self._pair_sums = pair_sums
         return Gaussians(*(torch.from_numpy(output) for output in outputs))
+
+    def screen_gradients(self) -> Tensor:
+        """dL/d(projected mean) [N, 2] of the last backward pass, by px; 0 where not visible."""
+        frame, sums = self._frame, self._pair_sums
+        if frame is None or sums is None or len(sums) != len(frame.pair_ids):
+            raise RuntimeError("screen_gradients() needs a backward() before it")
+        pairs = np.diff(frame.pair_offsets)
+        shown = np.flatnonzero(pairs)
+        owner = np.repeat(np.arange(len(shown)), pairs[shown])
+        u, v = (np.bincount(owner, sums[:, column], len(shown)) for column in (SUM_VU, SUM_VY))  # float64
+        # a, e and k are those of `layout`; BEND_X is a log2(e) / 2.
+        splats = frame.splats[shown]
+        x = 2.0 * math.log(2.0) * splats[:, BEND_X] * u
+        y = 2.0 * math.log(2.0) * splats[:, BEND_Y] * v - splats[:, SKEW] * x
+        gradient = np.zeros((len(pairs), 2), np.float32)
+        gradient[shown] = np.stack([x, y], axis=1)
+        return torch.from_numpy(gradient)
 
     def _project_and_bin(
         self,

@@ -1,4 +1,4 @@
-"""Relocation, growth and noise of 3DGS-MCMC on the device; the rules are those of ``cleargs.splat.strategy``.
+"""Relocation, growth and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.mcmc``.
 
 Relocation and growth happen every so many steps and are torch operations; the noise of every step is one
 kernel. Draws come from Philox counters keyed by the step's seed. Gaussians are drawn through integer prefix
@@ -16,9 +16,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from cleargs.splat import strategy
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
+from cleargs.splat.strategy import mcmc
 
 BLOCK = 256
 WEIGHT_BITS = 32
@@ -45,11 +45,11 @@ def sample(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def split_opacity(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """``strategy.split_opacity`` on float64 tensors [M].
+    """``mcmc.split_opacity`` on float64 tensors [M].
 
     The double sum of the paper's equation 9 is one sum here, as C(0, k) + ... + C(c - 1, k) = C(c, k + 1).
     """
-    most = strategy.MAX_COPIES
+    most = mcmc.MAX_COPIES
     table = torch.tensor(
         [
             [(-1.0) ** k / math.sqrt(k + 1.0) * math.comb(c, k + 1) for k in range(most)]
@@ -173,7 +173,7 @@ def shake_kernel(
 
 
 def shake(gaussians: Gaussians, *, amount: float, min_opacity: float, seed: int) -> None:
-    """Noise on the means for one step, in place; only Gaussians below ``strategy.NOISE_CUT`` feel it."""
+    """Noise on the means for one step, in place; only Gaussians below ``mcmc.NOISE_CUT`` feel it."""
     shake_kernel[(-(-gaussians.num // BLOCK),)](
         gaussians.means,
         gaussians.log_scales,
@@ -183,7 +183,7 @@ def shake(gaussians: Gaussians, *, amount: float, min_opacity: float, seed: int)
         seed,
         amount,
         min_opacity,
-        strategy.NOISE_CUT,
+        mcmc.NOISE_CUT,
         BLOCK=BLOCK,
         num_warps=4,
     )

@@ -5,6 +5,7 @@ A forward pass waits for the device once, to learn how many (tile, splat) pairs 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -249,6 +250,19 @@ class CudaRasteriser:
                 num_warps=4,
             )
         return Gaussians(**outputs)
+
+    def screen_gradients(self) -> Tensor:
+        """dL/d(projected mean) [N, 2] of the last backward pass, by px; 0 where not visible."""
+        frame = self._frame
+        if frame is None:
+            raise RuntimeError("screen_gradients() needs a backward() before it")
+        totals = self._buffers.take("totals", layout.PAIR_COLUMNS, frame.gaussians.num, dtype=torch.float64)
+        seen = frame.tile_counts > 0  # elsewhere nothing was written
+        # a, e and k are those of `layout`; BEND_X is a log2(e) / 2.
+        a, e = (2.0 * math.log(2.0) * frame.splats[:, column] for column in (layout.BEND_X, layout.BEND_Y))
+        x = a * totals[layout.SUM_VU]
+        y = e * totals[layout.SUM_VY] - frame.splats[:, layout.SKEW] * x
+        return torch.where(seen[:, None], torch.stack([x, y], dim=1), 0.0).float()
 
     def _project_and_bin(
         self,

@@ -3,17 +3,26 @@
 As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
 the means are shaken by noise that only transparent Gaussians feel.
 
-Pure functions on numpy arrays: one thread, so the results depend on no thread count.
+The rules are pure functions on numpy arrays: one thread, so the results depend on no thread count. A GPU has
+the same rules, and draws other random numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cleargs.splat.backend import backend_for
+from cleargs.splat.strategy.base import NOISE, REFINE, Strategy
+
+if TYPE_CHECKING:
+    from cleargs.splat.config import TrainConfig
+    from cleargs.splat.gaussians import Gaussians
+    from cleargs.splat.optimiser import Moments
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -26,14 +35,35 @@ NOISE_CUT = 0.15
 """Opacity above which the noise factor is under 1e-6, and is left out."""
 
 
-def budget_from_pixels(pixels: int) -> int:
-    """Hard budget of a capture whose active frames hold ``pixels`` pixels in all.
+class MCMC(Strategy):
+    """See the module. It remembers nothing from step to step."""
 
-    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
-    within [40,000, 150,000]: fewer cost a small capture a dB (docs/training.md); with more, an iteration on
-    two cores is no longer well under a second.
-    """
-    return int(np.clip(pixels // 160, 40_000, 150_000))
+    def __init__(self, config: TrainConfig, budget: int, seed: Sequence[int]) -> None:
+        self._config = config
+        self._budget = budget
+        self._seed = tuple(seed)
+
+    def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
+        """Relocate the dead and grow."""
+        return backend_for(gaussians.device).relocate_and_grow(
+            gaussians,
+            moments,
+            rate=self._config.growth,
+            budget=self._budget,
+            min_opacity=self._config.min_opacity,
+            seed=(*self._seed, REFINE, step),
+        )
+
+    def after_step(self, gaussians: Gaussians, rate: float, step: int) -> None:
+        """Add the noise of a step to the means."""
+        config = self._config
+        if config.noise > 0.0:
+            backend_for(gaussians.device).add_position_noise(
+                gaussians,
+                amount=config.noise * rate,
+                min_opacity=config.min_opacity,
+                seed=(*self._seed, NOISE, step),
+            )
 
 
 def sample(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:

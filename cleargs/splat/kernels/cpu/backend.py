@@ -1,0 +1,217 @@
+"""The CPU's part of `cleargs.splat.backend.Backend`: tensors in, Numba kernels inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu import adam, colour, launch, loss
+from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
+from cleargs.splat.losses import PhotometricLoss
+from cleargs.splat.optimiser import Moments
+from cleargs.splat.strategy import mcmc
+
+ADAM_BLOCK = 4096
+"""Elements per work item, about."""
+
+
+def rasteriser(device: torch.device) -> CpuRasteriser:
+    return CpuRasteriser()
+
+
+# -- loss --------------------------------------------------------------------------------------------------
+
+
+def photometric_loss(
+    image: Tensor,
+    target: Tensor,
+    *,
+    ssim_lambda: float,
+    weight: float,
+    mask: Tensor | None,
+    gradient: Tensor,
+) -> PhotometricLoss:
+    with launch.exclusive():
+        padded = _pad(image, target, mask)
+        l1, similarity, count, maps = _measure(padded)
+        if weight == 0.0 or count == 0:
+            gradient.zero_()
+        else:
+            loss.differentiate(
+                padded.image,
+                padded.target,
+                padded.counted,
+                loss.ssim_window(),
+                maps,
+                np.float32(weight * (1.0 - ssim_lambda) / count),
+                np.float32(-weight * ssim_lambda / count),
+                gradient.numpy(),
+            )
+    value = weight * ((1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - similarity)) if count else 0.0
+    return PhotometricLoss(value, gradient, l1, similarity)
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    with launch.exclusive():
+        _, similarity, _, _ = _measure(_pad(image, target, mask))
+    return similarity
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    row_sums = np.empty((image.shape[0], 2), np.float64)
+    with launch.exclusive():
+        loss.squared_errors(_read(image), _read(target), None if mask is None else _read(mask), row_sums)
+    total, count = math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
+    return 10.0 * math.log10(count / total) if total > 0.0 else math.inf
+
+
+def meter(ssim_lambda: float) -> None:
+    """Losses are known at once."""
+
+
+class _Padded(NamedTuple):
+    image: npt.NDArray[np.float32]  # [H, padded length]
+    target: npt.NDArray[np.float32]
+    counted: npt.NDArray[np.float32]
+
+
+def _read(tensor: Tensor) -> npt.NDArray[np.float32]:
+    array: npt.NDArray[np.float32] = tensor.detach().contiguous().numpy()
+    return array
+
+
+def _pad(image: Tensor, target: Tensor, mask: Tensor | None) -> _Padded:
+    shape = (image.shape[0], loss.padded_length(image.shape[1]))
+    padded = _Padded(*(np.empty(shape, np.float32) for _ in range(3)))
+    loss.pad_images(_read(image), _read(target), None if mask is None else _read(mask), *padded)
+    return padded
+
+
+def _measure(padded: _Padded) -> tuple[float, float, float, npt.NDArray[np.float32]]:
+    """Mean |x - y|, mean SSIM, the number of values that count, and the derivative maps of SSIM."""
+    # The kernels read maps between the padding only, so what is there need not be set.
+    maps = np.empty((3, *padded.image.shape), np.float32)
+    row_sums = np.empty((len(padded.image), 3), np.float64)
+    loss.measure(*padded, loss.ssim_window(), maps, row_sums)
+    l1, similarity, count = (math.fsum(column) for column in row_sums.T)
+    if count == 0:
+        return 0.0, 1.0, 0.0, maps
+    return l1 / count, similarity / count, count, maps
+
+
+# -- optimiser ---------------------------------------------------------------------------------------------
+
+
+def adam_step(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    *,
+    step: int,
+    lr: float | Tensor,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    columns = parameter.numel() // len(parameter)
+    rates = np.asarray(lr, np.float64).reshape(-1)
+    beta1, beta2 = betas
+    corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
+    tensors = (parameter, gradient, first_moment, second_moment)
+    flat = [tensor.detach().view(-1).numpy() for tensor in tensors]
+    with launch.exclusive():
+        adam.adam(
+            flat[0],
+            flat[1],
+            flat[2],
+            flat[3],
+            np.tile(corrected, max(1, ADAM_BLOCK // columns)),
+            np.float32(beta1),
+            np.float32(beta2),
+            np.float32(eps),
+            np.float32(math.sqrt(1.0 - beta2**step)),
+        )
+
+
+def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
+    if opacity > 0.0:
+        opacities = mcmc.sigmoid(gaussians.logit_opacities.numpy())
+        gradients.logit_opacities.numpy()[:] += (
+            np.float32(opacity / gaussians.num) * opacities * (1 - opacities)
+        )
+    if scale > 0.0:
+        scales = np.exp(gaussians.log_scales.numpy())
+        gradients.log_scales.numpy()[:] += np.float32(scale / scales.size) * scales
+
+
+# -- densification -----------------------------------------------------------------------------------------
+
+
+def relocate_and_grow(
+    gaussians: Gaussians,
+    moments: Moments,
+    *,
+    rate: float,
+    budget: int,
+    min_opacity: float,
+    seed: Sequence[int],
+) -> tuple[Gaussians, Moments]:
+    rng = np.random.default_rng([*seed])
+    arrays = {name: tensor.numpy() for name, tensor in gaussians.tensors().items()}
+    running = [
+        {name: tensor.numpy() for name, tensor in group.items()} for group in (moments.first, moments.second)
+    ]
+    mcmc.relocate(arrays, running, min_opacity=min_opacity, rng=rng)
+    arrays, running = mcmc.grow(arrays, running, rate=rate, budget=budget, min_opacity=min_opacity, rng=rng)
+    grown, first, second = (
+        {name: torch.from_numpy(array) for name, array in group.items()} for group in (arrays, *running)
+    )
+    return Gaussians(**grown), Moments(first, second)
+
+
+def add_position_noise(
+    gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
+) -> None:
+    felt, offsets = mcmc.mean_noise(
+        gaussians.log_scales.numpy(),
+        gaussians.rotations.numpy(),
+        gaussians.logit_opacities.numpy(),
+        amount=amount,
+        min_opacity=min_opacity,
+        rng=np.random.default_rng([*seed]),
+    )
+    gaussians.means.numpy()[felt] += offsets
+
+
+# -- colour ------------------------------------------------------------------------------------------------
+
+
+def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
+    output = torch.empty(image.shape)
+    with launch.exclusive():
+        colour.apply_affine(
+            image.detach().contiguous().numpy(), affine.detach().float().contiguous().numpy(), output.numpy()
+        )
+    return output
+
+
+def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
+    grad_image = torch.empty(image.shape)
+    row_sums = np.empty((image.shape[0], 3, 4), np.float64)
+    with launch.exclusive():
+        colour.affine_backward(
+            image.detach().contiguous().numpy(),
+            affine.detach().float().contiguous().numpy(),
+            grad_output.detach().contiguous().numpy(),
+            grad_image.numpy(),
+            row_sums,
+        )
+    sums = [math.fsum(column) for column in row_sums.reshape(len(row_sums), 12).T]
+    return grad_image, torch.tensor(sums, dtype=torch.float64).reshape(3, 4)

@@ -1,0 +1,108 @@
+"""The GPU's part of `cleargs.splat.backend.Backend`: tensors in, Triton kernels inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda import adam, densify, support
+from cleargs.splat.kernels.cuda.colour import affine_backward as affine_backward
+from cleargs.splat.kernels.cuda.colour import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.loss import Meter, Photometer
+from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
+from cleargs.splat.losses import PhotometricLoss
+from cleargs.splat.optimiser import Moments
+
+
+def rasteriser(device: torch.device) -> CudaRasteriser:
+    """Raises InputError when the kernels cannot run on ``device``."""
+    support.require(device)
+    return CudaRasteriser(device)
+
+
+def photometric_loss(
+    image: Tensor,
+    target: Tensor,
+    *,
+    ssim_lambda: float,
+    weight: float,
+    mask: Tensor | None,
+    gradient: Tensor,
+) -> PhotometricLoss:
+    measured = Photometer()(
+        image,
+        target,
+        mask,
+        l1_weight=weight * (1.0 - ssim_lambda),
+        ssim_weight=-weight * ssim_lambda,
+        gradient=gradient,
+    )
+    read = measured.read(ssim_lambda=ssim_lambda, weight=weight)
+    return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    measured = Photometer()(image, target, mask, l1_weight=0.0, ssim_weight=0.0, gradient=None)
+    return measured.read(ssim_lambda=0.0, weight=1.0).ssim
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    errors = (image.detach().double() - target.double()).square()
+    errors = errors if mask is None else errors[mask]
+    mean = float(errors.mean()) if errors.numel() else 0.0
+    return -10.0 * math.log10(mean) if mean > 0.0 else math.inf
+
+
+def meter(ssim_lambda: float) -> Meter:
+    return Meter(ssim_lambda)
+
+
+def adam_step(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    *,
+    step: int,
+    lr: float | Tensor,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    rates = adam.rates_tensor(lr, parameter.device)
+    adam.adam_step(parameter, gradient, first_moment, second_moment, rates, step=step, betas=betas, eps=eps)
+
+
+def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
+    if opacity > 0.0:
+        opacities = gaussians.logit_opacities.sigmoid()
+        gradients.logit_opacities += opacity / gaussians.num * opacities * (1 - opacities)
+    if scale > 0.0:
+        gradients.log_scales += scale / gaussians.log_scales.numel() * gaussians.log_scales.exp()
+
+
+def relocate_and_grow(
+    gaussians: Gaussians,
+    moments: Moments,
+    *,
+    rate: float,
+    budget: int,
+    min_opacity: float,
+    seed: Sequence[int],
+) -> tuple[Gaussians, Moments]:
+    running = [moments.first, moments.second]
+    seeds = [densify.seed_of(*seed, part) for part in (0, 1)]
+    densify.relocate(gaussians, running, min_opacity=min_opacity, seed=seeds[0])
+    gaussians, running = densify.grow(
+        gaussians, running, rate=rate, budget=budget, min_opacity=min_opacity, seed=seeds[1]
+    )
+    return gaussians, Moments(*running)
+
+
+def add_position_noise(
+    gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
+) -> None:
+    densify.shake(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))
