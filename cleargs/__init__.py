@@ -1,3 +1,31 @@
 """ClearGS: clean 3D Gaussian Splatting scenes from handheld videos of mixed quality."""
 
-__version__ = "0.1.0"
+from importlib import import_module
+
+__version__ = "0.2.0"
+
+# Loaded when first asked for, so that `import cleargs` costs nothing. Their types stand in __init__.pyi.
+_HOMES = {
+    "run": "api",
+    **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "results"),
+    **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api"),
+    **dict.fromkeys(("score_frames", "score", "restore", "deblur", "evaluate_scene"), "api"),
+    "Camera": "splat.camera",
+    "CleargsError": "errors",
+    "G0Config": "splat.config",
+    "Gaussians": "splat.gaussians",
+    "Scene": "splat.scene",
+    "TrainConfig": "splat.config",
+    "View": "splat.views",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

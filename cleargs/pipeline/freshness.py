@@ -1,7 +1,8 @@
 """Whether what a run shows was made with the run's settings and inputs: one answer for all who read results.
 
 Stale is a finished stage that was made with other settings, another seed, other files of the capture or other
-model weights than the run has now, or from a stage that is stale or not there; and one without its manifest.
+model weights than the run has now, or from a stage that is stale or not there; and one without its manifest,
+or whose files are no longer those that it published.
 A newer version of the program or of a library makes nothing stale: `cleargs explain` says what a run would
 make again for that reason.
 """
@@ -18,7 +19,7 @@ from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo, tree_digest
 from cleargs.pipeline.keys import differences, key_config
-from cleargs.pipeline.manifest import Manifest, linked_manifest
+from cleargs.pipeline.manifest import Manifest, damage, linked_manifest
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, read_run_file
 from cleargs.pipeline.store import Store
@@ -43,7 +44,10 @@ def stale_stages(dag: Dag, run: Run) -> dict[str, Reasons]:
             reasons += [f"it was made from stale {', '.join(old)}"] if old else []
             if reasons:
                 stale[name] = tuple(reasons)
-    return stale
+        for name, manifest in made.items():  # last: what was made from it before it was damaged is as it was
+            if (fault := damage(run.folder / name, manifest, memo)) is not None:
+                stale[name] = (*stale.get(name, ()), fault)
+    return {name: stale[name] for name in dag.names if name in stale}
 
 
 def require_fresh(dag: Dag, folder: Path, stages: Sequence[str], *, stale: bool = False) -> str:

@@ -10,9 +10,11 @@ import json
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict
+
+from cleargs.plugins import Socket, plugin
 
 SCHEMA = 1
 """Raised when the way keys are made changes: every old result becomes a miss."""
@@ -80,6 +82,24 @@ def library_versions(distributions: tuple[str, ...], device: Literal["cpu", "cud
             versions[name] = _onnxruntime(device)
         elif name != "triton" or device == "cuda":
             versions[name] = _version(name)
+    return versions
+
+
+def plugin_versions(config: BaseModel, prefix: str = "") -> dict[str, str]:
+    """What other packages bring to the settings: "DISTRIBUTION for SETTING=NAME" -> installed version.
+
+    A field that may name such a part is declared with ``json_schema_extra={"plugin": SOCKET}``.
+    """
+    versions: dict[str, str] = {}
+    for name, field in type(config).model_fields.items():
+        value, extra = getattr(config, name), field.json_schema_extra
+        if isinstance(value, BaseModel):
+            versions |= plugin_versions(value, f"{prefix}{name}.")
+        elif isinstance(extra, dict) and "plugin" in extra and value != field.default:
+            found = plugin(cast(Socket, extra["plugin"]), value)
+            if found is not None:
+                distribution, version = found.distribution
+                versions[f"{distribution} for {prefix}{name}={value}"] = version
     return versions
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from cleargs.errors import InputError, StoreError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import require_utf8, tree_digest
-from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions
+from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions, plugin_versions
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, External, StageContext
@@ -96,7 +96,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device,
-            libraries=library_versions(stage.LIBRARIES, self.run.device),
+            libraries=library_versions(stage.LIBRARIES, self.run.device) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited = tuple(
@@ -245,10 +245,10 @@ def cost_line(plans: list[StagePlan]) -> str:
     if not costs:
         return ""
     words = [
-        f"{stage} {cost.minutes:.1f} min {cost.memory_gb:.1f} GB, disk {cost.disk_gb:.1f} GB"
+        f"{stage} {_time(cost.minutes)} {cost.memory_gb:.1f} GB, disk {_size(cost.disk_gb)}"
         for stage, cost in costs
     ]
-    return f"expected about {sum(cost.minutes for _, cost in costs):.1f} min: " + "; ".join(words)
+    return f"expected about {_time(sum(cost.minutes for _, cost in costs))}: " + "; ".join(words)
 
 
 def check_disk(plans: list[StagePlan], store: Path) -> None:
@@ -262,6 +262,10 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
             f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
         )
+
+
+def _time(minutes: float) -> str:
+    return f"{minutes:.1f} min" if minutes >= 0.5 else f"{60 * minutes:.0f} s"
 
 
 def _size(gigabytes: float) -> str:

@@ -1,0 +1,26 @@
+from cleargs.api import deblur as deblur
+from cleargs.api import evaluate_scene as evaluate_scene
+from cleargs.api import initialise as initialise
+from cleargs.api import load as load
+from cleargs.api import render_view as render_view
+from cleargs.api import restore as restore
+from cleargs.api import run as run
+from cleargs.api import save as save
+from cleargs.api import score as score
+from cleargs.api import score_frames as score_frames
+from cleargs.api import train as train
+from cleargs.errors import CleargsError as CleargsError
+from cleargs.results import Prepared as Prepared
+from cleargs.results import Run as Run
+from cleargs.results import StageResults as StageResults
+from cleargs.results import open_prepared as open_prepared
+from cleargs.results import open_run as open_run
+from cleargs.splat.camera import Camera as Camera
+from cleargs.splat.config import G0Config as G0Config
+from cleargs.splat.config import TrainConfig as TrainConfig
+from cleargs.splat.gaussians import Gaussians as Gaussians
+from cleargs.splat.scene import Scene as Scene
+from cleargs.splat.views import View as View
+
+__all__: list[str]
+__version__: str

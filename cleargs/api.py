@@ -1,0 +1,317 @@
+"""The library: what the command line does, for programs. ``import cleargs as cg`` brings these names.
+
+Images are [H, W, 3] sRGB, uint8 or float32 in [0, 1]. Errors are `CleargsError` with a ``hint``.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cleargs.errors import InputError
+from cleargs.pipeline.config import check_document
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.session import (
+    SCENE,
+    DeviceChoice,
+    asked_run,
+    opened_store,
+    usable_cores,
+)
+from cleargs.progress import Reporter, SilentReporter, SilentTask, Task
+from cleargs.results import Prepared, Run, open_prepared
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from cleargs.evaluate.config import EvalOptions
+    from cleargs.evaluate.results import Evaluation
+    from cleargs.rivr.restoring import Deblurred
+    from cleargs.splat.camera import Camera
+    from cleargs.splat.config import G0Config, TrainConfig
+    from cleargs.splat.engine import Render
+    from cleargs.splat.formation import Formation
+    from cleargs.splat.scene import Scene
+    from cleargs.splat.trainer import Trained
+    from cleargs.splat.views import View
+
+    Image = NDArray[np.uint8] | NDArray[np.float32]
+
+Progress = Reporter | Callable[[str], object] | None
+"""Who is told how work goes on: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
+
+
+def run(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    workflow: str | None = None,
+    set: Mapping[str, Any] | None = None,
+    until: str | None = None,
+    force: Sequence[str] = (),
+    allow_partial: bool = False,
+    seed: int | None = None,
+    device: DeviceChoice = "auto",
+    threads: int | None = None,
+    store: str | Path | None = None,
+    progress: Progress = None,
+) -> Run:
+    """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
+
+    ``source`` is a video, an image folder, a COLMAP project, or a folder with ``transforms.json``. What is
+    there already is not made again. ``set`` changes settings by name: ``{"rva.tau_R": 0.6}``; an existing run
+    keeps the others, unless a ``workflow`` is given. Raises InputError for what cannot be used as it is,
+    StageError where a stage fails; what was finished stays.
+    """
+    from cleargs.pipeline.runner import Runner
+
+    dag, reporter = installed(), _reporter(progress)
+    dag.until(until)
+    asked = asked_run(
+        dag,
+        Path(source),
+        Path(folder),
+        workflow=workflow,
+        overrides=[f"{name}={_toml(value)}" for name, value in (set or {}).items()],
+        seed=seed,
+        store=None if store is None else Path(store),
+        device=device,
+        say=reporter.info,
+    )
+    with opened_store(asked.store) as opened:
+        runner = Runner(dag, asked, opened, threads or usable_cores(), reporter)
+        runner.run_until(until, force=force, allow_partial=allow_partial)
+    return Run(asked.folder)
+
+
+def initialise(
+    capture: Prepared,
+    views: Sequence[View] | None = None,
+    config: G0Config | None = None,
+    *,
+    seed: int = 0,
+) -> Scene:
+    """The scene that a training starts from: one Gaussian a sparse point, and more between them.
+
+    ``views`` (default: all of ``capture``) give the colours of those in between; of ``config`` count
+    ``sh_degree``, ``min_points``, ``budget``, ``init_*``, ``antialias`` and ``background``.
+    """
+    from cleargs.capture.tables import load_observations
+    from cleargs.splat.config import G0Config
+    from cleargs.splat.initialise import SparsePoints, starting_gaussians
+    from cleargs.splat.scene import Scene
+
+    views, config = capture.views() if views is None else views, config or G0Config()
+    points, observations = capture.points, load_observations(capture.folder)
+    frame_ids = [view.frame_id for view in views]
+    sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
+    gaussians = starting_gaussians(sparse, views, config, seed=seed)
+    return Scene(gaussians, config.antialias, config.background)
+
+
+def train(
+    scene: Scene,
+    views: Sequence[View],
+    config: TrainConfig | None = None,
+    *,
+    formation: Formation | None = None,
+    seed: int = 0,
+    checkpoint: str | Path | None = None,
+    device: str = "cpu",
+    progress: Progress = None,
+) -> Trained:
+    """Optimise ``scene`` against ``views``; the result has ``scene``, and ``rows``, one a step.
+
+    ``formation`` says what the cameras made of the sharp scene: None compares the images with the render as
+    it is, `cleargs.formation.capture.CaptureFormation` finds blur, rolling shutter and defocus. With a
+    ``checkpoint`` file a training that was cut off goes on from it, to the same result. On a CPU the result
+    depends on the arguments alone, not on threads. Raises InputError without a weighted view.
+    """
+    from cleargs.splat.config import TrainConfig
+    from cleargs.splat.trainer import train as train_scene
+
+    config = config or TrainConfig()
+    with tempfile.TemporaryDirectory() as nowhere:
+        if checkpoint is None:  # never written then
+            config = config.model_copy(update={"checkpoint_interval": config.steps})
+        return train_scene(
+            scene,
+            views,
+            config,
+            seed=(seed,),
+            formation=formation,
+            checkpoint=Path(nowhere) / "none" if checkpoint is None else Path(checkpoint),
+            reporter=_reporter(progress),
+            device=device,
+        )
+
+
+def render_view(scene: Scene, camera: Camera) -> Render:
+    """What ``scene`` shows at ``camera``: image, alpha and accumulated depth, differentiable by torch."""
+    from cleargs.splat.render import render
+
+    return render(scene.gaussians, camera, background=scene.background, antialias=scene.antialias)
+
+
+def save(scene: Scene, path: str | Path) -> None:
+    """Write ``scene`` in the format of the ending: .ply .compressed.ply .sog .spz .glb .usdc.
+
+    Raises InputError for another ending.
+    """
+    from cleargs.splat.formats import format_of, write_scene
+
+    write_scene(Path(path), scene, format_of(Path(path)))
+
+
+def load(path: str | Path) -> Scene:
+    """Read a ``scene.ply`` of ClearGS or of the Inria code. Raises StoreError when it cannot be read."""
+    from cleargs.splat.ply import read_ply
+
+    return read_ply(Path(path))
+
+
+def score_frames(
+    paths: Sequence[str | Path],
+    *,
+    evaluator: str = "statistics",
+    threads: int | None = None,
+    progress: Progress = None,
+) -> pa.Table:
+    """How good each frame of a video looks: a row a file, with RVA's eleven cues, R and B, all in [0, 1].
+
+    ``paths`` are images in the order in which they were taken. A frame that could not be scored has NaN.
+    Raises ConfigError for an unknown evaluator.
+    """
+    import pyarrow as pa
+
+    from cleargs.rva.config import RvaConfig
+    from cleargs.rva.evaluator import View, make_evaluator
+    from cleargs.rva.scores import appearance_scores
+    from cleargs.rva.tables import CUE_COLUMNS
+
+    config = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
+    assert isinstance(config, RvaConfig)
+    with tempfile.TemporaryDirectory() as cache:
+        judge = make_evaluator(config, cache=Path(cache))
+        views = [View(number, Path(path)) for number, path in enumerate(paths)]
+        cues = judge.evaluate(views, threads=threads or usable_cores(), reporter=_reporter(progress))
+    R, B = appearance_scores(cues, config)
+    columns = dict(zip(CUE_COLUMNS, cues.T, strict=True))
+    return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})
+
+
+def score(image: Image, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
+    """How good an image looks without a reference: 0 to 100, higher is better.
+
+    ``scorer`` is clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX
+    file. Raises InputError for another name, and for an image smaller than 32 pixels.
+    """
+    from cleargs.models.scorer import load_scorer
+
+    return load_scorer(scorer).score(_floats(image), threads=threads or usable_cores())
+
+
+def restore(image: Image, *, expert: str = "embedded", threads: int | None = None) -> NDArray[np.float32]:
+    """A sharper image of the same size [H, W, 3] by a restoration network, float32 in [0, 1].
+
+    ``expert`` is embedded, an installed model or an ONNX file. Raises InputError for another name.
+    """
+    from cleargs.models.expert import load_expert
+
+    return load_expert(expert).restore(_floats(image), threads=threads or usable_cores())
+
+
+def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | None:
+    """A raw frame without the motion, rolling shutter and defocus that the scene of ``stage`` explains.
+
+    The result has ``image`` [H, W, 3] float32, and ``formation``, what was undone; None where nothing
+    explains the frame better than the render as it is. Raises InputError for a frame without a pose.
+    """
+    from cleargs.rivr.distillation import Snapshot
+    from cleargs.splat.views import view_of
+
+    capture = open_prepared(run["ingest"])
+    frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
+    if frame is None or not frame.registered:
+        raise InputError(f"frame {frame_id} has no pose", hint="see cleargs show RUN ingest")
+    return Snapshot(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
+
+
+def evaluate_scene(
+    scene: Run | Scene | str | Path,
+    reference: str | Path | None = None,
+    *,
+    stage: str | None = None,
+    options: EvalOptions | None = None,
+    threads: int | None = None,
+    progress: Progress = None,
+) -> Evaluation:
+    """Compare a scene with the sharp images of ``reference`` (``images/`` and ``transforms.json``).
+
+    That of a run (of ``stage``, or the last) is compared in the world of its input, without a ``reference``
+    with the frames held out; a scene or a scene.ply has to be in the world of the reference. ``means`` of
+    the result maps metrics to figures. Raises InputError where nothing matches.
+    """
+    from cleargs.evaluate.config import EvalOptions
+    from cleargs.evaluate.evaluate import evaluate_scene, reference_in, reference_of
+    from cleargs.splat.scene import Scene
+
+    directory, reporter = None if reference is None else Path(reference), _reporter(progress)
+    if isinstance(scene, Run):
+        compared = reference_of(scene.folder, directory, reporter=reporter)
+    elif directory is not None:
+        compared = reference_in(directory)
+    else:
+        raise InputError("there is nothing to compare with", hint="give a folder of sharp images")
+    with tempfile.TemporaryDirectory() as folder:
+        if isinstance(scene, Scene):
+            path = Path(folder) / SCENE
+            save(scene, path)
+        else:
+            path = scene.scene_file(stage) if isinstance(scene, Run) else Path(scene)
+        count = threads or usable_cores()
+        return evaluate_scene(
+            path, compared, options=options or EvalOptions(), threads=count, reporter=reporter
+        )
+
+
+class _Lines(SilentReporter):
+    """Tells a function, line by line."""
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        yield SilentTask()
+        self._say(f"{label}: done")
+
+    def info(self, text: str) -> None:
+        self._say(text)
+
+    def warn(self, text: str) -> None:
+        self._say(f"warning: {text}")
+
+
+def _reporter(progress: Progress) -> Reporter:
+    if progress is None:
+        return SilentReporter()
+    return _Lines(progress) if callable(progress) else progress
+
+
+def _toml(value: Any) -> str:
+    """A plain value or a list as TOML, of which JSON's spelling is a part."""
+    return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def _floats(image: Image) -> NDArray[np.float32]:
+    import numpy as np
+
+    floats = image.astype(np.float32)
+    return floats / np.float32(255) if image.dtype == np.uint8 else floats

@@ -1,0 +1,141 @@
+"""How work begins, for the command line and the library alike: device, store, and a run as asked for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from cleargs.errors import ConfigError, InputError
+from cleargs.pipeline.config import Config, Document, check_document, load_config
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.keys import settings as settings_in
+from cleargs.pipeline.run_file import RUN_FILE, Device, Run, kept_settings, noted_place
+from cleargs.pipeline.store import STORE_FOLDER, Store
+
+SCENE = "scene.ply"
+"""What a stage that trains leaves."""
+
+DeviceChoice = Literal["auto", "cpu", "cuda"]
+
+UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
+
+
+def usable_cores() -> int:
+    """The CPU cores that this process may use, as far as the system says."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def resolve_device(choice: DeviceChoice, say: Callable[[str], None]) -> Device:
+    """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
+
+    Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
+    cannot be had.
+    """
+    obstacle = None if choice == "cpu" else cuda_obstacle()
+    if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
+        if choice == "auto" and obstacle is None:
+            say(UNUSED_GPU)
+        return "cpu"
+    if obstacle is not None:
+        raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
+    return "cuda"
+
+
+def cuda_obstacle() -> str | None:
+    """Why work cannot run on an NVIDIA GPU here; None when it can."""
+    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg")):
+        return "there is no NVIDIA GPU"
+    if find_spec("triton") is None:
+        return "Triton is not installed (pip install 'cleargs[cuda]')"
+    if version("torch").endswith("+cpu"):
+        return "this PyTorch is built for the CPU only (install a CUDA build)"
+    return None
+
+
+@contextmanager
+def opened_store(root: Path) -> Iterator[Store]:
+    """The store at ``root`` with its digest memo. Its folder appears when the first stage starts."""
+    root = root.absolute()
+    with DigestMemo(root / "digests.sqlite") as memo:
+        yield Store(root, memo)
+
+
+def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
+    """The stage whose scene to take: ``chosen``, or the last that has one.
+
+    Raises InputError when there is no such scene.
+    """
+    done = [name for name in dag.names if (run / name / SCENE).is_file()]
+    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
+    if stage is None:
+        raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
+    if stage not in done:
+        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs explain {run}"
+        raise InputError(f"{stage} has no scene in {run}", hint=there)
+    return stage
+
+
+def asked_run(
+    dag: Dag,
+    source: Path,
+    folder: Path,
+    *,
+    workflow: str | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    reset: bool = False,
+    store: Path | None = None,
+    device: DeviceChoice = "auto",
+    say: Callable[[str], None],
+) -> Run:
+    """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
+
+    An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
+    forgets the settings, as does a ``workflow``. ``say`` is told what is kept. Raises InputError when
+    ``source`` is missing or itself a run, ConfigError for settings that cannot be used.
+    """
+    if not source.exists():
+        raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
+    if (source / RUN_FILE).is_file():
+        noted = noted_place(source).source
+        raise InputError(
+            f"{source} is a run, not a capture",
+            hint=f"give the capture that it was made from{f': {noted}' if noted else ''}",
+        )
+    folder = folder.absolute()
+    kept = None if reset or workflow is not None else _kept(dag, folder)
+    config = load_config(dag, workflow or "default" if kept is None else kept, overrides, seed)
+    before = noted_place(folder)
+    root = (store or before.store or folder / STORE_FOLDER).absolute()
+    chosen = resolve_device(before.device or device if device == "auto" else device, say)
+    if kept is not None and (line := _own_settings(dag, check_document(dag, kept))):
+        say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
+    return Run(folder, source.absolute(), config, root, chosen)
+
+
+def _kept(dag: Dag, folder: Path) -> Document | None:
+    """The settings of the run in ``folder``; None without one. Raises ConfigError when they are damaged."""
+    try:
+        kept = kept_settings(folder)
+        if kept is not None:
+            check_document(dag, kept)
+    except ConfigError as error:
+        raise ConfigError(
+            f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
+        ) from error
+    return kept
+
+
+def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:
+    """The first few settings that are not the default, in one line; "" where there are none."""
+    usual = dict(settings_in(check_document(dag, {}).document()))
+    own = [f"{name}={value}" for name, value in settings_in(config.document()) if usual.get(name) != value]
+    return ", ".join(own[:most]) + (f" and {len(own) - most} more" if len(own) > most else "")

@@ -1,0 +1,77 @@
+"""What other packages add: an entry point in the group of a socket, found by its name when it is asked for.
+
+    [project.entry-points."cleargs.evaluators"]
+    mine = "my_package.frames:make_evaluator"
+
+Nothing is imported before a setting names it. What a part computes may depend on its arguments and on the
+version of its distribution alone: that version enters the key of every stage whose settings name the part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from cleargs.errors import InputError
+
+Socket = Literal["evaluators", "experts", "scorers", "strategies", "formats", "layouts", "backends"]
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A part that another package brings."""
+
+    name: str
+    entry: EntryPoint
+
+    @property
+    def distribution(self) -> tuple[str, str]:
+        """Name and version of the package."""
+        found = self.entry.dist
+        return ("unknown", "unknown") if found is None else (found.name, found.version)
+
+    def load(self) -> Any:
+        """What the entry point names. Raises InputError where it cannot be imported."""
+        try:
+            return self.entry.load()
+        except Exception as error:
+            package, version = self.distribution
+            raise InputError(
+                f"{self.name} of {package} {version} cannot be loaded: {type(error).__name__}: {error}",
+                hint=f"repair or uninstall {package}, or name another part",
+            ) from error
+
+
+def plugins(socket: Socket) -> dict[str, Plugin]:
+    """Name -> part that the installed packages bring for a socket; of two of a name, the first by package."""
+    found = entry_points(group=f"cleargs.{socket}")
+    parts = sorted((Plugin(entry.name, entry) for entry in found), key=lambda part: part.distribution)
+    return {part.name: part for part in reversed(parts)}
+
+
+def plugin(socket: Socket, name: str) -> Plugin | None:
+    """The part of that name; None where no package brings one."""
+    return plugins(socket).get(name)
+
+
+def load_part(socket: Socket, name: str) -> Any:
+    """What the entry point of that name refers to. Raises InputError where there is none, or it is broken."""
+    found = plugin(socket, name)
+    if found is None:
+        raise InputError(f"no installed package brings {name!r}", hint=f"install it: cleargs.{socket}")
+    return found.load()
+
+
+def require_known(socket: Socket, name: str, shipped: Iterable[str]) -> str:
+    """``name``, where it ships with ClearGS or a package brings it. Raises ValueError with what was meant."""
+    shipped = tuple(shipped)
+    if name in shipped:  # without a look at what is installed
+        return name
+    names = [*shipped, *plugins(socket)]
+    if name in names:
+        return name
+    near = get_close_matches(name, names, n=1)
+    raise ValueError(f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}")

@@ -1,0 +1,130 @@
+"""What lies in a run folder: finished stages, their tables, the scene; and a prepared capture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cleargs.errors import InputError
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.freshness import require_fresh
+from cleargs.pipeline.manifest import Manifest, read_manifest
+from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.session import SCENE, scene_stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from cleargs.capture.tables import Frame, Points
+    from cleargs.splat.camera import Camera
+    from cleargs.splat.scene import Scene
+    from cleargs.splat.views import View
+
+
+def open_run(folder: str | Path) -> Run:
+    """The run in ``folder``. Raises InputError when there is none."""
+    return Run(read_run_file(Path(folder), installed()).folder)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder: ``run["rva"]`` is a finished stage."""
+
+    folder: Path
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The finished stages, in order."""
+        return tuple(name for name in installed().names if (self.folder / name).is_dir())
+
+    def __getitem__(self, stage: str) -> StageResults:
+        """The results of a stage. Raises InputError where it is not finished."""
+        installed().check(stage)
+        try:
+            return StageResults(self.folder / stage, read_manifest(self.folder / stage))
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{stage} is not finished in {self.folder}", hint=f"see cleargs explain {self.folder}"
+            ) from error
+
+    def scene(self, stage: str | None = None, *, stale: bool = False) -> Scene:
+        """The scene of ``stage``, or of the last stage that has one.
+
+        Raises InputError where there is none, or where it was made with other settings or inputs than the
+        run's, unless ``stale``.
+        """
+        from cleargs.splat.ply import read_ply
+
+        return read_ply(self.scene_file(stage, stale=stale))
+
+    def scene_file(self, stage: str | None = None, *, stale: bool = False) -> Path:
+        """Where the scene of `scene` lies."""
+        dag = installed()
+        chosen = scene_stage(dag, self.folder, stage)
+        require_fresh(dag, self.folder, (chosen,), stale=stale)
+        return self.folder / chosen / SCENE
+
+
+@dataclass(frozen=True)
+class StageResults:
+    """What a finished stage left in ``folder``, and the manifest that says from what."""
+
+    folder: Path
+    manifest: Manifest
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The figures that the stage reports."""
+        return self.manifest.summary
+
+    def table(self, name: str) -> pa.Table:
+        """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none."""
+        import pyarrow.parquet as pq
+
+        try:
+            return pq.read_table(self.folder.resolve() / f"{name}.parquet")
+        except OSError as error:
+            known = sorted(Path(file).stem for file in self.manifest.files if file.endswith(".parquet"))
+            raise InputError(
+                f"{self.manifest.stage} has no table {name!r}", hint=f"its tables are {', '.join(known)}"
+            ) from error
+
+    def weights(self) -> dict[int, float]:
+        """Frame -> weight of its supervision in [0, 1]: of ``rva``."""
+        table = self.table("frames")
+        return dict(zip(table["frame_id"].to_pylist(), table["weight"].to_pylist(), strict=True))
+
+
+def open_prepared(folder: StageResults | str | Path) -> Prepared:
+    """The frames, cameras and points of a finished ``ingest`` (``run["ingest"]``, or its folder)."""
+    from cleargs.capture.tables import load_frames, load_points
+
+    place = folder.folder if isinstance(folder, StageResults) else Path(folder)
+    return Prepared(place, load_frames(place), load_points(place))
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A capture with poses, in the normalised world: the farthest camera is at distance 1 of the origin."""
+
+    folder: Path
+    frames: list[Frame]
+    """All of them, by frame_id; those without a pose too."""
+    points: Points
+
+    def views(self, weights: Mapping[int, float] | None = None) -> list[View]:
+        """What a training looks at: the frames with a pose, not held out, whose weight (default: 1) is
+        above 0. Images are read when they are needed."""
+        from cleargs.splat.views import real_views
+
+        given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
+        return real_views(self.frames, given, self.folder)
+
+    def cameras(self) -> dict[int, Camera]:
+        """Frame -> camera, of every frame with a pose, held-out ones too."""
+        from cleargs.splat.views import view_of
+
+        posed = (frame for frame in self.frames if frame.registered)
+        return {frame.frame_id: view_of(frame, self.folder, 1.0).camera for frame in posed}

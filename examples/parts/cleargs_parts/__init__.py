@@ -1,0 +1,1 @@
+"""Parts that ClearGS finds through the entry points in pyproject.toml: a file a part."""

@@ -1,0 +1,28 @@
+"""An input layout: ingest.layout=listed takes the images that list.txt in the input names, a name a line."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cleargs.capture.config import IngestConfig
+from cleargs.capture.sources import Capture, SourceFrame, spread
+from cleargs.errors import InputError
+from cleargs.pipeline.stage import External
+
+
+def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
+    """All files that are read: their content is in the key of the stage."""
+    return {"list": source / "list.txt", "images": {name: source / name for name in _names(source)}}
+
+
+def open_capture(source: Path, config: IngestConfig) -> Capture:
+    """Frames without cameras and poses, which SfM then finds; a SourceFrame may bring both."""
+    names = _names(source)
+    frames = tuple(SourceFrame(name, source / name) for name in spread(names, config.max_frames))
+    return Capture("listed", frames, len(names))
+
+
+def _names(source: Path) -> list[str]:
+    try:
+        return (source / "list.txt").read_text(encoding="utf-8").split()
+    except OSError as error:
+        raise InputError(f"{source} has no list.txt", hint="write the names of the images into it") from error

@@ -1,0 +1,16 @@
+"""An export format: `cleargs export RUN -o room.csv` writes the places of the Gaussians as text."""
+
+from pathlib import Path
+
+from cleargs.files import write_bytes
+from cleargs.splat.formats import Format
+from cleargs.splat.scene import Scene
+
+
+def write_csv(path: Path, scene: Scene) -> None:
+    """Called with the scene turned to the axes of the format; the file is to appear whole."""
+    rows = (",".join(f"{value:.6g}" for value in row) for row in scene.gaussians.means.tolist())
+    write_bytes(path, "\n".join(["x,y,z", *rows, ""]).encode())
+
+
+CSV = Format(write_csv, axes=(1.0, -1.0, -1.0))  # y up, z back

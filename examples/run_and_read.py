@@ -1,0 +1,15 @@
+"""A capture through all stages, and what came of it: python run_and_read.py CAPTURE RUN [WORKFLOW]"""
+
+import sys
+
+import cleargs as cg
+
+capture, folder, *workflow = sys.argv[1:]
+run = cg.run(capture, folder, workflow=workflow[0] if workflow else None, progress=print)
+for stage in run.stages:
+    print(stage, run[stage].summary)
+
+frames = run["rva"].table("frames").select(["name", "role", "weight"])
+for row in frames.to_pylist():
+    print(f"{row['name']}: {row['role']}, weight {row['weight']:.2f}")
+print(f"{run.scene().gaussians.num} Gaussians")

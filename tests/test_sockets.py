@@ -1,0 +1,234 @@
+"""Parts of another package, that of the examples: found by name, refused by name, in the keys."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import cleargs as cg
+from cleargs.errors import ConfigError, InputError
+from cleargs.models.expert import load_expert
+from cleargs.models.scorer import load_scorer
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.keys import plugin_versions
+from cleargs.plugins import plugins
+from cleargs.progress import SilentReporter
+from cleargs.splat.backend import backend_for
+from cleargs.splat.camera import Camera
+from cleargs.splat.config import TrainConfig
+from cleargs.splat.formation import Formation
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.scene import Scene
+from cleargs.splat.trainer import Trainer, train
+from cleargs.splat.views import View
+
+PARTS = Path(__file__).parents[1] / "examples" / "parts"
+
+
+def install(folder: Path, version: str = "1.0") -> None:
+    """Lay down what `pip install examples/parts` would, in ``folder``."""
+    project = tomllib.loads((PARTS / "pyproject.toml").read_text())["project"]
+    information = folder / "cleargs_parts.dist-info"
+    information.mkdir(exist_ok=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: cleargs-parts\nVersion: {version}\n")
+    lines = []
+    for group, entries in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in entries.items()), ""]
+    (information / "entry_points.txt").write_text("\n".join(lines))
+
+
+@pytest.fixture
+def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The example's package, installed for one test."""
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    install(folder)
+    for place in (folder, PARTS):
+        monkeypatch.syspath_prepend(str(place))
+    return folder
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).random((48, 64, 3), dtype=np.float32)
+
+
+def test_nothing_is_imported_before_it_is_named(parts: Path) -> None:
+    for name in [name for name in sys.modules if name.startswith("cleargs_parts")]:
+        del sys.modules[name]
+    assert list(plugins("evaluators")) == ["contrast"]
+    config = load_config(installed(), "default", ["rva.evaluator=contrast", "g0.strategy=prune-only"])
+    assert config.sections["rva"].evaluator == "contrast"
+    assert not any(name.startswith("cleargs_parts") for name in sys.modules)
+
+
+@pytest.mark.parametrize(
+    ("setting", "wrong", "near"),
+    [("rva.evaluator", "contrst", "contrast"), ("g0.strategy", "prune_only", "prune-only")],
+)
+def test_an_unknown_name_is_refused_with_the_nearest(
+    setting: str, wrong: str, near: str, parts: Path
+) -> None:
+    with pytest.raises(ConfigError, match=wrong) as caught:
+        load_config(installed(), "default", [f"{setting}={wrong}"])
+    assert caught.value.hint == f"did you mean {near}?"
+
+
+def test_without_the_package_its_names_are_unknown() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(installed(), "default", ["rva.evaluator=contrast"])
+    assert "statistics" in caught.value.hint
+    with pytest.raises(InputError, match="no scorer is called 'gradient'"):
+        load_scorer("gradient")
+    with pytest.raises(InputError, match="no restoration expert 'unsharp'"):
+        load_expert("unsharp")
+
+
+def test_the_version_of_the_package_is_in_the_key(parts: Path) -> None:
+    overrides = ["rva.evaluator=contrast", "rivr.tiebreak_scorer=gradient", "rivr.distil.strategy=prune-only"]
+    sections = load_config(installed(), "default", overrides).sections
+    assert plugin_versions(sections["g0"]) == {}
+    assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.0"}
+    assert plugin_versions(sections["rivr"]) == {
+        "cleargs-parts for tiebreak_scorer=gradient": "1.0",
+        "cleargs-parts for distil.strategy=prune-only": "1.0",
+    }
+    install(parts, "1.1")
+    assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.1"}
+    for stage in ("rivr", "consolidate"):  # no file stands for a part of another package
+        roles = installed().load(stage).externals(sections[stage], Path())
+        assert "tie-break scorer" not in roles and roles
+
+
+def test_a_broken_part_is_an_error_with_a_remedy(parts: Path) -> None:
+    entries = parts / "cleargs_parts.dist-info" / "entry_points.txt"
+    entries.write_text("[cleargs.experts]\nunsharp = cleargs_parts.nowhere:Expert\n")
+    with pytest.raises(InputError, match=r"unsharp of cleargs-parts 1\.0 cannot be loaded") as caught:
+        load_expert("unsharp")
+    assert "uninstall cleargs-parts" in caught.value.hint
+
+
+def test_evaluator(parts: Path, tmp_path: Path, picture: np.ndarray) -> None:
+    from cleargs.media.image import write_rgb
+
+    flat = np.full_like(picture, 0.5)
+    for name, image in (("a.png", picture), ("b.png", flat)):
+        write_rgb(tmp_path / name, image)
+    table = cg.score_frames([tmp_path / "a.png", tmp_path / "b.png"], evaluator="contrast")
+    assert table["r_sharpness"].to_pylist() == [1.0, 0.0] and table["B"].to_pylist()[0] == 0.0
+    with pytest.raises(ConfigError, match="contrasts"):
+        cg.score_frames([], evaluator="contrasts")
+
+
+def test_expert_and_scorer(parts: Path, picture: np.ndarray) -> None:
+    restored = cg.restore(picture, expert="unsharp")
+    assert restored.shape == picture.shape and np.abs(restored - picture).mean() > 0.01
+    assert 0.0 < cg.score(0.5 * picture, scorer="gradient") <= 100.0
+    assert cg.score(np.full_like(picture, 0.5), scorer="gradient") == 0.0
+    # No part shadows what ships.
+    assert load_expert("embedded").name == "embedded"
+
+
+def test_format(parts: Path, tmp_path: Path) -> None:
+    scene = toy()
+    cg.save(scene, tmp_path / "room.csv")
+    lines = (tmp_path / "room.csv").read_text().splitlines()
+    x, y, z = scene.gaussians.means[0].tolist()
+    assert lines[0] == "x,y,z" and len(lines) == 1 + scene.gaussians.num
+    assert [float(value) for value in lines[1].split(",")] == pytest.approx([x, -y, -z], rel=1e-5)
+    with pytest.raises(InputError, match="no ending") as caught:
+        cg.save(scene, tmp_path / "room.xyz")
+    assert ".csv" in caught.value.hint and ".ply" in caught.value.hint
+
+
+def toy(count: int = 30) -> Scene:
+    rng = np.random.default_rng(5)
+    return Scene(
+        Gaussians(
+            means=torch.from_numpy(rng.uniform(-0.4, 0.4, (count, 3)).astype(np.float32)),
+            log_scales=torch.full((count, 3), -2.5),
+            rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+            logit_opacities=torch.full((count,), 2.0),
+            sh=torch.from_numpy(rng.uniform(-1.0, 1.0, (count, 1, 3)).astype(np.float32)),
+        )
+    )
+
+
+def toy_views(scene: Scene, dim: float = 0.0) -> list[View]:
+    """Three views of ``scene``, ``dim`` darker in the corners."""
+    made = []
+    for number in range(3):
+        pose = np.eye(4)
+        pose[:3, 3] = (0.1 * number, 0.0, 1.0)
+        camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, pose)
+        image = cg.render_view(scene, camera).image.detach().clamp(0.0, 1.0).numpy()
+        y, x = np.linspace(-1, 1, 24)[:, None], np.linspace(-1, 1, 32)[None, :]
+        pixels = (image * (1.0 - dim * ((x * x + y * y) / 2))[..., None]).astype(np.float32)
+        made.append(View(number, camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+    return made
+
+
+def test_strategy(parts: Path, tmp_path: Path) -> None:
+    scene = toy()
+    scene.gaussians.logit_opacities[:10] = -9.0  # faint: to be removed
+    config = TrainConfig(steps=6, strategy="prune-only", refine_interval=2, refine_start=0.0, opacity_reg=0.0)
+    trained = train(
+        scene,
+        toy_views(scene),
+        config,
+        seed=(0,),
+        checkpoint=tmp_path / "checkpoint",
+        reporter=SilentReporter(),
+    )
+    assert trained.scene.gaussians.num == 20
+
+
+def test_formation(parts: Path) -> None:
+    """The example's vignette is found while the scene is trained through it."""
+    from cleargs_parts.formation import Vignette
+
+    scene, vignette = toy(), Vignette(rate=0.5)
+    model: Formation = vignette
+    config = TrainConfig(steps=60, densify=False, lr_means=0.0, lr_sh=0.0, lr_opacities=0.0, coarse_share=0.0)
+    trainer = Trainer(scene, toy_views(scene, dim=0.4), config, seed=(0,), formation=model)
+    while trainer.done < config.steps:
+        trainer.step()
+    assert 0.2 < vignette.strength < 0.6  # 0.4 in truth; scales and rotations go on learning
+    assert "formation.strength" in trainer.state()
+
+
+def test_layout(parts: Path, tmp_path: Path, picture: np.ndarray) -> None:
+    from cleargs.capture.sources import open_capture
+    from cleargs.media.image import write_rgb
+
+    for name in ("b.png", "a.png", "d.png", "c.png"):
+        write_rgb(tmp_path / name, picture)
+    sections = load_config(installed(), "default", ["ingest.layout=listed"]).sections
+    ingest = sections["ingest"]
+    with pytest.raises(InputError, match=r"no list\.txt"):
+        open_capture(tmp_path, ingest)
+    (tmp_path / "list.txt").write_text("c.png\nb.png\na.png\n")
+    assert [frame.name for frame in open_capture(tmp_path, ingest).frames] == ["c.png", "b.png", "a.png"]
+    roles = installed().load("ingest").externals(ingest, tmp_path)
+    assert set(roles) == {"list", "images"} and set(roles["images"]) == {"a.png", "b.png", "c.png"}
+    assert plugin_versions(ingest) == {"cleargs-parts for layout=listed": "1.0"}
+    (tmp_path / "list.txt").write_text("a.png")
+    with pytest.raises(InputError, match="at least 3"):
+        open_capture(tmp_path, ingest)
+
+
+def test_backend(parts: Path) -> None:
+    """A device that nobody serves is refused; a package may serve it."""
+    entries = parts / "cleargs_parts.dist-info" / "entry_points.txt"
+    with pytest.raises(InputError, match="no meta back end"):
+        backend_for("meta")
+    entries.write_text("[cleargs.backends]\nmeta = cleargs.splat.kernels.cpu:backend\n")
+    from cleargs.splat.kernels.cpu import backend as cpu
+
+    assert backend_for("meta") is cpu and backend_for("cpu") is cpu
