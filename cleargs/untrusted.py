@@ -103,6 +103,8 @@ def cause(error: Exception) -> str:
         return "it breaks off"
     if isinstance(error, OverflowError):
         return "a number is too large"
+    if isinstance(error, ZeroDivisionError):
+        return "a number is zero that must not be"
     if isinstance(error, RecursionError):
         return str(_too_deep())
     if isinstance(error, KeyError):

@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 6
+VERSION = 7
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -50,7 +50,7 @@ _STREAM = 6
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
-    """The scorer's model file, whose content enters the key."""
+    """The scorer's model file, whose content enters the key; none for one of another package."""
     from cleargs.models.scorer import scorer_path
 
     path = scorer_path(config.scorer)

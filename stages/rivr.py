@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 9
+VERSION = 10
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -52,7 +52,7 @@ _STREAM = 5
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
-    """The model files, whose content enters the key."""
+    """The model files, whose content enters the key (the version of what other packages bring does)."""
     from cleargs.models.expert import expert_path
     from cleargs.models.scorer import scorer_path
 
@@ -109,7 +109,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.restoring import Restorations
     from cleargs.rivr.results import refused_repairs, summary
-    from cleargs.rivr.rounds import Rules
+    from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision
     from cleargs.rivr.tables import write_selection
@@ -119,6 +119,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     targets = supervision.targets(config.targets)
+    forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
     rules = Rules(

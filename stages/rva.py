@@ -43,7 +43,7 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
         frames = sum(1 for _ in (context.inputs["ingest"] / "images").iterdir())
     else:
         frames = context.expected["ingest"].frames
-    if config.evaluator == "statistics":
+    if config.evaluator != "qwen3-vl":
         return Estimate(minutes=frames / (_FRAMES_PER_MINUTE * context.threads), memory_gb=0.3, disk_gb=0.001)
     at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
     folders = externals(config, context.source).values()

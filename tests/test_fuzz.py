@@ -1,6 +1,7 @@
 """Readers under mutated files: whatever comes, they return or raise an error of one line, and soon.
 
-The same 60 mutations a reader in each run of the tests; CLEARGS_FUZZ=N draws N others of each.
+The same 60 mutations a reader in each run of the tests. ``CLEARGS_FUZZ=2000 pytest tests/test_fuzz.py
+--hypothesis-seed=7`` draws 2000 others of each; the same seed draws the same again.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -27,16 +29,26 @@ from cleargs.capture.layout import externals
 from cleargs.capture.llff import read_poses_bounds
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.transforms import read_transforms
+from cleargs.capture.world import Similarity
 from cleargs.errors import CleargsError
+from cleargs.files import write_json
+from cleargs.formation.colour import EXPOSURE
+from cleargs.media.encode import write_video
 from cleargs.media.exr import LayeredImage, read_exr, write_exr
 from cleargs.media.image import read_rgb
+from cleargs.media.video import read_timeline
 from cleargs.pipeline.config import read_toml
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.lease import living_holder
 from cleargs.pipeline.manifest import read_manifest
+from cleargs.progress import SilentReporter
+from cleargs.render.poses import read_poses
+from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.state import load_state, save_state
+from cleargs.tables import read_table, write_table
 
 EXAMPLES = int(os.environ.get("CLEARGS_FUZZ", "60"))
 
@@ -170,6 +182,41 @@ def npy(folder: Path) -> None:
     np.save(folder / "poses_bounds.npy", np.ones((3, 17)))
 
 
+SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
+LENS = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4))
+
+
+def poses(folder: Path) -> None:
+    folder.mkdir()
+    place = {
+        "rotation": np.eye(3).tolist(),
+        "position": [0.1, 0.2, 0.3],
+        "width": 64,
+        "height": 48,
+        "fx": 50.0,
+    }
+    write_json(folder / "cameras.json", [place, place])
+    frame = {"transform_matrix": np.eye(4).tolist()}
+    write_json(folder / "transforms.json", {"w": 64, "h": 48, "fl_x": 50.0, "frames": [frame, frame]})
+
+
+def tables(folder: Path) -> None:
+    folder.mkdir()
+    rows = [dict.fromkeys(EXPOSURE.names, 0.5) | {"frame_id": k} for k in range(3)]
+    write_table(folder / "t.parquet", pa.Table.from_pylist(rows, EXPOSURE), EXPOSURE)
+    save_state(folder / "t.safetensors", {"step": torch.tensor(3), "means": torch.zeros(4, 3)})
+
+
+def read_stored(file: Path) -> object:
+    return read_table(file, EXPOSURE) if file.suffix == ".parquet" else load_state(file, SilentReporter())
+
+
+def video(folder: Path) -> None:
+    folder.mkdir()
+    frames = (np.full((48, 64, 3), 40 * k, np.uint8) for k in range(4))
+    write_video(folder / "v.mp4", frames, 10.0)
+
+
 def read_manifest_or_none(folder: Path) -> object:
     with suppress(ValueError, FileNotFoundError):  # what its callers take for damage
         return read_manifest(folder)
@@ -202,6 +249,9 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path], object]]] = {
     "sheets": (sheets, all_of(lambda file: read_scenes(file, installed()), "s.*")),
     "manifest": (manifests, read_manifest_or_none),
     "lease": (manifests, lambda folder: living_holder(folder / "lease.json")),
+    "poses": (poses, all_of(lambda file: read_poses(file, LENS, SAME), "*.json")),
+    "tables, checkpoints": (tables, all_of(read_stored, "t.*")),
+    "video": (video, lambda folder: read_timeline(folder / "v.mp4")),
     "run.toml": (manifests, lambda folder: read_toml(folder / "run.toml")),
 }
 

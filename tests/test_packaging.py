@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+import cleargs
 
 ROOT = Path(__file__).parents[1]
 
@@ -18,9 +22,33 @@ def test_every_package_is_listed() -> None:
     """setuptools cannot find packages through ``package-dir``, so they are listed by hand."""
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     own = [path.parent.relative_to(ROOT) for path in (ROOT / "cleargs").rglob("__init__.py")]
-    assert sorted(listed) == sorted(
+    assert sorted([*listed, *CHECKOUT_ALONE]) == sorted(
         [".".join(p.parts) for p in own] + ["cleargs.stages", "cleargs.workflows"]
     )
+
+
+CHECKOUT_ALONE = ("cleargs.models.training",)
+"""What made the embedded networks; who installs the program needs none of it."""
+
+
+def test_nothing_installed_imports_what_the_checkout_alone_has() -> None:
+    folder = ROOT / "cleargs/models/training"
+    for path in [*(ROOT / "cleargs").rglob("*.py"), *(ROOT / "stages").rglob("*.py")]:
+        if folder in path.parents:
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            assert not [name for name in names if name.startswith(CHECKOUT_ALONE)], path
+
+
+def test_the_version_stands_in_one_place() -> None:
+    """``cleargs.__version__``; the metadata of the installation and the citation follow it."""
+    assert version("cleargs") == cleargs.__version__
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert cited is not None and cited[1] == cleargs.__version__
+    assert f"## [{cleargs.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_every_dependency_is_pinned() -> None:
@@ -28,7 +56,7 @@ def test_every_dependency_is_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
     assert all(pin and "*" not in pin for pin in pins.values())
-    missing = needed("cleargs", ("test", "dev")) - {name.lower() for name in pins}
+    missing = needed("cleargs", ("test", "dev", "docs")) - {name.lower() for name in pins}
     assert {name for name in missing if not name.startswith(LEFT_OPEN)} == set()
 
 

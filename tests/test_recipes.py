@@ -177,7 +177,12 @@ EMBEDDED = {
             "the model maxim-gopro is not installed",
             "cleargs models install maxim-gopro",
         ),
-        ("default", "rivr.primary_scorer=clarity", "no scorer is called 'clarity'", "use clarity-net"),
+        (
+            "default",
+            "rivr.primary_scorer=clarity",
+            "no scorer is called 'clarity'",
+            "did you mean clarity-net?",
+        ),
         ("default", "rivr.expert=none.onnx", "none.onnx", "check the path"),
     ],
 )

@@ -7,6 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from cleargs.plugins import require_known
+
 SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 
@@ -21,7 +23,7 @@ class IngestConfig(BaseModel):
         le=1000,
         description="frames per second to take from a video; unset: max_frames alone decides",
     )
-    max_frames: int = Field(150, ge=3, description="at most so many frames, evenly in time")
+    max_frames: int = Field(150, ge=3, description="most frames to take, evenly in time")
     max_size: int = Field(
         960,
         ge=64,
@@ -32,6 +34,11 @@ class IngestConfig(BaseModel):
         "none",
         description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "
         "N registered frames in a row) | names, stems or patterns such as eval_*, separated by commas",
+    )
+    layout: str = Field(
+        "auto",
+        json_schema_extra={"key": False, "plugin": "layouts"},  # what is read in consequence is in the key
+        description="how the input is read; auto: by what lies in it; or one that another package brings",
     )
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
@@ -63,7 +70,7 @@ class IngestConfig(BaseModel):
         8,
         ge=1,
         le=100,
-        description="each frame is matched with so many next ones, and with those 2, 4, 8, ... on",
+        description="each frame is matched with this many next ones, and with those 2, 4, 8, ... on",
     )
     loop_candidates: int = Field(
         6, ge=0, le=100, description="distant frames of similar content to match with each frame"
@@ -71,6 +78,11 @@ class IngestConfig(BaseModel):
     min_registered: float = Field(
         0.30, ge=0, le=1, description="share of frames that must get a pose, or the stage fails"
     )
+
+    @field_validator("layout")
+    @classmethod
+    def _layout_is_known(cls, name: str) -> str:
+        return require_known("layouts", name, ("auto",))
 
     @field_validator("holdout")
     @classmethod

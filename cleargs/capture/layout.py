@@ -5,11 +5,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from cleargs.capture.config import IngestConfig
 from cleargs.capture.listing import read_listing
 from cleargs.pipeline.stage import External
+from cleargs.plugins import load_part
+
+if TYPE_CHECKING:
+    from cleargs.capture.sources import Capture
+
+
+class Layout(Protocol):
+    """How another package reads an input; a module, say."""
+
+    def externals(self, source: Path, config: IngestConfig) -> Mapping[str, External]:
+        """Role -> file, folder, or single files by name: all that is read. Looks at names only."""
+        ...
+
+    def open_capture(self, source: Path, config: IngestConfig) -> Capture:
+        """The frames in trajectory order, at most ``config.max_frames``, with what is known of cameras and
+        poses. Decodes no frame; changes nothing. Raises InputError."""
+        ...
+
 
 POSES_BOUNDS = "poses_bounds.npy"
 """LLFF's file of poses."""
@@ -58,6 +76,9 @@ def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
 
     A missing input is left to ingest to name. Raises InputError where transforms.json cannot be read.
     """
+    if config.layout != "auto":
+        layout: Layout = load_part("layouts", config.layout)
+        return layout.externals(source, config)
     if not source.is_dir():
         return {"capture": source}
     kind = folder_kind(source, poses=config.poses == "auto")

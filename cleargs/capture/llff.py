@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -59,7 +60,8 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
     try:
         open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
-        table = np.lib.format.open_memmap(path, mode="r")
+        with warnings.catch_warnings(action="ignore"):  # that Python 2 wrote it is no news to anybody
+            table = np.lib.format.open_memmap(path, mode="r")
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} of shape {table.shape}, not numbers of shape (N, 17)")
         return np.array(table, np.float64)

@@ -6,14 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import find_model, folder_kind, image_folders, lies_below, mask_folder
+from cleargs.capture.layout import Layout, find_model, folder_kind, image_folders, lies_below, mask_folder
 from cleargs.capture.llff import read_llff
 from cleargs.capture.model import SparseModel, read_model
 from cleargs.capture.transforms import read_transforms
@@ -21,6 +21,7 @@ from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.media.image import image_size
 from cleargs.media.video import Timeline, read_timeline, video_size
+from cleargs.plugins import load_part
 
 T = TypeVar("T")
 
@@ -47,7 +48,8 @@ class SourceFrame:
 class Capture:
     """The chosen frames of an input, in trajectory order."""
 
-    kind: Literal["video", "images", "colmap", "llff", "transforms"]
+    kind: str
+    """video, images, colmap, llff, transforms, or what the layout of another package says."""
     frames: tuple[SourceFrame, ...]
     n_available: int
     """Frames in the input, before choosing."""
@@ -70,15 +72,19 @@ def open_capture(source: Path, config: IngestConfig) -> Capture:
     """
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
-    if not source.is_dir():
+    if config.layout != "auto":
+        layout: Layout = load_part("layouts", config.layout)
+        capture = layout.open_capture(source, config)
+    elif not source.is_dir():
         return _open_video(source, config)
-    opener = {
-        "transforms": _open_transforms,
-        "colmap": _open_colmap,
-        "llff": _open_llff,
-        "images": _open_images,
-    }[folder_kind(source, poses=config.poses == "auto")]
-    capture = opener(source, config)
+    else:
+        opener = {
+            "transforms": _open_transforms,
+            "colmap": _open_colmap,
+            "llff": _open_llff,
+            "images": _open_images,
+        }[folder_kind(source, poses=config.poses == "auto")]
+        capture = opener(source, config)
     if len(capture.frames) < MIN_FRAMES:
         raise InputError(
             f"{source} has {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",

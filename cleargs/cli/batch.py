@@ -14,19 +14,14 @@ from cleargs.batch.prepare import Preparation
 from cleargs.batch.scenes import Scene, read_scenes
 from cleargs.batch.sheet import SheetError
 from cleargs.batch.status import SceneState, scene_states
-from cleargs.cli.common import (
-    DeviceChoice,
-    json_option,
-    print_json,
-    quiet_option,
-    resolve_device,
-    usable_cores,
-)
+from cleargs.cli.common import json_option, print_json, quiet_option
 from cleargs.cli.progress import make_reporter
 from cleargs.errors import CleargsError, InputError, StageError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
+from cleargs.pipeline.session import DeviceChoice, resolve_device, usable_cores
 from cleargs.progress import Reporter, Task
+from cleargs.report.record import page_of
 
 sheet_argument = click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
 folder_option = click.option(
@@ -55,7 +50,7 @@ Examples:
 )
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
 @click.option("--dry-run", is_flag=True, help="Only check the sheet and say how many jobs there are.")
-@click.option("--allow-partial", is_flag=True, help="Go on after a stage that is done only in part.")
+@click.option("--allow-partial", is_flag=True, help="Continue after a stage that is done only in part.")
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
@@ -141,6 +136,8 @@ def run_batch(
     states = scene_states(folder, plan, ended=True)
     print_states(states, plan, as_json)
     page = _page(folder, plan, states, reporter) if plan.report else None
+    if not plan.report and (older := page_of(folder.root)).is_file():
+        reporter.info(f"note: {older} shows an earlier batch; without --no-report it is made anew")
     if page is not None and not as_json:
         click.echo(f"report: {page}")
     kinds = {state.state for state in states}

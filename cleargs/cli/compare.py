@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from cleargs.cli.common import (
-    DeviceChoice,
     json_option,
-    opened_store,
     print_json,
     quiet_option,
-    resolve_device,
     stale_option,
     threads_or_all,
     work_options,
@@ -27,6 +24,7 @@ from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
@@ -72,7 +70,7 @@ Examples:
     "out",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of the runs, tables, pictures and report; an existing one goes on.",
+    help="Folder of the runs, tables, pictures and report; resumes if it exists.",
 )
 @click.option(
     "--variants",
@@ -136,11 +134,11 @@ def compare(
     All variants of a capture train for the same number of steps, with the same budget of Gaussians and the
     same SH degree. Captures of one protocol are samples of one column; with several, or several seeds, a
     difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
-    same command goes on where it stopped.
+    same command resumes where it stopped.
     """
     from cleargs.evaluate.compared import compare_scenes
     from cleargs.evaluate.comparison import Recipe, Sample, existing, make_scenes
-    from cleargs.evaluate.tables import markdown
+    from cleargs.evaluate.tables import markdown, training_lines
     from cleargs.files import write_bytes, write_json
     from cleargs.report.comparison import comparison_sheet, plot_comparison
 
@@ -168,6 +166,7 @@ def compare(
             made = make_scenes(out, samples, chosen, recipe, store, reporter)
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels
+    warnings = [*training_lines(found, labels), *warnings]
     baselines = BASELINES if not runs else found.variants()[:1]
     made_with = _made_with(() if runs else chosen, seeds, recipe)
     head = "\n\n".join(["# Comparison", *warnings, "\n".join(f"* {line}" for line in made_with)])

@@ -14,7 +14,8 @@ from typing import Literal
 import click
 
 import cleargs
-from cleargs.cli.common import UNUSED_GPU, cuda_obstacle, json_option, print_json, usable_cores
+from cleargs.cli.common import json_option, print_json
+from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 
 LIBRARIES = (
     "torch",

@@ -106,7 +106,7 @@ stages and options stay there as long as their scenes do.
     type=click.IntRange(0, 200),
     default=0,
     show_default=True,
-    help="Fit each rendered pose to its reference in so many steps first.",
+    help="First fit each rendered pose to its reference, in this many steps.",
 )
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")

@@ -8,18 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.cli.common import (
-    DeviceChoice,
-    opened_store,
-    quiet_option,
-    resolve_device,
-    threads_or_all,
-    work_options,
-)
+from cleargs.cli.common import quiet_option, threads_or_all, work_options
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
@@ -42,7 +36,7 @@ Examples:
     "out",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of captures, runs and tables; an existing one goes on.",
+    help="Folder of captures, runs and tables; resumes if it exists.",
 )
 @click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
 @click.option(
@@ -82,7 +76,7 @@ def evidence(
     """Make the captures, scenes, tables and pictures of the page of results.
 
     What is compared is listed in one frozen file, on whose captures no default is chosen. The same command
-    goes on where it stopped. What cannot be made (a capture that is not there, say) stands on the page with
+    resumes where it stopped. What cannot be made (a missing capture, say) is named on the page with
     the reason.
     """
     from cleargs.evaluate.comparison import Recipe
@@ -115,9 +109,8 @@ def evidence(
                 write_json(out / f"{section.name}.json", found[-1].compared.document())
     origin = Origin(
         version=version_of_source(),
-        command=_command(
-            quick=quick, captures=captures is not None, listed=listed is not None, sections=sections
-        ),
+        command=_command(quick=quick, captures=captures is not None, listed=listed is not None),
+        sections=sections,
         recipe=recipe.workflow,
         quick=quick,
         threads=recipe.threads,
@@ -128,14 +121,13 @@ def evidence(
     return DONE_IN_PART if any(outcome.missing for outcome in found) else 0
 
 
-def _command(*, quick: bool, captures: bool, listed: bool, sections: tuple[str, ...]) -> str:
+def _command(*, quick: bool, captures: bool, listed: bool) -> str:
     """The command as a reader would type it: with words for the folders."""
     words = [
         "cleargs evidence -o OUT",
         "--quick" * quick,
         "--captures DIR" * captures,
         "--list FILE" * listed,
-        *(f"--section {name}" for name in sections),
     ]
     return " ".join(word for word in words if word)
 

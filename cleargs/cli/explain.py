@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import json_option, opened_store, run_argument, store_option, threads_or_all
+from cleargs.cli.common import json_option, run_argument, store_option, threads_or_all
 from cleargs.cli.outcome import print_plans
 from cleargs.cli.progress import make_reporter
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.session import opened_store
 
 
 @click.command(

@@ -7,12 +7,13 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import SCENE, run_argument, scene_stage, stale_option
+from cleargs.cli.common import run_argument, stale_option
 from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
+from cleargs.pipeline.session import SCENE, scene_stage
 
 MODEL = "colmap/sparse/0"
 

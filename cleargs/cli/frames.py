@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cleargs.cli.words import text_of
+from cleargs.cli.words import AS_FILMED, text_of
 
 COLUMNS = ("frame", "name", "role", "weight", "R", "B", "worst cue", "reason", "repair")
 
@@ -100,5 +100,7 @@ def _repair(row: Mapping[str, Any] | None) -> str:
 
     if row is None:
         return "none"
+    if row["chosen"] == "observed":
+        return AS_FILMED
     refused = not row["accepted"] or row["reason"].startswith(REFUSED)
     return "refused" if refused else str(row["chosen"])

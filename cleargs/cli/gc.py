@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import json_option, opened_store, print_json, store_option
+from cleargs.cli.common import json_option, print_json, store_option
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.session import opened_store
 
 
 @click.command(

@@ -11,7 +11,7 @@ from types import FrameType
 GRACE = 1.0
 """Seconds that the ordinary way out may take."""
 
-MESSAGE = b"interrupted; what is done is kept, and the same command goes on from there\n"
+MESSAGE = b"interrupted; finished work is kept, and the same command resumes from there\n"
 
 
 def answer_signals() -> None:

@@ -62,7 +62,7 @@ Examples:
 
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
-130 interrupted (the same command goes on).
+130 interrupted (the same command resumes).
 """
 
 
@@ -124,7 +124,7 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
         code = cli.main(arguments, prog_name="cleargs", standalone_mode=False, obj=dag or installed())
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
-        click.echo("interrupted; what is done is kept, and the same command goes on from there", err=True)
+        click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
         return INTERRUPTED
     except BrokenPipeError:
         return 1  # whoever read our output has gone
@@ -161,14 +161,19 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, cause, "run it again with --debug for the traceback, and please report it"
 
 
-def _lacks_memory(error: Exception) -> bool:
-    """Whether memory ran out, which threads and libraries that are being loaded say in words of their own."""
+def _lacks_memory(error: BaseException | None) -> bool:
+    """Whether memory ran out, which threads and libraries that are being loaded say in words of their own.
+
+    A package whose library cannot be loaded may put words of its own over the cause.
+    """
     said = str(error)
     match error:
         case MemoryError():
             return True
         case RuntimeError():
-            return any(words in said for words in ("can't start new thread", "can't allocate memory"))
+            return any(
+                words in said for words in ("can't start new thread", "can't allocate memory")
+            ) or _lacks_memory(error.__cause__ or error.__context__)
         case ImportError() | OSError():
             return any(words in said for words in ("failed to map segment", "Cannot allocate memory"))
         case _:

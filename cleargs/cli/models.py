@@ -10,6 +10,7 @@ from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
 from cleargs.models.installed import state
 from cleargs.models.registry import Source, find_model, load_registry, model_dir
+from cleargs.untrusted import cause, read_bytes
 
 _dir_option = click.option(
     "--dir",
@@ -99,7 +100,13 @@ def convert(checkpoint: Path, output: Path, tile: int) -> None:
     require_packages("spandrel", f"converting {checkpoint.name}")
     from cleargs.models.convert import restorer
 
-    restorer.convert(checkpoint.read_bytes(), output, tile)
+    try:
+        content = read_bytes(checkpoint)
+    except OSError as error:
+        raise InputError(
+            f"cannot read {checkpoint}: {cause(error)}", hint="give a checkpoint of PyTorch (.pth, .pt)"
+        ) from error
+    restorer.convert(content, output, tile)
     click.echo(output)
 
 

@@ -29,14 +29,14 @@ PICTURES = ("before_after.png", "candidates.png")
 """What to look at, the first that a stage has."""
 
 
-def print_outcomes(outcomes: Sequence[Outcome], run: Path) -> None:
+def print_outcomes(outcomes: Sequence[Outcome], run: Path, report: Path | None = None) -> None:
     """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
-    the picture to look at, the next command."""
+    what to look at (the ``report``, a picture), the next command."""
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
         click.echo(f"missing: {printable(missing)}", err=True)
     if last.status == "partial":
-        click.echo("hint: the same command tries again; --allow-partial goes on without", err=True)
+        click.echo("hint: the same command tries again; --allow-partial continues without it", err=True)
     summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
     scene = "scene.ply" in last.files
     partial = ", in part" if last.status == "partial" else ""
@@ -51,8 +51,8 @@ def print_outcomes(outcomes: Sequence[Outcome], run: Path) -> None:
         for name in PICTURES
         if name in outcome.manifest.files
     ]
-    if pictures:
-        click.echo(f"look at: {pictures[0]}")
+    if shown := [*([report] if report else []), *pictures[:1]]:
+        click.echo(f"look at: {', '.join(map(str, shown))}")
     click.echo(f"next: {_next(summaries, run, scene)}")
 
 

@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from cleargs.cli.common import (
-    DeviceChoice,
     json_option,
     parse_size,
     print_json,
     quiet_option,
-    resolve_device,
     run_argument,
-    scene_stage,
     stale_option,
     threads_or_all,
     work_options,
@@ -24,6 +21,7 @@ from cleargs.cli.progress import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
+from cleargs.pipeline.session import DeviceChoice, resolve_device, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.render.output import Kind, Shot
@@ -52,7 +50,11 @@ for each pose.
 )
 @run_argument
 @click.option("--frame", type=click.IntRange(min=0), metavar="N", help="A still at the pose of this frame.")
-@click.option("--turntable", is_flag=True, help="A full turn around what the cameras look at.")
+@click.option(
+    "--turntable",
+    is_flag=True,
+    help="A turn around what the cameras look at; to and fro where they saw it from one side alone.",
+)
 @click.option(
     "--poses",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),

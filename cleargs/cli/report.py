@@ -5,12 +5,12 @@ from __future__ import annotations
 import resource
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 
 import click
 
 from cleargs.cli.common import (
     json_option,
-    opened_store,
     print_json,
     quiet_option,
     run_argument,
@@ -25,6 +25,7 @@ from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.session import opened_store
 
 
 @click.command(
@@ -89,3 +90,13 @@ def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
     except CleargsError as error:  # the run itself has succeeded
         planner.reporter.warn(f"there is no report: {error}; {error.hint}")
         return None
+
+
+def older_report(run: Path, dag: Dag) -> str:
+    """The line that tells of a report of ``run`` that does not show its present results; "" for none."""
+    from cleargs.report.record import is_current, linked_manifests, page_of
+
+    page = page_of(run)
+    if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):
+        return ""
+    return f"note: {page} shows earlier results; `cleargs report {quote(str(run))}` makes it anew"

@@ -7,28 +7,21 @@ from pathlib import Path
 import click
 
 from cleargs.cli.common import (
-    DeviceChoice,
     json_option,
-    opened_store,
     partial_option,
     print_json,
     quiet_option,
-    resolve_device,
     store_option,
     threads_or_all,
     work_options,
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
 from cleargs.cli.progress import make_reporter
-from cleargs.cli.report import report_on
-from cleargs.errors import ConfigError, InputError
-from cleargs.pipeline.config import Config, Document, check_document, load_config
+from cleargs.cli.report import older_report, report_on
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import settings as settings_in
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import RUN_FILE, Run, kept_settings, noted_place
 from cleargs.pipeline.runner import Runner, check_same_input
-from cleargs.pipeline.store import STORE_FOLDER
+from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store
 
 
 @click.command(
@@ -50,7 +43,7 @@ Examples:
     metavar="RUN",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="The run folder; an existing one goes on.",
+    help="The run folder; the run resumes if it exists.",
 )
 @click.option(
     "--workflow",
@@ -107,29 +100,24 @@ def run(
 
     INPUT is a video, an image folder, a COLMAP project (images/ and sparse/0), or a folder with
     transforms.json or poses_bounds.npy. Results that are there already are not made again; an interrupted
-    run goes on. An existing run keeps its settings (RUN/run.toml) unless --set, --workflow or --reset say
+    run resumes. An existing run keeps its settings (RUN/run.toml) unless --set, --workflow or --reset say
     otherwise.
     """
-    if not source.exists():
-        raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
-    if (source / RUN_FILE).is_file():
-        noted = noted_place(source).source
-        raise InputError(
-            f"{source} is a run, not a capture",
-            hint=f"give the capture that it was made from{f': {noted}' if noted else ''}",
-        )
-    folder = folder.absolute()
-    kept = None if reset or workflow is not None else _kept(dag, folder)
-    config = load_config(dag, workflow or "default" if kept is None else kept, overrides, seed)
-    before = noted_place(folder)
-    root = (store or before.store or folder / STORE_FOLDER).absolute()
-    reporter = make_reporter(quiet)
-    chosen = resolve_device(before.device or device if device == "auto" else device, reporter.info)
-    settings = Run(folder, source.absolute(), config, root, chosen)
     dag.until(until)
-    if kept is not None and (line := _own_settings(dag, check_document(dag, kept))):
-        reporter.info(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    with opened_store(root) as opened:
+    reporter = make_reporter(quiet)
+    settings = asked_run(
+        dag,
+        source,
+        folder,
+        workflow=workflow,
+        overrides=overrides,
+        seed=seed,
+        reset=reset,
+        store=store,
+        device=device,
+        say=reporter.info,
+    )
+    with opened_store(settings.store) as opened:
         check_same_input(settings, dag, opened)
         if dry_run:
             planner = Planner(dag, settings, opened, threads_or_all(threads), reporter)
@@ -138,30 +126,10 @@ def run(
         runner = Runner(dag, settings, opened, threads_or_all(threads), reporter)
         outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
         page = report_on(runner.planner, outcomes) if wants_report else None
+        if not wants_report and (line := older_report(settings.folder, dag)):
+            reporter.info(line)
     if as_json:
         print_json([outcome_json(outcome) for outcome in outcomes])
     else:
-        print_outcomes(outcomes, folder)
-        if page is not None:
-            click.echo(f"report: {page}")
+        print_outcomes(outcomes, settings.folder, page)
     return exit_code(outcomes)
-
-
-def _kept(dag: Dag, folder: Path) -> Document | None:
-    """The settings of the run in ``folder``; None without one. Raises ConfigError when they are damaged."""
-    try:
-        kept = kept_settings(folder)
-        if kept is not None:
-            check_document(dag, kept)
-    except ConfigError as error:
-        raise ConfigError(
-            f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
-        ) from error
-    return kept
-
-
-def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:
-    """The first few settings that are not the default, in one line; "" where there are none."""
-    usual = dict(settings_in(check_document(dag, {}).document()))
-    own = [f"{name}={value}" for name, value in settings_in(config.document()) if usual.get(name) != value]
-    return ", ".join(own[:most]) + (f" and {len(own) - most} more" if len(own) > most else "")

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cleargs.cli.common import (
-    DeviceChoice,
     json_option,
     print_json,
     quiet_option,
-    resolve_device,
     run_argument,
     threads_or_all,
     work_options,
@@ -29,6 +27,7 @@ from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.progress import Reporter
 
 if TYPE_CHECKING:

@@ -85,7 +85,7 @@ def _check(run: Path, dag: Dag) -> Check:
     if absent:
         raise InputError(
             f"{absent[0]} is not in {source / TRUTH}",
-            hint="the capture changed: run it again, or make it anew",
+            hint="the capture changed: run it again, or make the capture again",
         )
     scored = np.flatnonzero(~np.isnan(np.asarray(judged["R"].to_numpy(), dtype=np.float64)))
     order = np.array([row[names[k]] for k in scored], dtype=np.intp)

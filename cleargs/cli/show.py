@@ -52,7 +52,7 @@ A stage is stale when it was made with other settings or inputs than the run has
 @click.option(
     "--plot",
     is_flag=True,
-    help="With rva, in place of its tables: draw the trajectory, scores, roles, weights and telling frames.",
+    help="With rva, instead of its tables: draw trajectory, scores, roles, weights, best and worst frames.",
 )
 @click.option(
     "--frame",

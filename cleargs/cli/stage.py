@@ -7,13 +7,10 @@ from pathlib import Path
 import click
 
 from cleargs.cli.common import (
-    DeviceChoice,
     json_option,
-    opened_store,
     partial_option,
     print_json,
     quiet_option,
-    resolve_device,
     run_argument,
     store_option,
     threads_or_all,
@@ -25,6 +22,7 @@ from cleargs.cli.report import report_on
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 
 
 @click.command(

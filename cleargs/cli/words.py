@@ -34,7 +34,7 @@ WORDS: Mapping[str, str] = {
     "reliable": "reliable frames",
     "stand_in": "frames that stand in for reliable ones",
     "weights": "frames by weight",
-    "effective_frames": "worth so many frames of full weight",
+    "effective_frames": "equivalent frames of full weight",
     "bins": "stretches of the trajectory",
     "bins_uncovered_before": "stretches without a usable frame at first",
     "views": "frames trained on",
@@ -67,6 +67,9 @@ WORDS: Mapping[str, str] = {
     "held_back.harm": "harm done to them",
 }
 """Figure of a manifest (rounds without their numbers) -> what to call it, in the order of reading."""
+
+AS_FILMED = "as filmed"
+"""What is called "observed" in tables: the raw frame, which needs no repair."""
 
 _ORDER = {name: place for place, name in enumerate(WORDS)}
 
@@ -150,7 +153,7 @@ def text_of(value: Any) -> str:
             )
         case Mapping():
             counts = all(isinstance(item, int) for item in value.values())
-            names = {name: name.replace("_", " ") for name in value}
+            names = {name: name.replace("_", " ").replace("observed", AS_FILMED) for name in value}
             if counts:
                 return ", ".join(f"{count} {names[name]}" for name, count in value.items() if count) or "none"
             return ", ".join(f"{names[name]} {text_of(item)}" for name, item in value.items())

@@ -31,6 +31,8 @@ class Cell(BaseModel):
     means: dict[str, float | None]
     """Metric -> mean over the images; None where it could not be measured."""
     images: int
+    trained_on: int | None = None
+    """How many of them show frames that the scene was trained on; None where that is not known."""
     seconds: float
     """Wall time of the stages that no earlier variant of the sample had made."""
     shared_seconds: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,29 +67,40 @@ class Choices(BaseModel):
 
 
 class Agreement(BaseModel):
-    """How well choices agree with the truth."""
+    """How well choices agree with the truth.
+
+    Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept
+    because its motion is known, not because it would be sharp.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    rows: int
-    by_psnr: float
-    """Share of the rows whose chosen candidate is the best by PSNR."""
+    kept: int
+    """Rows whose frame was kept as it was filmed; they count in none of the figures below."""
+    repaired: int
+    by_psnr: float | None
+    """Share of the repaired rows whose chosen candidate is the best by PSNR; None where there is none."""
     by_lpips: float | None
-    by_chance: float
+    by_chance: float | None
     """What choosing blindly would reach."""
-    lost_psnr: float
-    """Mean over the rows, dB."""
+    lost_psnr: float | None
+    """Mean over the repaired rows, dB."""
 
 
 def agreement(rows: Sequence[Choice]) -> Agreement:
-    """The figures of one or more rows."""
-    count = len(rows)
+    """The figures of some rows."""
+    repaired = [row for row in rows if row.chosen != RAW]
+
+    def mean(values: Iterable[float]) -> float | None:
+        return math.fsum(values) / len(repaired) if repaired else None
+
     return Agreement(
-        rows=count,
-        by_psnr=sum(row.best_by_psnr for row in rows) / count,
-        by_lpips=sum(row.best_by_lpips for row in rows) / count if all(row.lpips for row in rows) else None,
-        by_chance=math.fsum(1 / len(row.psnr) for row in rows) / count,
-        lost_psnr=math.fsum(row.lost_psnr for row in rows) / count,
+        kept=len(rows) - len(repaired),
+        repaired=len(repaired),
+        by_psnr=mean(row.best_by_psnr for row in repaired),
+        by_lpips=mean(row.best_by_lpips for row in repaired) if all(row.lpips for row in repaired) else None,
+        by_chance=mean(1 / len(row.psnr) for row in repaired),
+        lost_psnr=mean(row.lost_psnr for row in repaired),
     )
 
 

@@ -21,6 +21,7 @@ from cleargs.files import write_bytes
 from cleargs.pipeline.keys import canonical_json
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
+from cleargs.untrusted import read_bytes
 
 T = TypeVar("T", Cell, Roles, Choices)
 
@@ -121,7 +122,7 @@ def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
     }
     path = out / "choices" / f"{hashlib.sha256(canonical_json(parts).encode()).hexdigest()}.json"
     try:
-        rows = TypeAdapter(tuple[Choice, ...]).validate_json(path.read_bytes())
+        rows = TypeAdapter(tuple[Choice, ...]).validate_json(read_bytes(path))
     except (OSError, ValidationError):  # not made yet, or damaged
         rows = tuple(judge_choices(made.run, made.sample.capture, distances.get("lpips_alex")))
         path.parent.mkdir(parents=True, exist_ok=True)

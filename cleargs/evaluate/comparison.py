@@ -8,7 +8,6 @@ by content in ``OUT/evaluations``.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,8 +29,9 @@ from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE, Device, Run, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
-from cleargs.progress import Reporter
+from cleargs.progress import Reporter, SilentReporter
 from cleargs.splat.constants import SH_DEGREES
+from cleargs.untrusted import open_regular, read_bytes, read_json
 
 EVALUATION_VERSION = 2
 """Raised when an evaluation of equal inputs would give other figures."""
@@ -54,7 +54,7 @@ class Sample:
     def column(self) -> str:
         """The protocol of a synthetic capture, else the name of the capture."""
         try:
-            note = json.loads((self.capture / "truth" / "capture.json").read_bytes())
+            note = read_json(self.capture / "truth" / "capture.json")
             return str(note["protocol"])
         except (OSError, ValueError, KeyError, TypeError):
             return self.capture.resolve().stem
@@ -183,6 +183,7 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
                 views=view_set.views,
                 means=evaluation.means,
                 images=len(evaluation.images),
+                trained_on=_trained_on(made, view_set),
                 seconds=made.seconds,
                 shared_seconds=made.shared_seconds,
                 gaussians=gaussians,
@@ -194,6 +195,17 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
             )
         )
     return cells
+
+
+def _trained_on(made: Made, view_set: Views) -> int | None:
+    """How many of the views show frames that the scene was trained on; None where that is not known."""
+    from cleargs.evaluate.evaluate import reference_of
+    from cleargs.evaluate.references import views_trained_on
+
+    reference = reference_of(
+        made.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=SilentReporter()
+    )
+    return views_trained_on(made.run, made.variant.stage, reference)
 
 
 @dataclass(frozen=True)
@@ -251,7 +263,7 @@ def evaluated(
     folder = out / "evaluations" / hashlib.sha256(canonical_json(parts).encode()).hexdigest()
     path = folder / "eval.json"
     try:
-        return Evaluation.model_validate_json(path.read_bytes()), folder
+        return Evaluation.model_validate_json(read_bytes(path)), folder
     except (OSError, ValidationError):
         pass  # not made yet, or damaged
     reference = reference_of(
@@ -296,7 +308,7 @@ def trained_steps(made: Made) -> int:
 def size_of(scene: Path) -> tuple[int, int]:
     """The number of Gaussians in a PLY and their SH degree, from its header."""
     count, rest = 0, 0
-    with scene.open("rb") as file:
+    with open_regular(scene) as file:
         for line in file:
             if line.startswith(b"element vertex"):
                 count = int(line.split()[2])
@@ -317,7 +329,7 @@ def _all_noted(combine: Callable[[list[float]], float], values: Sequence[float |
 def _matrices(folder: Path) -> list[Any]:
     """The poses that ``transforms.json`` lists; none without the file."""
     try:
-        frames = json.loads((folder / "transforms.json").read_bytes())["frames"]
+        frames = read_json(folder / "transforms.json")["frames"]
         return [frame.get("transform_matrix") for frame in frames]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []

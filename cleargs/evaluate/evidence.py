@@ -28,6 +28,7 @@ from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
 from cleargs.synth.capture import make_capture
+from cleargs.untrusted import FAULTS, cause, read_text, shallow
 
 WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ingest.max_frames=60")
 """How a scene is trained that becomes a world: on every frame."""
@@ -135,16 +136,17 @@ class Workshop:
 
 def read_evidence(path: Path | None = None) -> Evidence:
     """The lists of ``path``; those of the package for None. Raises ConfigError when they cannot be used."""
-    source = path or files("cleargs.evaluate") / "evidence.toml"
     hint = "compare it with cleargs/evaluate/evidence.toml"
     try:
-        return Evidence.model_validate(tomllib.loads(source.read_text(encoding="utf-8")))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read the list of evidence: {error}", hint=hint) from error
+        own = files("cleargs.evaluate") / "evidence.toml"
+        text = own.read_text(encoding="utf-8") if path is None else read_text(path)
+        return Evidence.model_validate(shallow(tomllib.loads(text)))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise ConfigError(f"list of evidence, {place}: {first['msg']}", hint=hint) from error
+    except FAULTS as error:
+        raise ConfigError(f"cannot read the list of evidence: {cause(error)}", hint=hint) from error
 
 
 def make_section(section: Section, shop: Workshop) -> Outcome:
@@ -203,7 +205,7 @@ def minutes(section: Section, shop: Workshop) -> float:
 # Wall seconds on two quiet cores: a part a unit and a part a megapixel. A step: docs/speed.md (0.027 s at
 # 0.125 MP). A judged frame, views off the path included: nearly all of it LPIPS with VGG. A repair: as RIVR
 # estimates. A sample: its capture, poses and cues.
-_STEP_S, _STEP_S_PER_MP = 0.008, 0.16
+_STEP_S, _STEP_S_PER_MP = 0.02, 0.16
 _JUDGE_S, _JUDGE_S_PER_MP = 0.05, 10.0
 _REPAIR_S, _REPAIR_S_PER_MP = 0.3, 5.0
 _SAMPLE_S = 8.0

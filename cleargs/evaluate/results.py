@@ -16,6 +16,7 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import disk_error, write_json
 from cleargs.tables import column, write_table
+from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
 World = Literal["scene", "ingest", "umeyama"]
@@ -144,7 +145,7 @@ def write_report(path: Path, report: Report) -> None:
 def read_report(path: Path) -> Report:
     """Read what `write_report` wrote. Raises InputError when it is missing or damaged."""
     try:
-        return Report.model_validate_json(path.read_bytes())
+        return Report.model_validate_json(read_bytes(path))
     except (OSError, ValidationError) as error:
         raise InputError(
             f"cannot read {path}: {str(error).splitlines()[0]}", hint="make it again with `cleargs eval`"

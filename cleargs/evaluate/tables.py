@@ -24,6 +24,8 @@ NOTES: Mapping[ViewSet, str] = {
     "held-out": "No scene was trained on these frames. They are as sharp as they were filmed.",
 }
 """What to know of a set of views."""
+UNKNOWN = "Which of these frames the scenes were trained on is not known."
+SEEN = "Scenes were trained on some of these frames, as the first lines say."
 NAMES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
 COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 """Metrics whose differences are tabled."""
@@ -75,7 +77,7 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
     cells, parts = found.cells, []
     for views in cells.view_sets():
         parts.append(f"## {TITLES[views]}")
-        parts += [NOTES[views]] if views in NOTES else []
+        parts += [note] if (note := note_on(cells, views)) else []
         for metric in cells.metrics():
             parts.append(f"### {metric_title(metric)}")
             parts.append(metric_table(cells, labels, views, metric).markdown())
@@ -92,6 +94,24 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
     if found.choices:
         parts += ["## The choice against the truth", choices_table(found.choices, labels).markdown()]
     return "\n\n".join(parts) + "\n"
+
+
+def note_on(cells: Cells, views: ViewSet) -> str:
+    """What to know of a set of views in this comparison; "" for nothing."""
+    seen = [cell.trained_on for cell in cells.cells if cell.views == views]
+    if views == "held-out" and any(seen):
+        return SEEN
+    return UNKNOWN if views == "held-out" and None in seen else NOTES.get(views, "")
+
+
+def training_lines(cells: Cells, labels: Mapping[str, str]) -> list[str]:
+    """The scenes that are judged on frames that they were trained on, where the views are not called so."""
+    return [
+        f"note: {cell.trained_on} of {cell.images} views of {labels[cell.variant]} are of frames that it was "
+        "trained on"
+        for cell in cells.cells
+        if cell.views in ("held-out", "reference") and cell.trained_on
+    ]
 
 
 def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> Table:
@@ -178,27 +198,29 @@ def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> Table:
 
 
 def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> Table:
-    """How often the chosen candidate is the best, over all rows of all samples of a column."""
+    """How often the chosen repair is the best candidate, over all rows of all samples of a column."""
     rows = []
     for column, variant in dict.fromkeys((scene.column, scene.variant) for scene in choices):
         own = [scene for scene in choices if (scene.column, scene.variant) == (column, variant)]
         found = agreement([row for scene in own for row in scene.rows])
-        by_lpips = "n/a" if found.by_lpips is None else f"{100 * found.by_lpips:.0f} %"
         rows.append(
             [
                 column,
                 labels[variant],
-                str(found.rows),
-                f"{100 * found.by_psnr:.0f} %",
-                by_lpips,
-                f"{100 * found.by_chance:.0f} %",
-                f"{found.lost_psnr:.2f}",
+                str(found.kept),
+                str(found.repaired),
+                *(
+                    "n/a" if share is None else f"{100 * share:.0f} %"
+                    for share in (found.by_psnr, found.by_lpips, found.by_chance)
+                ),
+                "n/a" if found.lost_psnr is None else f"{found.lost_psnr:.2f}",
             ]
         )
     head = [
         "",
         "",
-        "rows",
+        "kept as filmed",
+        "repaired",
         "best by PSNR",
         "best by LPIPS (AlexNet)",
         "by chance",

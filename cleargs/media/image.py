@@ -16,7 +16,7 @@ from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
 from cleargs.media.header import PNG
 from cleargs.media.header import image_size as stated_size
-from cleargs.untrusted import cause, read_bytes
+from cleargs.untrusted import cause, open_regular, read_bytes
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
@@ -38,7 +38,11 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     from OpenImageIO import ImageInput, geterror
 
-    source = ImageInput.open(str(path))
+    try:
+        open_regular(path).close()
+        source = ImageInput.open(str(path))
+    except OSError:
+        source = None
     if source is None:
         geterror()  # else it is told on stderr at the end
         raise InputError(f"{path} is not an image that can be read", hint="convert it to JPEG or PNG")

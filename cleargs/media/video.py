@@ -149,12 +149,15 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         with av.open(path, metadata_errors="replace") as container:
             if not container.streams.video:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
-            width, height = container.streams.video[0].width, container.streams.video[0].height
+            stream = container.streams.video[0]
+            if stream.codec_context is None:  # of a form that FFmpeg does not know
+                raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
+            width, height = stream.width, stream.height
             if width * height > MAX_PIXELS:
                 raise InputError(
                     f"{path.name} has {width}x{height} pixels; at most {MAX_PIXELS} are read", hint=_HINT
                 )
-            yield container, container.streams.video[0]
+            yield container, stream
     except (av.error.FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path.name} cannot be read as a video: {reason}", hint=_HINT) from error

@@ -20,6 +20,7 @@ from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.registry import load_registry
 from cleargs.models.tiling import Image, apply_tiled, map_tiled
+from cleargs.plugins import load_part, plugins
 
 EMBEDDED = "embedded"
 """The name under which settings ask for the expert that ships with ClearGS."""
@@ -118,9 +119,10 @@ class OnnxExpert:
         return np.asarray(restored, np.float32)
 
 
-def expert_path(spec: str) -> Path:
+def expert_path(spec: str) -> Path | None:
     """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, the name of an expert in the
-    registry is the installed one, a name with an ending or a folder is a path.
+    registry is the installed one, a name with an ending or a folder is a path. None for an expert that
+    another package brings: its version stands in the key of the store instead.
 
     Raises InputError for any other name, and when an expert of the registry is not installed.
     """
@@ -128,7 +130,10 @@ def expert_path(spec: str) -> Path:
         return Path(str(files("cleargs.models"))).absolute() / "weights" / "restorer.onnx"
     path = installed_file(spec, "expert") or Path(spec).absolute()
     if path.name == spec and not (path.suffix or path.exists()):
-        names = [EMBEDDED, *(model.name for model in load_registry() if model.role == "expert")]
+        brought = plugins("experts")
+        if spec in brought:
+            return None
+        names = [EMBEDDED, *(model.name for model in load_registry() if model.role == "expert"), *brought]
         near = get_close_matches(spec, names, n=1)
         raise InputError(
             f"there is no restoration expert {spec!r}",
@@ -141,6 +146,9 @@ def load_expert(spec: str, device: Device = "cpu") -> Expert:
     """The expert named by ``spec`` (see `expert_path`), on what `network_device` found. Raises InputError as
     `OnnxExpert` does, and where an installed file is not what was installed."""
     path = expert_path(spec)
+    if path is None:
+        maker: Callable[[Device], Expert] = load_part("experts", spec)
+        return maker(device)
     if model := installable(spec, "expert"):
         verify(model, path.parent)
     return OnnxExpert(path, name=spec if spec == EMBEDDED or model else None, device=device)

@@ -11,6 +11,7 @@ from pathlib import Path
 from cleargs.children import module_command
 from cleargs.errors import InputError, StageError
 from cleargs.models.registry import Source
+from cleargs.untrusted import cause, read_bytes
 
 _MANUALLY = "check the connection, or fetch the file elsewhere and give it with --from FILE"
 
@@ -43,9 +44,9 @@ def fetch(source: Source, folder: Path) -> Path:
 def read_checked(path: Path, source: Source) -> bytes:
     """The content of the file, if it is the published one; InputError if not."""
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}", hint=f"give {source.label}") from error
+        raise InputError(f"{path} cannot be read: {cause(error)}", hint=f"give {source.label}") from error
     if source.sha256 and not hashlib.sha256(data).hexdigest().startswith(source.sha256):
         size = f"; it has {source.size} bytes" if source.size else ""
         raise InputError(

@@ -9,6 +9,7 @@ from typing import Literal
 
 from cleargs.errors import InputError
 from cleargs.models.registry import Model, Role, load_registry, model_dir
+from cleargs.untrusted import open_regular, read_json
 
 State = Literal["shipped", "installed", "not installed", "incomplete"]
 
@@ -75,7 +76,7 @@ def write_receipt(model: Model, directory: Path, source_sha256: str) -> Path:
 def read_receipt(model: Model, directory: Path) -> dict[str, str]:
     """The digests of the installed files by name; none if there is no readable receipt."""
     try:
-        files = json.loads((directory / _receipt_name(model)).read_text("utf-8"))["files"]
+        files = read_json(directory / _receipt_name(model))["files"]
         return {str(name): str(digest) for name, digest in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
@@ -87,7 +88,7 @@ def file_digest(path: Path) -> str:
         from cleargs.models.lpips import tensors_digest
 
         return tensors_digest(path)
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -11,6 +11,8 @@ share of the image that carries information (`cleargs.models.information`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
@@ -25,6 +27,7 @@ from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.registry import load_registry
 from cleargs.models.tile_mean import Image, cover, mean_over_tiles
+from cleargs.plugins import load_part, plugins
 
 CLARITY = "clarity-net"
 """The embedded network, meant for the primary role."""
@@ -136,11 +139,12 @@ class LearnedScorer:
         return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
 
 
-def scorer_path(spec: str) -> Path:
+def scorer_path(spec: str) -> Path | None:
     """The file, absolute, that holds the weights of the scorer that a setting names.
 
-    Its content stands for the scorer in the keys of the store. A path need not exist; raises InputError for
-    any other name, and when a scorer of the registry is not installed.
+    Its content stands for the scorer in the keys of the store; None for a scorer that another package brings,
+    whose version does. A path need not exist; raises InputError for any other name, and when a scorer of the
+    registry is not installed.
     """
     models = Path(str(files("cleargs.models"))).absolute()
     if spec == CLARITY:
@@ -150,17 +154,18 @@ def scorer_path(spec: str) -> Path:
     if spec.endswith(".onnx"):
         return Path(spec).absolute()
     path = installed_file(spec, "scorer")
-    if path is None:
-        known = [model.name for model in load_registry() if model.role == "scorer"]
-        raise InputError(
-            f"no scorer is called {spec!r}", hint=f"use {', '.join(known)} or the path of an .onnx file"
-        )
+    if path is None and spec not in (brought := plugins("scorers")):
+        known = [*(model.name for model in load_registry() if model.role == "scorer"), *brought]
+        near = get_close_matches(spec, known, n=1)
+        every = f"use {', '.join(known)} or the path of an .onnx file"
+        raise InputError(f"no scorer is called {spec!r}", hint=f"did you mean {near[0]}?" if near else every)
     return path
 
 
 def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
     """The scorer that a setting names: ``clarity-net``, ``naturalness-stats``, one of the registry that is
-    installed, or the path of an ONNX file; networks on what `network_device` found.
+    installed, the path of an ONNX file, or one that another package brings; networks on what `network_device`
+    found.
 
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
@@ -169,6 +174,9 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
 
 def _load(spec: str, device: Device) -> Scorer:
     path = scorer_path(spec)
+    if path is None:
+        maker: Callable[[Device], Scorer] = load_part("scorers", spec)
+        return maker(device)
     if spec == NATURALNESS:
         return StatisticsScorer(NATURALNESS)
     if model := installable(spec, "scorer"):

@@ -29,6 +29,8 @@ meet at a point that could be trusted."""
 _FLATTEST = 0.25
 """Smallest radius of a turntable, as a share of the distance to its centre: cameras straight above it give no
 circle."""
+WIDEST_GAP = np.pi / 2
+"""Between neighbouring cameras around the axis, up to which a turntable turns fully."""
 _PULL = 0.003
 """Weight of the cameras' mean up, against their horizontal axes, in what is up."""
 
@@ -77,8 +79,12 @@ def smooth_path(cameras: Sequence[Camera], count: int) -> CameraPath:
 
 
 def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
-    """A full turn in ``count`` equal steps around the point that ``cameras`` look at, from the first one's
-    side, at their median distance from the axis and median height. The axis is that of `upright`.
+    """A turn in ``count`` steps around the point that ``cameras`` look at, from the first one's side.
+
+    At their median distance from the axis and median height; the axis is that of `upright`.
+
+    It is a full one in equal steps; where the cameras leave more than `WIDEST_GAP` of it out, it goes to and
+    fro along what they saw, since beyond it the scene has nothing to show.
 
     Raises InputError when they all look the same way.
     """
@@ -91,7 +97,18 @@ def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] 
     radius = max(float(np.median(np.linalg.norm(away, axis=1))), _FLATTEST * distance)
     ahead = _unit(away[np.argmax(np.linalg.norm(away, axis=1) > 1e-6 * distance)])
     aside = np.cross(up, ahead)
-    angles = 2 * np.pi * np.arange(count) / count
+    phases = 2 * np.pi * np.arange(count) / count
+    seen = np.sort(np.arctan2(away @ np.cross(up, ahead), away @ ahead))
+    gaps = np.diff(seen, append=seen[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] <= WIDEST_GAP:
+        angles = phases
+    else:
+        half = 0.5 * (2 * np.pi - gaps[widest])
+        middle = seen[widest] - half
+        first = min(0.0, -2 * np.pi, key=lambda angle: abs(angle - middle))  # where the first camera stands
+        begin = np.arcsin(np.clip((first - middle) / max(half, 1e-9), -1.0, 1.0))
+        angles = middle + half * np.sin(begin + phases)
     around = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
     places = centre + radius * around + np.median(heights) * up
     return np.stack([look_at(place, centre, up) for place in places])

@@ -20,7 +20,8 @@ from cleargs.untrusted import FAULTS, cause, read_json
 
 World = Literal["normalised", "input"]
 
-_OPENGL = np.diag([1.0, -1.0, -1.0])
+_OPENGL = np.array([1.0, -1.0, -1.0])
+"""By what the axes of an OpenCV camera are multiplied to be those of an OpenGL one."""
 _HINT = "give cameras.json as `cleargs export` writes it, or transforms.json as nerfstudio does"
 
 
@@ -56,7 +57,7 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
 
 def _of_cameras_json(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[Camera, Pose]:
     """An entry in the layout of the Inria code: the camera's position, and its axes in the world."""
-    axes = np.array(entry["rotation"], np.float64).reshape(3, 3) @ _OPENGL
+    axes = np.array(entry["rotation"], np.float64).reshape(3, 3) * _OPENGL
     place = np.array(entry["position"], np.float64).reshape(3)
     return _with_lens(lens, entry, ("width", "height"), ("fx", "fy")), rigid_pose(
         np.column_stack([axes, place]), name, _HINT

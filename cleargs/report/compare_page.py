@@ -20,12 +20,12 @@ from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.evaluate.results import Evaluation
 from cleargs.evaluate.tables import (
     NAMES,
-    NOTES,
     TITLES,
     Table,
     choices_table,
     difference_table,
     metric_title,
+    note_on,
     number,
     roles_table,
     value_text,
@@ -165,7 +165,7 @@ def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, 
         for views in cells.view_sets():
             if column in cells.columns(views):
                 values = _values(cells, labels, views, column)
-                capture.tables.append((views, TITLES[views], NOTES.get(views, ""), values))
+                capture.tables.append((views, TITLES[views], note_on(cells, views), values))
         for shot in found:
             capture.poses.append(_pose(shot, numbers, pictures, out, folder, labels))
             numbers += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ class Watched:
             stages.append({"name": name, "state": state, "seconds": seconds})
         return {
             "name": self.folder.name,
-            "now": None if found is None else _now(found),
+            "now": None if found is None else asdict(found),
             "stages": stages,
             "preview": None if picture is None else str(picture.version),
             "report": page_of(self.folder).is_file(),
@@ -55,14 +56,3 @@ class Watched:
 
     def _at_work(self) -> AtWork | None:
         return at_work(self._run.folder, self._run.store)
-
-
-def _now(found: AtWork) -> dict[str, Any]:
-    return {
-        "stage": found.stage,
-        "label": found.label,
-        "done": found.done,
-        "total": found.total,
-        "note": found.note,
-        "seconds_left": found.seconds_left,
-    }

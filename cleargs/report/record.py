@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import cleargs
 from cleargs.files import write_json
 from cleargs.pipeline.manifest import Manifest, linked_manifest
+from cleargs.untrusted import read_json
 
 FOLDER, PAGE, RECORD = "report", "index.html", "report.json"
 
@@ -46,7 +46,7 @@ def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
 
 def _record(run: Path) -> dict[str, Any]:
     try:
-        record = json.loads((run / FOLDER / RECORD).read_bytes())
+        record = read_json(run / FOLDER / RECORD)
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}

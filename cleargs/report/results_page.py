@@ -37,7 +37,9 @@ class Origin:
 
     version: str
     command: str
-    """The names of sections last; below a section stands its own instead."""
+    """Without the names of sections."""
+    sections: tuple[str, ...]
+    """Those that were asked for; empty for all."""
     recipe: str
     quick: bool
     threads: int
@@ -45,9 +47,9 @@ class Origin:
 
     def made(self, section: Section | None = None) -> str:
         """The line under a table."""
-        only = f" --section {section.name}" if section is not None else ""
-        command = self.command if section is None else self.command.split(" --section ")[0]
-        return f"`{command}{only}`, version {self.version}"
+        names = self.sections if section is None else (section.name,)
+        command = " ".join((self.command, *(f"--section {name}" for name in names)))
+        return f"`{command}`, version {self.version}"
 
 
 def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
@@ -57,9 +59,7 @@ def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
         metric for found in outcomes if found.compared for metric in found.compared.results.cells.metrics()
     }
     lacking = [NAMES[name] for name in ("lpips_alex", "lpips_vgg") if name not in nets]
-    warnings = [
-        "This is the rough page (`--quick`): small images, short trainings, few captures."
-    ] * origin.quick
+    warnings = [_ROUGH] * origin.quick
     if lacking:
         warnings.append(f"{' and '.join(lacking)} could not be measured: `cleargs models install lpips`.")
     values = {

@@ -106,6 +106,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(_static(_OURS[path]), Path(path).suffix)
         elif path == "/state.json":
             self._send(json.dumps(plain_json(self._watched.state())).encode(), ".json")
+        elif path == "/favicon.ico":  # asked for by every browser; we have none
+            self.send_response(HTTPStatus.NO_CONTENT)
+            self.end_headers()
         elif path == "/preview.png":
             self._send_file(self._watched.preview())
         elif path == f"/{FOLDER}":

@@ -201,7 +201,8 @@ def _allocation_warnings(
     if _figure(manifests, "rva", "stand_in"):
         yield Caution(
             "No frame counts as reliable",
-            "The best of them stand in. Thresholds nearer to this capture tell good frames from bad ones.",
+            "The best of them are used instead. Thresholds nearer to this capture would separate good frames "
+            "from bad ones.",
             tuple(
                 f"rva.{name}={_setting(config, 'rva', name) + step:.2f}"
                 for name, step in (("tau_R", -0.1), ("tau_B", 0.1))

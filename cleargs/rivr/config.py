@@ -37,7 +37,7 @@ class HarmConfig(BaseModel):
 class GateConfig(BaseModel):
     """When a repair is refused because it disagrees with both the raw frame and the render.
 
-    docs/rivr.md has the measurements behind the thresholds.
+    docs/experiments/rivr.md has the measurements behind the thresholds.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -68,18 +68,19 @@ class RivrConfig(BaseModel):
     )
     expert: str = Field(
         "embedded",
-        description="restoration expert: embedded, a name of `cleargs models list`, or an ONNX file",
-        json_schema_extra={"key": False},  # its content is in the key
+        description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
+        "that another package brings",
+        json_schema_extra={"key": False, "plugin": "experts"},  # its content is in the key
     )
     primary_scorer: str = Field(
         "clarity-net",
         description="decides between candidates: the name of a scorer, or an ONNX file",
-        json_schema_extra={"key": False},  # as for the expert
+        json_schema_extra={"key": False, "plugin": "scorers"},  # as for the expert
     )
     tiebreak_scorer: str = Field(
         "naturalness-stats",
         description="decides near-ties: the name of a scorer, or an ONNX file",
-        json_schema_extra={"key": False},
+        json_schema_extra={"key": False, "plugin": "scorers"},
     )
     group: int | None = Field(
         None,
@@ -93,7 +94,7 @@ class RivrConfig(BaseModel):
     )
     keep_raw: bool = Field(
         True,
-        description="a raw frame that needs no repair gets none and goes on supervising by itself; false: "
+        description="a raw frame that needs no repair gets none and keeps supervising by itself; false: "
         "the paper's, where every target gets a pseudo observation",
     )
     fuse_sigma: float = Field(
@@ -125,7 +126,7 @@ class ConsolidateConfig(BaseModel):
     scorer: str = Field(
         "clarity-net",
         description="measures harm: the name of a scorer, or the path of an ONNX file",
-        json_schema_extra={"key": False},  # its content is in the key
+        json_schema_extra={"key": False, "plugin": "scorers"},  # its content is in the key
     )
     distil: RepairDistilConfig = Field(RepairDistilConfig(), description="the final distillation")
     harm: HarmConfig = Field(HarmConfig(), description="when the consolidated scene is rejected")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cleargs.errors import StoreError
+from cleargs.files import remove
 from cleargs.formation.frame import described
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
@@ -70,7 +71,8 @@ def run_round(
     reporter: Reporter,
     label: str = "candidates",
 ) -> list[Selection]:
-    """Repair every target frame; EXRs go to ``out/round_NN/``. Frames that have theirs are left alone."""
+    """Repair every target frame; EXRs go to ``out/round_NN/``. Frames that have theirs are left alone; an EXR
+    that is damaged, or of another frame or round, is made again, with a warning."""
     folder = f"round_{number:02d}"
     (out / folder).mkdir(exist_ok=True)
     rows = []
@@ -78,7 +80,9 @@ def run_round(
         for view in targets:
             exr = f"{folder}/{view.frame_id:06d}.exr"
             row = recorded_row(out, exr)
-            if row is None:
+            if row is None or (row.round, row.frame_id) != (number, view.frame_id):
+                if (out / exr).exists():
+                    reporter.warn(f"{exr}: what an earlier try left cannot be used and is made again")
                 rendered = render(view)
                 restoration = restore(view, rendered)
                 row, image = repair(number, view, exr, rendered, restoration, explain(view), rules)
@@ -165,6 +169,16 @@ def repair(
     if explained is not None:
         layers["explained"] = to_layer(explained.image)
     return row, LayeredImage(layers, _attributes(row))
+
+
+def forget_others(out: Path, rounds: int, targets: Sequence[View]) -> None:
+    """Remove what would be published beside the EXRs of ``targets`` in rounds 1 to ``rounds``."""
+    ours = {
+        f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets
+    }
+    for place in out.glob("round_*/*"):
+        if place.relative_to(out).as_posix() not in ours:
+            remove(place)
 
 
 def recorded_row(out: Path, exr: str) -> Selection | None:

@@ -15,7 +15,7 @@ from cleargs.rivr.candidates import CANDIDATES, CandidateName, Image
 
 NEGLIGIBLE = 0.15
 """Change by the repair, as a share of what the render leaves unexplained, below which there is nothing to
-repair. docs/rivr.md has the measurement."""
+repair. docs/experiments/rivr.md has the measurement."""
 
 KEPT = "needs no repair"
 """The reason of a row whose raw frame is kept."""

@@ -23,8 +23,6 @@ length.
 """
 FINE, COARSE = 1.0, 3.0
 """Standard deviations, px, of the two scales. Finer is noise; coarser mixes neighbouring edges."""
-STEP_EDGES = COARSE / FINE
-"""The ratio of a sharp image of step edges (p = 1/2)."""
 LARGEST_EXTENT = 6.0
 """Extents, px, beyond which the ratio of the two scales says nothing more."""
 

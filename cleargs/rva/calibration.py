@@ -2,8 +2,8 @@
 
 Rule behind the blur constants: a frame whose full weight in training does no harm should reach the paper's
 R >= 0.70. Measured on two synthetic captures of 320x180 px, half of whose frames are blurred by a motion of L
-(docs/rva.md): full weight gains in PSNR and SSIM at 2.5 px and loses to a weight of 0.4 at 4 px. Their mean R
-is 0.82 at 2.5 px, 0.67 at 4 px and 0.54 at 6 px.
+(docs/experiments/rva.md): full weight gains in PSNR and SSIM at 2.5 px and loses to a weight of 0.4 at 4 px.
+Their mean R is 0.82 at 2.5 px, 0.67 at 4 px and 0.54 at 6 px.
 """
 
 from __future__ import annotations

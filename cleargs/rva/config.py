@@ -9,13 +9,18 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
+
+from cleargs.plugins import require_known
 
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 """A number in [0, 1]."""
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
 
+
+EVALUATORS = ("statistics", "qwen3-vl")
+"""Those that ship with ClearGS."""
 
 MODEL_VARIABLE = "CLEARGS_VLM_MODEL"
 """Environment variable with the model's name, where ``qwen.model`` gives none."""
@@ -122,10 +127,11 @@ class RvaConfig(BaseModel):
         description="with coverage: suppressed frames are reactivated until this share of the registered "
         "frames is active; 0: the paper's",
     )
-    evaluator: Literal["statistics", "qwen3-vl"] = Field(
+    evaluator: str = Field(
         "statistics",
+        json_schema_extra={"plugin": "evaluators"},
         description="who judges appearance; statistics: image and video statistics, no network; "
-        "qwen3-vl: the paper's vision-language model",
+        "qwen3-vl: the paper's vision-language model; or one that another package brings",
     )
     qwen: QwenConfig = Field(QwenConfig(), description="how qwen3-vl is asked")
     frames_per_bin: int = Field(
@@ -198,6 +204,11 @@ class RvaConfig(BaseModel):
     attenuated_gain: float = Field(
         0.30, ge=0.0, le=1.0, description="gain of the weight of geometric and auxiliary frames"
     )
+
+    @field_validator("evaluator")
+    @classmethod
+    def _evaluator_is_known(cls, name: str) -> str:
+        return require_known("evaluators", name, EVALUATORS)
 
     @model_validator(mode="before")
     @classmethod

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
+from cleargs.plugins import load_part
 from cleargs.progress import Reporter
-from cleargs.rva.config import RvaConfig
+from cleargs.rva.config import EVALUATORS, RvaConfig
 from cleargs.rva.scores import Floats
 
 if TYPE_CHECKING:
@@ -55,6 +56,9 @@ def check_evaluator(config: RvaConfig) -> None:
     at the server's address, the server has no such model, or the folder holds none that can be loaded."""
     if config.evaluator == "statistics":
         return
+    if config.evaluator not in EVALUATORS:
+        load_part("evaluators", config.evaluator)
+        return
     if config.qwen.model_dir:
         from cleargs.rva.vlm.local import check_folder
 
@@ -72,7 +76,8 @@ def make_evaluator(
     device: Literal["cpu", "cuda"] = "cpu",
     cache: Path | None = None,
 ) -> Evaluator:
-    """The evaluator that the settings name.
+    """The evaluator that the settings name: what another package brings is called with ``seed``, ``device``
+    and ``cache``.
 
     ``cache`` is a folder in which the evaluator keeps what it found out about single frames; ``qwen3-vl``
     needs one.
@@ -82,6 +87,9 @@ def make_evaluator(
         from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
 
         return StatisticsEvaluator(cache)
+    if config.evaluator not in EVALUATORS:
+        maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
+        return maker(seed=seed, device=device, cache=cache)
     from cleargs.rva.vlm.evaluator import QwenEvaluator
 
     if cache is None:

@@ -12,6 +12,7 @@ import numpy as np
 from cleargs.files import write_json
 from cleargs.rva.evaluator import View
 from cleargs.rva.scores import Floats
+from cleargs.untrusted import read_json
 
 
 class KeptRows:
@@ -24,7 +25,7 @@ class KeptRows:
     def find(self, digest: str) -> Floats | None:
         """The row; None where there is none, or where its file is damaged."""
         try:
-            kept = json.loads((self._folder / f"{digest}.json").read_text(encoding="utf-8"))
+            kept = read_json(self._folder / f"{digest}.json")
             row = np.array([kept[column] for column in self._columns], dtype=np.float64)
         except (OSError, ValueError, KeyError, TypeError):
             return None

@@ -175,3 +175,15 @@ def test_a_result_that_no_longer_holds_is_waited_for_without_a_word(tmp_path: Pa
 def test_the_status_of_no_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(["batch-status", str(tmp_path / "sheet.csv")]) == 2
     assert "there was no batch" in said(capsys)[0]
+
+
+@pytest.mark.usefixtures("program")
+def test_a_page_of_an_earlier_batch_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "hall.mp4").touch()
+    sheet = tmp_path / "sheet.csv"
+    sheet.write_text("name,input\nhall,hall.mp4\n")
+    page = tmp_path / "sheet.batch" / "report" / "index.html"
+    page.parent.mkdir(parents=True)
+    page.touch()
+    invoke(["batch", str(sheet), "--no-report"])
+    assert f"note: {page} shows an earlier batch; without --no-report it is made anew" in said(capsys)

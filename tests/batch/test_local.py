@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from toy_batch import ToyBatch, make_toy_batch
 
-pytestmark = pytest.mark.usefixtures("engine")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("engine")]
 
 
 def kinds(scenes: dict[str, dict[str, Any]]) -> dict[str, str]:

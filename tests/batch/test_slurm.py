@@ -23,6 +23,7 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.manifest import read_manifest
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.usefixtures("impatient_engine"),
     pytest.mark.skipif(missing_daemon() is not None, reason=f"Slurm's {missing_daemon()} is not installed"),
 ]

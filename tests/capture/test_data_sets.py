@@ -188,6 +188,14 @@ def test_arrays_that_are_no_poses(tmp_path: Path, table: NDArray[Any]) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_array_that_python_2_wrote_is_read_without_a_word(tmp_path: Path) -> None:
+    path = tmp_path / "poses_bounds.npy"
+    np.save(path, np.ones((6, 17)))
+    path.write_bytes(path.read_bytes().replace(b"(6, 17), }  ", b"(6L, 17L), }"))
+    assert read_poses_bounds(path).shape == (6, 17)
+
+
 def test_damaged_poses_bounds(tmp_path: Path) -> None:
     path = tmp_path / "poses_bounds.npy"
     np.save(path, poses_bounds(camera_to_world(6)))

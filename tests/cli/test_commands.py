@@ -106,8 +106,8 @@ def test_the_cost_is_revised_when_the_capture_is_known(shell: Shell) -> None:
     _, _, err = shell.run("--set", "count.limit=3")
     first, revised = (line for line in err.splitlines() if "expected about" in line)
     assert first == (
-        "expected about 6.4 min: count 0.1 min 0.1 GB, disk 0.0 GB; square 6.0 min 0.1 GB, disk 0.0 GB; "
-        "total 0.3 min 0.1 GB, disk 0.0 GB"
+        "expected about 6.4 min: count 6 s 0.1 GB, disk 1 MB; square 6.0 min 0.1 GB, disk 1 MB; "
+        "total 18 s 0.1 GB, disk 1 MB"
     )
     assert revised.startswith("now expected about 3.3 min: square 3.0 min")
     assert err.index(revised) > err.index("count: starts")
@@ -370,7 +370,7 @@ def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
     time.sleep(1)  # until it is in the call
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and "the same command goes on" in errors
+    assert process.returncode == 130 and "the same command resumes" in errors
     assert len(errors.splitlines()) == 1
 
 
@@ -427,6 +427,10 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
         f"look at: {run}/consolidate/before_after.png",
         f"next: cleargs export '{run}' -o 'my room.ply'",
     ]
+    print_outcomes(outcomes, run, run / "report/index.html")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    assert lines[3] == f"look at: {run}/report/index.html, {run}/consolidate/before_after.png"
 
 
 def test_the_time_left_counts_from_the_first_step_on(
@@ -446,7 +450,7 @@ def test_the_time_left_counts_from_the_first_step_on(
 def test_a_gpu_that_is_not_used_is_told_of(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cleargs.cli.common.cuda_obstacle", lambda: None)
+    monkeypatch.setattr("cleargs.pipeline.session.cuda_obstacle", lambda: None)
     assert "--device cuda" in shell.run()[2]
     assert "--device cuda" not in shell.run("--device", "cpu")[2]
 

@@ -67,6 +67,8 @@ def test_repairs_stand_beside_their_frames() -> None:
     assert repair(chosen(2, "restored"), chosen(1, "render")) == "restored", "the last round counts"
     assert repair(chosen(1, "render", "repair refused: 12% of its blocks out of place")) == "refused"
     assert repair(chosen(1, "render", "every pixel of the frame is masked", accepted=False)) == "refused"
+    assert repair(chosen(1, "observed", "explained: motion 3 px", accepted=False)) == "as filmed"
+    assert repair(chosen(1, "observed", "every pixel of the frame is masked", accepted=False)) == "as filmed"
     assert "repair" not in frame_rows(frames, SETTINGS, None)[0]
     assert tuple(frame_rows(frames, SETTINGS, [])[0]) == COLUMNS
 
@@ -81,7 +83,7 @@ def test_figures_have_words() -> None:
         "held_back": {"frames": [1, 2], "psnr_before": 22.5, "harm": None},
         "holdout_hash": "ab" * 32,
         "latest_rounds": {"2": 11},
-        "rounds": [{"round": 1, "chosen": {"render": 3, "restored": 9, "fused": 0}}],
+        "rounds": [{"round": 1, "chosen": {"render": 3, "restored": 9, "fused": 0, "observed": 2}}],
         "weights": {"0.0": 0, "0.1": 5, "0.9": 7},
         "some_new_figure": 3,
     }
@@ -92,5 +94,5 @@ def test_figures_have_words() -> None:
         ("their PSNR in the first scene, dB", "22.5"),
         ("harm done to them", "none"),
         ("some new figure", "3"),
-        ("round 1: chosen", "3 render, 9 restored"),
+        ("round 1: chosen", "3 render, 9 restored, 2 as filmed"),
     ]

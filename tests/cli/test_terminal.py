@@ -75,12 +75,21 @@ def empty(bench: Bench) -> Path:
     return recipe
 
 
+def behind(error: Exception, cause: Exception) -> Exception:
+    error.__cause__ = cause
+    return error
+
+
+UNLOADABLE = ImportError("libx.so: failed to map segment from shared object")
+
+
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
         (MemoryError(), 1, "out of memory"),
+        (behind(RuntimeError("Cannot import the C++ backend"), UNLOADABLE), 1, "out of memory"),
         (RuntimeError("can't start new thread"), 1, "out of memory"),
-        (ImportError("libx.so: failed to map segment from shared object"), 1, "out of memory"),
+        (UNLOADABLE, 1, "out of memory"),
         (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 300), 2, "too long"),
     ],
 )

@@ -23,11 +23,21 @@ def test_agreement_by_hand() -> None:
         row("restored", 30.0, 31.0, 34.0),  # the raw frame was better by 3 dB
     ]
     found = agreement(rows)
-    assert found.rows == 3
+    assert (found.repaired, found.kept) == (3, 0)
     assert found.by_psnr == pytest.approx(1 / 3)
     assert found.by_lpips == pytest.approx(1 / 3)
     assert found.by_chance == pytest.approx(1 / 3)
     assert found.lost_psnr == pytest.approx((0 + 6 + 3) / 3)
+
+
+def test_a_frame_kept_as_filmed_is_no_choice_of_a_repair() -> None:
+    kept = row("observed", 20.0, 26.0, 22.0)
+    repaired = row("restored", 20.0, 25.0, 22.0)
+    found = agreement([kept, repaired])
+    assert (found.repaired, found.kept) == (1, 1)
+    assert found == agreement([repaired]).model_copy(update={"kept": 1})
+    alone = agreement([kept])
+    assert alone.kept == 1 and alone.by_psnr is alone.by_lpips is alone.by_chance is alone.lost_psnr is None
 
 
 def test_without_lpips_there_is_no_agreement_by_it() -> None:

@@ -62,7 +62,7 @@ size = [96, 54]
 steps = 24
 variants = ["all-view"]
 """
-ORIGIN = Origin("0.1.0, abc", "cleargs evidence -o OUT", "default", False, 2, "cpu")
+ORIGIN = Origin("0.1.0, abc", "cleargs evidence -o OUT", (), "default", False, 2, "cpu")
 
 
 def test_the_test_set_is_no_tuning_set() -> None:

@@ -21,6 +21,7 @@ from cleargs.media.colour import (
     srgb_from_linear,
     tone_map,
 )
+from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, read_timeline
 
 # EBU bars at 75 %, with greys and a saturated red, in sRGB code values.
@@ -245,6 +246,14 @@ def test_not_a_video(tmp_path: Path) -> None:
     path = tmp_path / "notes.mp4"
     path.write_text("these are notes")
     with pytest.raises(InputError, match="cannot be read as a video"):
+        read_timeline(path)
+
+
+def test_a_codec_that_nobody_knows(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    write_video(path, [np.zeros((32, 32, 3), np.uint8)] * 3, 10.0)
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+    with pytest.raises(InputError, match="in a form that cannot be decoded"):
         read_timeline(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import pytest
@@ -85,3 +86,17 @@ def test_results_without_their_manifest(bench: Bench) -> None:
     assert stale(bench) == {"total": ("its manifest is missing or damaged",)}
     with pytest.raises(InputError, match="total is stale"):
         require_fresh(bench.dag, bench.folder, ("total",))
+
+
+def test_damaged_results_are_refused_too(bench: Bench) -> None:
+    """What was made from them is as it was: it names the content that they had."""
+    bench.run()
+    file = bench.folder / "square" / "powers" / "3.txt"
+    before = file.stat()
+    file.write_text("7")
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert stale(bench) == {"square": ("powers/3.txt has other content",)}
+    with pytest.raises(InputError, match="square is stale: powers/3"):
+        require_fresh(bench.dag, bench.folder, ("square",))
+    bench.run()
+    assert stale(bench) == {}

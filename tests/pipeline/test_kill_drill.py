@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 
+import pytest
 from test_interruption import PROGRAM, start
 from toy import Bench
 
@@ -24,6 +25,7 @@ def collect(bench: Bench, *options: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 def test_runs_and_collections_are_killed_at_any_moment(bench: Bench) -> None:
     healthy = bench.digests()
     bench.folder.rename(bench.root / "undisturbed")

@@ -171,6 +171,28 @@ def test_cameras_on_one_side_that_look_down_do_not_tilt_the_table() -> None:
     np.testing.assert_allclose(upright([camera(pose) for pose in same]), UP, atol=1e-9)
 
 
+@pytest.mark.parametrize("first", [0, 5, 11])
+@pytest.mark.parametrize("begin", [0.3, 2.0, 3.0, 5.0])
+def test_a_turntable_of_cameras_on_one_side_stays_there(begin: float, first: int) -> None:
+    """To and fro over the third of a turn that was seen, whole, from where the first camera stood."""
+    cameras = around(np.zeros(3), begin + np.linspace(0, 2 * np.pi / 3, 12))
+    poses = turntable([cameras[first], *cameras], 240)
+    # What is up comes out 0.02 degrees off where no full circle was seen.
+    np.testing.assert_allclose(centres(poses)[0], cameras[first].centre, atol=2e-3)
+    seen = np.stack([each.centre for each in cameras])
+
+    def beyond(places: Array) -> Array:
+        """Angles from the middle of what was seen."""
+        middle = (seen[0] + seen[-1])[[0, 2]]
+        across = middle[0] * places[:, 2] - middle[1] * places[:, 0]
+        return np.asarray(np.arctan2(across, places[:, [0, 2]] @ middle))
+
+    angles = beyond(centres(poses))
+    # 240 places leave at most (pi / 240)^2 / 2 of the half arc out at its ends.
+    np.testing.assert_allclose([angles.min(), angles.max()], [-np.pi / 3, np.pi / 3], atol=1e-3)
+    assert np.abs(np.diff(angles, append=angles[0])).max() < 1.1 * 2 * np.pi / 240 * np.pi / 3
+
+
 def test_a_turntable_of_cameras_straight_above() -> None:
     target = np.array([0.5, 0.0, 2.0])
     above = [target + np.array([x, -3.0, z]) for x, z in ((-0.3, 0), (0.3, 0), (0, 0.3))]

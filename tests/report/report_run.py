@@ -16,9 +16,15 @@ from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.digest import file_digest, tree_digest
 from cleargs.pipeline.keys import KeyParts, key_config
-from cleargs.pipeline.manifest import FileRecord, Manifest, published_files, write_manifest
+from cleargs.pipeline.manifest import (
+    FileRecord,
+    Manifest,
+    linked_manifest,
+    published_files,
+    write_manifest,
+)
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
@@ -107,11 +113,12 @@ class FinishedRun:
             for name, file in published_files(folder).items()
         }
         libraries = {"numpy": np.__version__}
+        ingest = linked_manifest(self.folder, "ingest") if stage != "ingest" else None
         parts = KeyParts(
             stage=stage,
             version=1,
             config=key_config(self.run.config.sections[stage]),
-            inputs={},
+            inputs={} if ingest is None else {"ingest": {"images": tree_digest(ingest.under("images"))}},
             externals={},
             seed=0,
             device="cpu",
@@ -211,8 +218,9 @@ class FinishedRun:
             for step in range(90)
         ]
         write_table(folder / "train.parquet", pa.Table.from_pylist(rows, TRAIN), TRAIN)
-        gains = np.linspace(0.8, 1.2, 5)
-        write_exposure(folder / "exposure.parquet", Exposure.from_gains(list(range(5)), gains))
+        trained_on = [frame for frame in range(5) if frame not in self.held_out]
+        gains = np.linspace(0.8, 1.2, len(trained_on))
+        write_exposure(folder / "exposure.parquet", Exposure.from_gains(trained_on, gains))
         if stage == "consolidate":
             write_repairs(folder / "repairs.parquet", latest_accepted(self.selections))
         self.finish(stage, summary)

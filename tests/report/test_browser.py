@@ -17,7 +17,7 @@ from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 from cleargs.report.scene import Renderer, camera_of, level_camera
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 DIFFERENCE = 12.0
 """Mean absolute difference of a viewer's pixels from ours, in levels of 255. Measured: 9, nearly all of

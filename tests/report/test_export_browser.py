@@ -18,7 +18,7 @@ from cleargs.cli.main import invoke
 from cleargs.report.scene import Renderer, camera_of, level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 SIZE = 320, 180
 FRAME = 3

@@ -16,7 +16,7 @@ from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
 from cleargs.cli.main import invoke
-from cleargs.cli.report import report_on
+from cleargs.cli.report import older_report, report_on
 from cleargs.errors import InputError
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.manifest import linked_manifest, write_manifest
@@ -141,6 +141,17 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
         assert "made anew" in page.read_text()  # the report before stays
         (run.folder / "ingest/manifest.json").unlink()
         assert report_on(planner, outcomes("found")) is None  # there is nothing to report on
+
+
+def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    assert older_report(run.folder, run.dag) == "", "there is none"
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        page = write_report(run.planner(Store(tmp_path, memo)))
+    assert older_report(run.folder, run.dag) == ""
+    (run.folder / "consolidate/manifest.json").unlink()
+    line = older_report(run.folder, run.dag)
+    assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
 
 
 def test_stale_results_are_shown_only_where_that_is_asked_for(

@@ -74,6 +74,11 @@ def test_a_finished_run_is_its_report(finished: FinishedRun, port: int) -> None:
     assert json.loads(ask(port, "/state.json").body)["done"] is True
 
 
+def test_a_browser_that_asks_for_an_icon_gets_no_error(port: int) -> None:
+    answer = ask(port, "/favicon.ico")
+    assert answer.status == 204 and answer.body == b""
+
+
 def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun, port: int) -> None:
     assert ask(port, "/preview.png").status == 404
     with working(finished, "rivr") as (_, checkpoints):

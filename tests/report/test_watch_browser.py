@@ -16,7 +16,7 @@ from cleargs.progress import PREVIEW
 from cleargs.report.scene import Renderer
 from cleargs.splat.preview import write_preview
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 
 def until(page: Any, condition: str) -> None:

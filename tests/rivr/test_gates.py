@@ -86,7 +86,7 @@ FOUND = {
     "shift 4 px": "out of place",
     **dict.fromkeys(["tint 16%", "half the contrast"], "off colour"),
 }
-"""Of `FAULTS`, those that docs/rivr.md reports as always found, and what they are found by."""
+"""Of `FAULTS`, those that docs/experiments/rivr.md reports as always found, and what they are found by."""
 
 
 @pytest.mark.parametrize("name", FOUND)

@@ -31,6 +31,7 @@ from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
+from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import fuse
 from cleargs.rivr.tables import (
     REPAIRS,
@@ -447,4 +448,32 @@ def test_a_damaged_exr_is_made_again(capture: Capture, undisturbed: dict[str, di
     assert run_both(capture, threads=1) == undisturbed
     victim = capture.root / "run" / "rivr" / "round_01" / "000004.exr"
     victim.write_bytes(victim.read_bytes()[:1000])
+    context = dataclasses.replace(capture.context("rivr", tiny_rivr()), reporter=(remarks := Remarks()))
+    rivr.run(context)
+    assert [line.partition(":")[0] for line in remarks.warnings] == ["round_01/000004.exr"]
     assert run_both(capture, threads=1) == undisturbed
+
+
+def test_exrs_that_no_frame_of_the_round_left_are_not_published(
+    capture: Capture, undisturbed: dict[str, dict[str, str]]
+) -> None:
+    """Of a held-back frame, of a round too many, or under another frame's name."""
+    assert run_both(capture, threads=1) == undisturbed
+    out = capture.root / "run" / "rivr"
+    image = (out / "round_01" / "000004.exr").read_bytes()
+    (out / "round_09").mkdir()
+    for place in (f"round_01/{HELD_BACK:06d}.exr", "round_01/x.exr", "round_09/000004.exr"):
+        (out / place).write_bytes(image)
+    for number, frame in ((1, 5), (2, 4)):  # of another frame, and of another round
+        (out / f"round_{number:02d}" / f"{frame:06d}.exr").write_bytes(image)
+    assert run_both(capture, threads=1) == undisturbed
+
+
+class Remarks(SilentReporter):
+    """A reporter that keeps its warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,8 @@ import pytest
 from vlm_server import two_stages
 
 from cleargs.cli.main import invoke
-from cleargs.pipeline.manifest import read_manifest, write_manifest
+from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.manifest import FileRecord, read_manifest, write_manifest
 
 
 class Shell:
@@ -81,8 +83,9 @@ def test_scores_of_another_ingest_are_not_drawn_over_this_one(shell: Shell, name
     """After ``cleargs stage ingest`` with other settings RUN/rva still holds the scores of the old frames."""
     link, other = shell.folder / "ingest", shell.root / "other"
     manifest = read_manifest(link)
-    changed = manifest.files[name].model_copy(update={"digest": "0" * 64})
-    other.mkdir()
+    shutil.copytree(link, other)
+    (other / name).write_bytes((other / name).read_bytes() + b"\0")
+    changed = FileRecord(size=manifest.files[name].size + 1, digest=file_digest(other / name))
     write_manifest(other, manifest.model_copy(update={"files": {**manifest.files, name: changed}}))
     link.unlink()
     link.symlink_to(other)

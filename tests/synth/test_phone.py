@@ -24,7 +24,7 @@ from cleargs.synth.world import Shutter
 
 WIDTH, HEIGHT, SEED = 96, 54, 3
 UNRELIABLE = 7.0
-"""px at 640: at a blur of 3 to 4 px at 320 R falls below its threshold (docs/rva.md)."""
+"""px at 640: at a blur of 3 to 4 px at 320 R falls below its threshold (docs/experiments/rva.md)."""
 
 
 def rgb(path: Path) -> np.ndarray:

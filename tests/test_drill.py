@@ -1,0 +1,16 @@
+"""The kill drill over all five stages and ``gc``, at its shortest: one kill each."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+DRILL = Path(__file__).with_name("drill.py")
+
+
+def test_what_was_killed_ends_with_the_same_digests() -> None:
+    done = subprocess.run([sys.executable, DRILL, "--kills", "6"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    killed = "{'ingest': 1, 'rva': 1, 'g0': 1, 'rivr': 1, 'consolidate': 1, 'gc': 1}"
+    assert done.stdout.splitlines()[-1].startswith(f"killed {killed}")

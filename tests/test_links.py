@@ -1,0 +1,40 @@
+"""Links that `make docs` does not see: those of pages outside docs/, and pages that the source names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "data/README.md",
+    "cleargs/models/weights/README.md",
+]
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+NAMED_PAGE = re.compile(r"\bdocs/[\w/-]+\.(?:md|png|svg)\b")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_relative_links_lead_somewhere(page: str) -> None:
+    found = [link for link in LINK.findall((ROOT / page).read_text("utf-8")) if "://" not in link]
+    assert [link for link in found if not (ROOT / page).parent.joinpath(link).exists()] == []
+
+
+def test_pages_named_in_the_source_exist() -> None:
+    places = [
+        path for room in ("cleargs", "stages", "workflows", "tests") for path in (ROOT / room).rglob("*")
+    ]
+    named = {
+        (name, path.relative_to(ROOT).as_posix())
+        for path in places
+        if path.suffix in (".py", ".toml", ".md")
+        for name in NAMED_PAGE.findall(path.read_text("utf-8"))
+    }
+    assert {name for name, _ in named} >= {"docs/settings.md", "docs/results.md"}
+    assert [(name, where) for name, where in sorted(named) if not (ROOT / name).exists()] == []

@@ -1,0 +1,60 @@
+"""Documents that lie where anybody may put them: no pipe holds a reader up, no depth of nesting ends it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cleargs.capture.tables import load_frames
+from cleargs.errors import CleargsError
+from cleargs.evaluate.comparison import Sample
+from cleargs.evaluate.evidence import read_evidence
+from cleargs.evaluate.results import read_report
+from cleargs.media.image import image_size
+from cleargs.models.fetch import read_checked
+from cleargs.models.installed import read_receipt
+from cleargs.models.registry import find_model
+from cleargs.report.record import noted
+from cleargs.rva.kept import KeptRows
+
+DEEP = "[" * 200_000
+
+
+READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "eval.json": ("eval.json", lambda folder: read_report(folder / "eval.json")),
+    "list of evidence": ("evidence.toml", lambda folder: read_evidence(folder / "evidence.toml")),
+    "note of a synthetic capture": ("truth/capture.json", lambda folder: Sample(folder, 0, None).column),
+    "note of a report": ("report/report.json", noted),
+    "kept findings": (f"{'0' * 64}.json", lambda folder: KeptRows(folder, ("a",)).find("0" * 64)),
+    "receipt of a model": (
+        "musiq.receipt.json",
+        lambda folder: read_receipt(find_model("musiq"), folder),
+    ),
+    "published weights": (
+        "weights",
+        lambda folder: read_checked(folder / "weights", find_model("maxim-gopro").source),
+    ),
+    "table of frames": ("frames.parquet", load_frames),
+    "size of an image": ("a.png", lambda folder: image_size(folder / "a.png")),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("what", ["a pipe", "nested deeply"])
+def test_what_nobody_trusts_is_refused_or_passed_over(name: str, what: str, tmp_path: Path) -> None:
+    place, read = READERS[name]
+    file = tmp_path / place
+    file.parent.mkdir(exist_ok=True)
+    if what == "a pipe":
+        os.mkfifo(file)
+    else:
+        file.write_text(DEEP)
+    try:
+        found = read(tmp_path)
+    except CleargsError as error:
+        assert "\n" not in str(error) and error.hint
+    else:
+        assert found in (None, {}, tmp_path.stem)
