@@ -199,7 +199,10 @@ def test_refuses_other_values(scorer: Scorer, image: np.ndarray, cause: str) -> 
 def test_unknown_scorers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="musik") as caught:
         load_scorer("musik")
-    assert CLARITY in caught.value.hint
+    assert caught.value.hint == "did you mean musiq?"
+    with pytest.raises(InputError, match="no scorer is called 'best'") as caught:
+        load_scorer("best")
+    assert CLARITY in caught.value.hint and "musiq" in caught.value.hint
     with pytest.raises(InputError, match="does not exist"):
         load_scorer(str(tmp_path / "none.onnx"))
     (tmp_path / "broken.onnx").write_bytes(b"not a model")

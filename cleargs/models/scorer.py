@@ -157,7 +157,7 @@ def scorer_path(spec: str) -> Path | None:
     if path is None and spec not in (brought := plugins("scorers")):
         known = [*(model.name for model in load_registry() if model.role == "scorer"), *brought]
         near = get_close_matches(spec, known, n=1)
-        every = f"use {', '.join(known)} or the path of an .onnx file"
+        every = f"choose {', '.join(known)}, or give an ONNX file"
         raise InputError(f"no scorer is called {spec!r}", hint=f"did you mean {near[0]}?" if near else every)
     return path
 

@@ -25,7 +25,7 @@ from cleargs.splat.trainer import Trainer, train
 CONFIG = TrainConfig(
     steps=40,
     strategy="adaptive",
-    adaptive=AdaptiveConfig(reset=0.5),
+    adaptive=AdaptiveConfig(grad=5e-5, reset=0.5),  # more are copied than faint ones removed
     refine_interval=5,
     refine_start=0.1,
     budget=90,
@@ -51,7 +51,7 @@ def arrays(scales: list[float]) -> dict[str, np.ndarray]:
 def test_the_gradient_on_the_screen_is_that_of_a_shift_of_the_principal_point() -> None:
     """Moving the principal point moves every projected mean alike, and hardly anything else."""
     scene = gaussians(20, seed=1)
-    at, shift = camera(0.3), 0.05
+    at, shift = camera(0.3), 0.1
     engine = Engine()
     # A ramp, so that the Gaussians pull the same way: random signs would leave little but noise of the sum.
     down, across = torch.linspace(0, 1, at.height)[:, None], torch.linspace(0, 1, at.width)[None, :]
@@ -70,8 +70,8 @@ def test_the_gradient_on_the_screen_is_that_of_a_shift_of_the_principal_point() 
         2 * shift
     )
     assert expected.abs().min() > 3.0
-    # What pixels gain and lose at the cut-offs meanwhile comes to about 0.1.
-    torch.testing.assert_close(measured.float(), expected.float(), rtol=0.0, atol=0.3)
+    # What pixels gain and lose at the cut-offs meanwhile: 1.1 % of the gradient.
+    assert (measured - expected).norm() < 0.03 * expected.norm()
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
