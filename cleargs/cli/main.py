@@ -126,6 +126,9 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
         return INTERRUPTED
+    except click.exceptions.NoArgsIsHelpError as error:  # a group alone: what it offers
+        error.show()
+        return error.exit_code
     except BrokenPipeError:
         return 1  # whoever read our output has gone
     except Exception as error:

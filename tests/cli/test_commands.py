@@ -58,6 +58,13 @@ def shell(
     return Shell(bench, recipe, capsys)
 
 
+@pytest.mark.parametrize("group", [[], ["models"]])
+def test_a_group_alone_shows_what_it_offers(group: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(group) == 2
+    said = capsys.readouterr().err
+    assert "error:" not in said and "Commands:\n" in said
+
+
 def test_run_twice(shell: Shell) -> None:
     code, out, err = shell.run()
     assert code == 0
