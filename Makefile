@@ -1,4 +1,5 @@
 # make demo   a synthetic capture through all five stages
+# make env    the program alone, in .venv
 # make test   every test that is not slow
 # make test-all   the whole test suite
 # make test-package   wheel and sdist, built and installed apart; the smoke demo run from the wheel
@@ -15,13 +16,23 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
-PIP := $(BIN)/$(PIP_INSTALL)
 
-.PHONY: demo test test-all test-package test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+# $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,WHAT OF OURS,MORE OF PYTORCH'S): every file is checked against
+# its digest, but for torch's, whose builds differ by machine.
+PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check
+define install
+	awk -v wanted=" $(2) " '/^## /{take = index(wanted, " " $$2 " ")} take' requirements.lock > $(1)/requirements.txt
+	$(1)/bin/$(PIP_INSTALL) --require-hashes --no-deps -r $(1)/requirements.txt
+	$(if $(3),$(1)/bin/$(PIP_INSTALL) -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch $(4))
+	$(if $(3),$(1)/bin/$(PIP_INSTALL) --no-deps --no-build-isolation $(3))
+endef
+PINS := pyproject.toml requirements.lock constraints.txt
 
-demo: .venv/demo.stamp demo/capture/transforms.json
+.PHONY: demo env test test-all test-package test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+
+env: .venv/demo.stamp
+
+demo: env demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
 
 test: .venv/test.stamp
@@ -34,7 +45,7 @@ test-all: .venv/test.stamp
 test-package: dist
 	rm -rf dist/env dist/try
 	$(PYTHON) -m venv dist/env
-	dist/env/bin/$(PIP_INSTALL) dist/*.tar.gz
+	$(call install,dist/env,base,dist/*.tar.gz)
 	dist/env/bin/$(PIP_INSTALL) --no-deps --force-reinstall dist/*.whl
 	mkdir dist/try
 	cd dist/try && ../env/bin/python -P ../../tests/installed.py
@@ -44,7 +55,7 @@ test-package: dist
 
 dist: .venv/dev.stamp
 	rm -rf dist build
-	$(BIN)/python -m build --quiet --outdir dist .
+	$(BIN)/python -m build --quiet --no-isolation --outdir dist .
 	rm -rf build
 
 docs: .venv/docs.stamp
@@ -76,10 +87,9 @@ oracles: .oracles/stamp
 # An environment of its own: the engine wants numpy and pandas of its own choosing.
 cluster: .venv-cluster/stamp
 
-.venv-cluster/stamp: Makefile
+.venv-cluster/stamp: requirements.lock
 	$(PYTHON) -m venv .venv-cluster
-	.venv-cluster/bin/python -m pip install --quiet --disable-pip-version-check \
-		'snakemake>=9.20,<10' 'snakemake-executor-plugin-slurm>=2.8,<3'
+	$(call install,.venv-cluster,cluster)
 	touch $@
 
 demo/capture/transforms.json: | .venv/demo.stamp
@@ -89,35 +99,33 @@ demo/capture/transforms.json: | .venv/demo.stamp
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-.venv/demo.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e .
+.venv/demo.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base,-e .)
 	touch $@
 
-.venv/test.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e '.[test]'
+.venv/test.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base test,-e .)
 	touch $@
 
-.venv/browser.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e '.[test,browser]'
+.venv/browser.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base test browser,-e .)
 	touch $@
 
-# The Triton that the tests passed with; a CPU build of PyTorch leaves the choice open.
-.venv/cuda.stamp: Makefile pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e '.[test,cuda]' 'triton==3.8.*'
+.venv/cuda.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base test cuda,-e .)
 	touch $@
 
-.venv/dev.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e '.[test,dev]'
+.venv/dev.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base test dev,-e .)
 	touch $@
 
-.venv/docs.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP) -e '.[docs]'
+.venv/docs.stamp: $(PINS) | .venv/bin/python
+	$(call install,.venv,base docs,-e .)
 	touch $@
 
-.venv-convert/stamp: pyproject.toml constraints.txt
+.venv-convert/stamp: $(PINS)
 	$(PYTHON) -m venv .venv-convert
-	.venv-convert/bin/$(PIP_INSTALL) -e '.[convert]' pytest hypothesis
-	.venv-convert/bin/$(PIP_INSTALL) --no-deps pyiqa==0.1.16 openai-clip==1.0.1
+	$(call install,.venv-convert,convert,-e .,torchvision)
 	touch $@
 
 clean:

@@ -52,16 +52,25 @@ def test_the_version_stands_in_one_place() -> None:
 
 
 def test_every_dependency_is_pinned() -> None:
-    """The lock names all that an installation brings, the dependencies of dependencies too."""
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
-    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    assert all(pin and "*" not in pin for pin in pins.values())
-    missing = needed("cleargs", ("test", "dev", "docs")) - {name.lower() for name in pins}
+    """The lock names all that an installation brings, the dependencies of dependencies too, with digests."""
+    lock = (ROOT / "requirements.lock").read_text()
+    pins = re.findall(r"^(\S+)==[^\\\n]*((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", lock, re.MULTILINE)
+    assert len(pins) == sum(bool(line) and line[0] not in "# " for line in lock.splitlines())
+    locked = {canonicalize_name(name) for name, _ in pins}
+    missing = needed("cleargs", ("test", "dev", "docs", "browser")) - locked
     assert {name for name in missing if not name.startswith(LEFT_OPEN)} == set()
 
 
-LEFT_OPEN = ("pip", "setuptools", "nvidia-", "cuda-", "triton")
-"""Installers, and what a CUDA build of torch brings."""
+def test_the_versions_here_are_those_of_the_lock() -> None:
+    """What CI tests is what the lock installs."""
+    shared = (ROOT / "requirements.lock").read_text().split("\n## cuda ")[0]
+    locked = dict(re.findall(r"^(\S+)==([^\s;]+)", shared, re.MULTILINE))
+    here = {name: version(name) for name in needed("cleargs", ("test",)) if name in locked}
+    assert len(here) > 40 and here == {name: locked[name] for name in here}
+
+
+LEFT_OPEN = ("pip", "torch", "nvidia-", "cuda-", "triton")
+"""What builds of torch bring, torch itself (constraints.txt), and pip."""
 
 
 def needed(distribution: str, extras: tuple[str, ...] = ()) -> set[str]:
