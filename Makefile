@@ -3,6 +3,8 @@
 # make test   every test that is not slow
 # make test-all   the whole test suite
 # make test-package   wheel and sdist, built and installed apart; the smoke demo run from the wheel
+# make drill  every stage and gc killed 50 times: same results
+# make fuzz   every reader under 2,000 mutations a file; SEED=N for others
 # make lint   ruff, codespell and mypy
 # make docs   the documentation as a site, in site/; a broken link is an error
 # make dist   wheel and sdist, in dist/
@@ -28,7 +30,7 @@ define install
 endef
 PINS := pyproject.toml requirements.lock constraints.txt
 
-.PHONY: demo env test test-all test-package test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
+.PHONY: demo env test test-all test-package drill fuzz test-gpu-kernels lint docs dist convert-env test-convert cluster browser oracles clean
 
 env: .venv/demo.stamp
 
@@ -60,6 +62,12 @@ dist: .venv/dev.stamp
 
 docs: .venv/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+drill: .venv/test.stamp
+	$(BIN)/python tests/drill.py
+
+fuzz: .venv/test.stamp
+	CLEARGS_FUZZ=2000 $(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-seed=$(or $(SEED),0)
 
 test-gpu-kernels: .venv/cuda.stamp
 	TRITON_INTERPRET=1 $(BIN)/python -m pytest tests/gpu

@@ -108,8 +108,8 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     """Every row of a finished RIVR against ``capture/truth/observed``; none where ``capture`` has no truth.
 
     A candidate has the exposure of its frame, so the truth is given the frame's true exposure error first:
-    what is compared is detail, not brightness. Frames whose images have another size than the truth are
-    left out. Raises StoreError when a table or an EXR is damaged.
+    what is compared is detail, not brightness. Frames that have no truth, or one of another size, are left
+    out. Raises StoreError when a table or an EXR is damaged.
     """
     folder, table = capture / "truth" / "observed" / "images", capture / "truth" / "frames.parquet"
     if not folder.is_dir() or not table.is_file():
@@ -119,7 +119,10 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     found = []
     for row in read_selection(run / "rivr" / "selection.parquet"):
         stem = stems[row.frame_id]
-        truth = exposed(read_rgb_float(folder / f"{stem}.png"), stops[stem])
+        sharp = folder / f"{stem}.png"
+        if stem not in stops or not sharp.is_file():
+            continue
+        truth = exposed(read_rgb_float(sharp), stops[stem])
         candidates = _candidates(run / "rivr" / row.exr, row.chosen)
         if any(image.shape != truth.shape for image in candidates.values()):
             continue

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
+from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
+from cleargs.evaluate.choices import judge_choices
 from cleargs.evaluate.variants import VARIANTS, WHOLE, Variant
 from cleargs.evaluate.work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.pipeline.config import load_config
@@ -176,6 +179,16 @@ def test_roles_and_choices_stand_beside_the_cells(out: Path) -> None:
         assert {"render", "restored", "observed"} <= row["psnr"].keys() and row["chosen"] in row["psnr"]
     text = (out / "comparison.md").read_text()
     assert "| all-view G0 | 24 |" in text and "best by PSNR" in text
+
+
+def test_a_frame_without_truth_is_judged_by_nobody(capture: Path, out: Path, tmp_path: Path) -> None:
+    shutil.copytree(capture, tmp_path / "room")
+    run = out / "room-0" / "full"
+    judged = {row.frame_id for row in judge_choices(run, tmp_path / "room", None)}
+    lost = min(judged)
+    stem = Path({frame.frame_id: frame.name for frame in load_frames(run / "ingest")}[lost]).stem
+    (tmp_path / "room" / "truth" / "observed" / "images" / f"{stem}.png").unlink()
+    assert {row.frame_id for row in judge_choices(run, tmp_path / "room", None)} == judged - {lost}
 
 
 def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
