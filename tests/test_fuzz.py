@@ -1,7 +1,7 @@
 """Readers under mutated files: whatever comes, they return or raise an error of one line, and soon.
 
-The same 60 mutations a reader in each run of the tests. ``make fuzz SEED=7`` draws 2000 others of each; the same
-seed draws the same again.
+The same 60 mutations a reader in each run of the tests. ``make fuzz SEED=7`` draws 2000 others of each;
+the same seed draws the same again.
 """
 
 from __future__ import annotations

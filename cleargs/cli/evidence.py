@@ -94,7 +94,7 @@ def evidence(
     found: list[Outcome] = []
     with opened_store(out / STORE_FOLDER) as store:
         shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)
-        plan = [(section, minutes(section, shop)) for section in chosen]
+        plan = list(zip(chosen, minutes(chosen, shop), strict=True))
         for section, cost in plan:
             click.echo(f"{section.name:12} {cost:6.1f} min  {section.title}")
         click.echo(f"{'in all':12} {sum(cost for _, cost in plan):6.1f} min  on two quiet cores")

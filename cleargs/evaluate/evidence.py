@@ -9,9 +9,11 @@ from __future__ import annotations
 import os
 import shutil
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -177,35 +179,53 @@ def make_section(section: Section, shop: Workshop) -> Outcome:
     return Outcome(section, found if found.cells else None, (*missing, *found.failures))
 
 
-def minutes(section: Section, shop: Workshop) -> float:
-    """Rough time of a section on two quiet cores, everything still to be made."""
+def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
+    """Rough time of each section on two quiet cores, everything still to be made; what a section before it
+    has made takes no time."""
+    made: set[object] = set()
+
+    def first(*what: object) -> bool:
+        known = what in made
+        made.add(what)
+        return not known
+
+    return [_seconds(section, shop, first) / 60 for section in sections]
+
+
+def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> float:
     megapixels = section.size[0] * section.size[1] / 1e6
-    samples = len(section.seeds) * max(1, len(section.protocols)) * max(1, len(section.captures))
-    seconds = _SAMPLE_S
-    for factor in section.factors:
-        shared: set[tuple[str | None, tuple[str, ...]]] = set()
-        for variant in find_variants(section.variants):
-            try:
-                own = steps_of(variant_config(shop.recipe.dag, variant, shop.recipe.workflow, (), 0))
-            except ConfigError:  # its recipe is not there: it takes no time
+    variants = []
+    for variant in find_variants(section.variants):
+        with suppress(ConfigError):  # its recipe is not there: it takes no time
+            config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, (), 0)
+            variants.append((variant, steps_of(config)))
+    seconds = 0.0
+    columns = product(section.protocols or [""], section.captures or [""], section.seeds)
+    for protocol, capture, seed in columns:
+        sample = (protocol, capture, seed, section.frames, section.size, section.settings)
+        seconds += _SAMPLE_S if first(sample) else 0.0
+        for factor, (variant, own) in product(section.factors, variants):
+            total = section.steps * factor
+            if not first(sample, total, variant.name):
                 continue
-            steps = float(section.steps * factor)
-            if variant.stage == "consolidate":
+            steps = float(total)
+            if variant.stage != "g0":
                 # Those that differ in RIVR alone share the first scene.
-                key = (variant.workflow, tuple(line for line in variant.overrides if line.startswith("rva")))
-                steps *= 1.0 - own.g0 / own.total if key in shared else 1.0
-                shared.add(key)
+                scene = (
+                    variant.workflow,
+                    tuple(line for line in variant.overrides if line.startswith("rva")),
+                )
+                steps *= 1.0 if first(sample, total, scene) else 1.0 - own.g0 / own.total
+                seconds += section.frames * own.rounds * (_REPAIR_S + _REPAIR_S_PER_MP * megapixels)
             seconds += steps * (_STEP_S + _STEP_S_PER_MP * megapixels)
             seconds += section.frames * (_JUDGE_S + _JUDGE_S_PER_MP * megapixels)
-            if variant.stage != "g0":
-                seconds += section.frames * own.rounds * (_REPAIR_S + _REPAIR_S_PER_MP * megapixels)
-    return samples * seconds / 60
+    return seconds
 
 
 # Wall seconds on two quiet cores: a part a unit and a part a megapixel. A step: docs/speed.md (0.027 s at
 # 0.125 MP). A judged frame, views off the path included: nearly all of it LPIPS with VGG. A repair: as RIVR
 # estimates. A sample: its capture, poses and cues.
-_STEP_S, _STEP_S_PER_MP = 0.02, 0.16
+_STEP_S, _STEP_S_PER_MP = 0.012, 0.16
 _JUDGE_S, _JUDGE_S_PER_MP = 0.05, 10.0
 _REPAIR_S, _REPAIR_S_PER_MP = 0.3, 5.0
 _SAMPLE_S = 8.0

@@ -12,8 +12,13 @@ from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
 from cleargs.evaluate.cells import Cell
 from cleargs.evaluate.compared import Compared
-from cleargs.evaluate.evidence import Outcome, read_evidence
+from cleargs.evaluate.comparison import Recipe
+from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.evidence import Outcome, Workshop, minutes, read_evidence
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, find_variants
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.session import opened_store
+from cleargs.progress import SilentReporter
 from cleargs.report.origin import version_of_source
 from cleargs.report.results_page import Origin, losses, results_page
 
@@ -92,6 +97,19 @@ def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: 
     path.write_text(TINY.replace(old, new, 1))
     with pytest.raises(ConfigError, match=cause):
         read_evidence(path)
+
+
+def test_what_a_section_before_it_has_made_takes_no_time(tmp_path: Path) -> None:
+    blur = read_evidence().quick[0]
+    with opened_store(tmp_path / "store") as store:
+        recipe = Recipe(installed(), "default", (), "cpu", 2, EvalOptions())
+        shop = Workshop(tmp_path, None, recipe, store, SilentReporter())
+        alone, again, more = minutes(
+            [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], shop
+        )
+        assert again == 0.0 and 0.0 < more < alone / len(blur.variants)
+        (twice,) = minutes([blur.model_copy(update={"seeds": (*blur.seeds, 105, 106, 107, 108, 109)})], shop)
+        assert twice == pytest.approx(2 * alone)
 
 
 def test_prose_states_no_number() -> None:
