@@ -24,6 +24,7 @@ from cleargs.pipeline.session import (
 )
 from cleargs.progress import Reporter, SilentReporter, SilentTask, Task
 from cleargs.results import Prepared, Run, open_prepared
+from cleargs.splat.effort import Quality, quality_settings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,6 +53,7 @@ def run(
     folder: str | Path,
     *,
     workflow: str | None = None,
+    quality: Quality | None = None,
     set: Mapping[str, Any] | None = None,
     until: str | None = None,
     force: Sequence[str] = (),
@@ -65,9 +67,9 @@ def run(
     """Turn a capture into a clean scene in the run folder ``folder``, as ``cleargs run`` does.
 
     ``source`` is a video, an image folder, a COLMAP project, or a folder with ``transforms.json``. What is
-    there already is not made again. ``set`` changes settings by name: ``{"rva.tau_R": 0.6}``; an existing run
-    keeps the others, unless a ``workflow`` is given. Raises InputError for what cannot be used as it is,
-    StageError where a stage fails; what was finished stays.
+    there already is not made again. ``quality`` says what trainings may cost; ``set`` changes settings by
+    name: ``{"rva.tau_R": 0.6}``; an existing run keeps the others, unless a ``workflow`` is given. Raises
+    InputError for what cannot be used as it is, StageError where a stage fails; what was finished stays.
     """
     from cleargs.pipeline.runner import Runner
 
@@ -78,7 +80,10 @@ def run(
         Path(source),
         Path(folder),
         workflow=workflow,
-        overrides=[f"{name}={_toml(value)}" for name, value in (set or {}).items()],
+        overrides=[
+            *(quality_settings(quality) if quality else ()),
+            *(f"{name}={_toml(value)}" for name, value in (set or {}).items()),
+        ],
         seed=seed,
         store=None if store is None else Path(store),
         device=device,
@@ -139,7 +144,7 @@ def train(
     config = config or TrainConfig()
     with tempfile.TemporaryDirectory() as nowhere:
         if checkpoint is None:  # never written then
-            config = config.model_copy(update={"checkpoint_interval": config.steps})
+            config = config.model_copy(update={"checkpoint_interval": 1_000_000})
         return train_scene(
             scene,
             views,

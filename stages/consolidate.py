@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 7
+VERSION = 8
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -68,9 +68,9 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """A training step takes about 0.3 s a megapixel on two cores."""
     from cleargs.capture.cost import capture_size, pace
 
-    _, megapixels = capture_size(context)
+    frames, megapixels = capture_size(context)
     return Estimate(
-        minutes=0.3 * megapixels * context.config.distil.steps * pace(context.threads) / 60.0,
+        minutes=0.3 * megapixels * context.config.distil.steps_for(frames) * pace(context.threads) / 60.0,
         memory_gb=1.0 + context.config.distil.cache_mb / 1024.0,
         disk_gb=0.2,
     )

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 7
+VERSION = 8
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
@@ -44,7 +44,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     config = context.config
     count, megapixels = capture_size(context)
     seen = config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share
-    seconds = config.steps * (_SECONDS_PER_STEP + _SECONDS_PER_MEGAPIXEL * megapixels * seen)
+    seconds = config.steps_for(count) * (_SECONDS_PER_STEP + _SECONDS_PER_MEGAPIXEL * megapixels * seen)
     seconds *= pace(context.threads)
     memory = 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
@@ -58,6 +58,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.photograph import evaluate_views
     from cleargs.formation.table import write_formation
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
+    from cleargs.splat.effort import decided
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.kernels.runtime import set_threads
     from cleargs.splat.ply import write_ply
@@ -80,6 +81,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     def say(remark: str) -> None:
         context.reporter.info(f"G0: {remark}")
 
+    config = decided(config, views)
     gaussians = starting_gaussians(sparse, views, config, seed=context.seed, say=say)
     exposure, spread = _exposure(config, views, sparse)
     formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
@@ -116,7 +118,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "views": len(views),
             "gaussians_start": gaussians.num,
             "gaussians": trained.scene.gaussians.num,
-            "steps": config.steps,
+            "steps": config.length,
             "sh_degree": gaussians.sh_degree,
             "exposure": exposure is not None,
             "exposure_spread": spread,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 10
+VERSION = 11
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -87,7 +87,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * (
         frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-        + 0.3 * config.rounds * config.distil.steps
+        + 0.3 * config.rounds * config.distil.steps_for(frames)
     )
     scene = context.inputs.get("g0", Path()) / "scene.ply"
     groups = 1 if config.group is None else -(-frames // config.group)
@@ -189,7 +189,7 @@ def _repair_and_distil(
     from cleargs.rivr.tables import kept_raw, repaired_share
 
     config, reporter = context.config, context.reporter
-    groups = trajectory_groups(targets, config.group, config.distil.steps)
+    groups = trajectory_groups(targets, config.group, config.distil.steps_for(len(supervision.real)))
     rows: list[Selection] = []
     trainings: list[Path] = []
     current = g0

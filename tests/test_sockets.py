@@ -177,7 +177,9 @@ def toy_views(scene: Scene, dim: float = 0.0) -> list[View]:
 def test_strategy(parts: Path, tmp_path: Path) -> None:
     scene = toy()
     scene.gaussians.logit_opacities[:10] = -9.0  # faint: to be removed
-    config = TrainConfig(steps=6, strategy="prune-only", refine_interval=2, refine_start=0.0, opacity_reg=0.0)
+    config = TrainConfig(
+        steps=6, strategy="prune-only", refine_every=1 / 3, refine_start=0.0, opacity_reg=0.0
+    )
     trained = train(
         scene,
         toy_views(scene),

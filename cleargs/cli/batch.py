@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -14,9 +15,10 @@ from cleargs.batch.prepare import Preparation
 from cleargs.batch.scenes import Scene, read_scenes
 from cleargs.batch.sheet import SheetError
 from cleargs.batch.status import SceneState, scene_states
-from cleargs.cli.common import json_option, print_json, quiet_option
+from cleargs.cli.common import json_option, print_json, quality_option, quiet_option
 from cleargs.cli.progress import make_reporter
 from cleargs.errors import CleargsError, InputError, StageError
+from cleargs.pipeline.config import override
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device, usable_cores
@@ -49,6 +51,7 @@ Examples:
     "--profile", default="local", show_default=True, metavar="local|slurm|FOLDER", help="Where to run."
 )
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
+@quality_option
 @click.option("--dry-run", is_flag=True, help="Only check the sheet and say how many jobs there are.")
 @click.option("--allow-partial", is_flag=True, help="Continue after a stage that is done only in part.")
 @click.option(
@@ -75,6 +78,7 @@ def batch(
     folder: Path | None,
     profile: str,
     until: str | None,
+    quality: tuple[str, ...],
     dry_run: bool,
     allow_partial: bool,
     device: DeviceChoice,
@@ -96,7 +100,7 @@ def batch(
     resolved: Device = "cuda" if elsewhere else resolve_device(device, reporter.info)
     options = ("--allow-partial",) if allow_partial else ()
     preparation = Preparation(dag, root, resolved, until, options, report=wants_report)
-    scenes = checked_scenes(sheet, preparation)
+    scenes = checked_scenes(sheet, preparation, quality)
     return run_batch(preparation, scenes, command, reporter, dry_run=dry_run, as_json=as_json)
 
 
@@ -158,10 +162,16 @@ def _page(folder: BatchFolder, plan: Plan, states: Sequence[SceneState], reporte
         return None
 
 
-def checked_scenes(sheet: Path, preparation: Preparation) -> list[Scene]:
-    """The scenes of ``sheet``; its mistakes go to stderr, one line each, before SheetError is raised."""
+def checked_scenes(sheet: Path, preparation: Preparation, overrides: Sequence[str] = ()) -> list[Scene]:
+    """The scenes of ``sheet``, with settings for all of them on top.
+
+    The mistakes of the sheet go to stderr, one line each, before SheetError is raised.
+    """
     try:
-        scenes = read_scenes(sheet, preparation.dag)
+        dag = preparation.dag
+        scenes = [
+            replace(scene, config=override(dag, scene.config, overrides)) for scene in read_scenes(sheet, dag)
+        ]
         conflicts = preparation.conflicts(scenes)
         if conflicts:
             raise SheetError(sheet, conflicts)

@@ -6,11 +6,12 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import click
 
 from cleargs.pipeline.session import usable_cores
+from cleargs.splat.effort import Quality, quality_settings
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -43,6 +44,20 @@ def parse_size(
     if not match or not all(16 <= int(side) <= 8192 for side in match.groups()):
         raise click.BadParameter("write WIDTHxHEIGHT in pixels, 480x270 say (16 to 8192 a side)")
     return int(match[1]), int(match[2])
+
+
+def _quality(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...]:
+    return () if value is None else quality_settings(value)
+
+
+quality_option = click.option(
+    "--quality",
+    type=click.Choice(get_args(Quality)),
+    callback=_quality,
+    help="What trainings may cost: draft is a look within minutes, standard what you would publish, high "
+    "four times its steps and twice its Gaussians. Steps and budgets that a recipe names stay.  "
+    "[default: standard]",
+)
 
 
 def work_options(command: F) -> F:

@@ -11,6 +11,7 @@ import click
 from cleargs.cli.common import (
     json_option,
     print_json,
+    quality_option,
     quiet_option,
     stale_option,
     threads_or_all,
@@ -100,6 +101,7 @@ Examples:
     "--workflow", default="default", show_default=True, metavar="NAME|FILE.toml", help="The recipe."
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
+@quality_option
 @click.option(
     "--report/--no-report",
     "wants_report",
@@ -122,6 +124,7 @@ def compare(
     lpips: tuple[LpipsNet, ...],
     workflow: str,
     overrides: tuple[str, ...],
+    quality: tuple[str, ...],
     wants_report: bool,
     stale: bool,
     device: DeviceChoice,
@@ -156,7 +159,7 @@ def compare(
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
     place = resolve_device(device, reporter.info)
-    recipe = Recipe(dag, workflow, overrides, place, threads_or_all(threads), options, steps)
+    recipe = Recipe(dag, workflow, (*quality, *overrides), place, threads_or_all(threads), options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])

@@ -10,6 +10,7 @@ from cleargs.cli.common import (
     json_option,
     partial_option,
     print_json,
+    quality_option,
     quiet_option,
     store_option,
     threads_or_all,
@@ -28,7 +29,8 @@ from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store
     epilog="""\b
 Examples:
   cleargs run video.mp4 -o room
-  cleargs run photos/ -o room --workflow smoke            quick look
+  cleargs run photos/ -o room --workflow smoke            does it work at all, in a minute
+  cleargs run photos/ -o room --quality draft             a look; then the same with --quality standard
   cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
   cleargs run photos/ -o room --dry-run                   what would be done, why, and the cost
   cleargs run photos/ -o room --until rva                 stop before training
@@ -58,6 +60,7 @@ Examples:
     metavar="STAGE.FIELD=VALUE",
     help="Change one setting (cleargs settings lists them).",
 )
+@quality_option
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of all randomness.  [default: 0]")
 @click.option("--reset", is_flag=True, help="Forget the settings of an existing run: start from the recipe.")
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
@@ -83,6 +86,7 @@ def run(
     folder: Path,
     workflow: str | None,
     overrides: tuple[str, ...],
+    quality: tuple[str, ...],
     seed: int | None,
     reset: bool,
     until: str | None,
@@ -110,7 +114,7 @@ def run(
         source,
         folder,
         workflow=workflow,
-        overrides=overrides,
+        overrides=(*quality, *overrides),
         seed=seed,
         reset=reset,
         store=store,

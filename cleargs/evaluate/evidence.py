@@ -198,7 +198,7 @@ def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> fl
     for variant in find_variants(section.variants):
         with suppress(ConfigError):  # its recipe is not there: it takes no time
             config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, (), 0)
-            variants.append((variant, steps_of(config)))
+            variants.append((variant, steps_of(config, section.frames)))
     seconds = 0.0
     columns = product(section.protocols or [""], section.captures or [""], section.seeds)
     for protocol, capture, seed in columns:

@@ -23,6 +23,8 @@ class Work:
     """What every variant of a sample gets."""
 
     steps: int
+    frames: int
+    """On which the proportions of the trainings rest, where the settings leave their steps open."""
     budget: int
     """Most Gaussians."""
     sh_degree: int
@@ -43,15 +45,16 @@ class Steps:
         return self.g0 + self.rounds * self.round + self.consolidate
 
 
-def steps_of(config: Config, stage: str = "consolidate") -> Steps:
-    """The steps that a run makes up to ``stage``, provided that some repair is accepted in each round."""
+def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
+    """The steps that a run on so many frames makes up to ``stage``, provided that some repair is accepted in
+    each round."""
     whole: Any = config.sections
     rivr, consolidate = stage != "g0", stage == "consolidate"
     return Steps(
-        g0=whole["g0"].steps,
-        round=whole["rivr"].distil.steps if rivr else 0,
+        g0=whole["g0"].steps_for(frames),
+        round=whole["rivr"].distil.steps_for(frames) if rivr else 0,
         rounds=whole["rivr"].rounds if rivr else 0,
-        consolidate=whole["consolidate"].distil.steps if consolidate else 0,
+        consolidate=whole["consolidate"].distil.steps_for(frames) if consolidate else 0,
     )
 
 
@@ -62,15 +65,16 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
     leaves open are decided as they would be with every registered training frame active.
     """
     from cleargs.capture.tables import load_frames
+    from cleargs.splat.effort import budget_from_pixels
     from cleargs.splat.initialise import sh_degree_from_views
-    from cleargs.splat.strategy import budget_from_pixels
 
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "train"]
     g0: Any = config.sections["g0"]
     pixels = sum(frame.width * frame.height for frame in frames)
     return Work(
-        steps=steps or steps_of(config).total,
-        budget=g0.budget or budget_from_pixels(pixels),
+        steps=steps or steps_of(config, len(frames)).total,
+        frames=len(frames),
+        budget=g0.budget or budget_from_pixels(pixels, g0.most, g0.quality),
         sh_degree=sh_degree_from_views(len(frames)) if g0.sh_degree is None else g0.sh_degree,
     )
 
@@ -123,8 +127,8 @@ def variant_config(
 
 
 def _settings(plain: Config, variant: Variant, work: Work) -> list[str]:
-    """What equal work changes. Intervals that count steps keep their share of the whole training."""
-    own = steps_of(plain)
+    """What equal work changes; schedules run by share of the steps."""
+    own = steps_of(plain, work.frames)
     spent = split(own, variant.stage, work.steps)
     lines = [f"g0.sh_degree={work.sh_degree}"]
     for name, steps in (
@@ -132,12 +136,7 @@ def _settings(plain: Config, variant: Variant, work: Work) -> list[str]:
         ("rivr.distil", spent.round),
         ("consolidate.distil", spent.consolidate),
     ):
-        training: Any = plain.sections[name.partition(".")[0]]
-        training = training.distil if name.endswith(".distil") else training
         lines.append(f"{name}.budget={work.budget}")
         if steps:  # else the stage does not run
             lines.append(f"{name}.steps={steps}")
-        for interval in ("refine_interval", "sh_interval"):
-            if before := getattr(training, interval):
-                lines.append(f"{name}.{interval}={max(1, round(before * work.steps / own.total))}")
     return lines

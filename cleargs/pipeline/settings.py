@@ -53,7 +53,7 @@ SYNONYMS: Mapping[str, str] = {
     "scaling_lr": "lr_scales",
     "rotation_lr": "lr_rotations",
     "feature_lr": "lr_sh",
-    "densification_interval": "refine_interval",
+    "densification_interval": "refine_every",
     "densify_from_iter": "refine_start",
     "densify_until_iter": "refine_stop",
     "bg": "background",

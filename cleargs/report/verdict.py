@@ -234,13 +234,12 @@ def _allocation_warnings(
 
 def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterator[Caution]:
     psnr = _figure(manifests, "g0", "psnr_strong")
-    steps = _setting(config, "g0", "steps")
     if psnr is not None and psnr < CLOSE_DB:
         yield Caution(
             f"The first scene reaches {decibel(psnr)} on the frames it trusts",
             "A longer training, or larger images, bring out finer detail.",
             (
-                f"g0.steps={2 * steps}",
+                f"g0.steps={2 * _figure(manifests, 'g0', 'steps')}",
                 f"ingest.max_size={_setting(config, 'ingest', 'max_size') * 3 // 2}",
             ),
         )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cleargs.plugins import require_known
+from cleargs.splat.effort import Quality, steps_from_frames
 
 STRATEGIES = ("mcmc", "adaptive")
 """Densification strategies that ship with ClearGS."""
@@ -69,7 +70,18 @@ class TrainConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    steps: int = Field(3200, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    quality: Quality = Field(
+        "standard",
+        description="what is spent where steps and budget are unset: draft a quarter of the steps and half "
+        "of the Gaussians of standard, high four times and twice",
+    )
+    steps: int | None = Field(
+        None,
+        ge=1,
+        le=1_000_000,
+        description="optimisation steps, one view each; unset = 50 an active frame, 3,200 to 7,200, times "
+        "what quality says",
+    )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
     coarse_share: float = Field(
         0.25, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
@@ -90,10 +102,13 @@ class TrainConfig(BaseModel):
         le=20_000_000,
         description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
     )
+    most: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
     growth: float = Field(
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
     )
-    refine_interval: int = Field(50, ge=1, description="steps between refinements")
+    refine_every: float = Field(
+        1 / 64, gt=0, le=1, description="share of the steps between refinements; one step at least"
+    )
     refine_start: float = Field(
         0.05, ge=0, le=1, description="share of the steps before the first refinement"
     )
@@ -126,10 +141,12 @@ class TrainConfig(BaseModel):
     lr_opacities: float = Field(5e-2, ge=0, description="rate of the opacity logits")
     lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a twentieth")
     lr_exposure: float = Field(1e-3, ge=0, description="rate of the exposure affines, where they are on")
-    sh_interval: int = Field(
-        500,
+    sh_every: float = Field(
+        5 / 32,
         ge=0,
-        description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
+        le=1,
+        description="share of the steps between raises of the SH degree from 0 up; 0 = all degrees from the "
+        "first step",
     )
 
     formation: FormationConfig = Field(FormationConfig(), description="what the camera did to each raw frame")
@@ -146,6 +163,25 @@ class TrainConfig(BaseModel):
         description="memory for decoded images, MiB; changes no result",
         json_schema_extra={"key": False},
     )
+
+    share_of_steps: ClassVar[float] = 1.0
+    """Of a first scene's, where ``steps`` is unset."""
+
+    def steps_for(self, frames: int) -> int:
+        """Steps of a training of so many active frames."""
+        return self.steps or max(1, round(self.share_of_steps * steps_from_frames(frames, self.quality)))
+
+    @property
+    def length(self) -> int:
+        """The steps; raises ValueError while they are open (`cleargs.splat.effort.decided`)."""
+        if self.steps is None:
+            raise ValueError("the steps of this training are still open")
+        return self.steps
+
+    @property
+    def refine_interval(self) -> int:
+        """Steps between refinements."""
+        return max(1, round(self.refine_every * self.length))
 
     @field_validator("strategy")
     @classmethod
@@ -185,7 +221,14 @@ class G0Config(TrainConfig):
 class DistilConfig(TrainConfig):
     """Training on from a finished scene, with repaired views beside the real ones."""
 
-    steps: int = Field(200, ge=1, le=1_000_000, description="optimisation steps, one view each")
+    share_of_steps: ClassVar[float] = 1 / 16
+
+    steps: int | None = Field(
+        None,
+        ge=1,
+        le=1_000_000,
+        description="optimisation steps, one view each; unset = a sixteenth of a first scene's",
+    )
     coarse_share: float = Field(
         0.0, ge=0, le=1, description="share of the steps that see reduced images; 0 = off"
     )
@@ -200,10 +243,12 @@ class DistilConfig(TrainConfig):
     lr_final: float = Field(
         1.0, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
     )
-    sh_interval: int = Field(
-        0,
+    sh_every: float = Field(
+        0.0,
         ge=0,
-        description="steps between raises of the SH degree from 0 up; 0 = all degrees from the first step",
+        le=1,
+        description="share of the steps between raises of the SH degree from 0 up; 0 = all degrees from the "
+        "first step",
     )
     formation: FormationConfig = Field(
         FormationConfig(start=0.0), description="what the camera did to each raw frame"

@@ -25,6 +25,7 @@ from cleargs.progress import PREVIEW, Reporter, Task
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.effort import decided
 from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
@@ -34,7 +35,7 @@ from cleargs.splat.optimiser import Moments, Rates, step_gaussians
 from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.strategy import budget_from_pixels, make_strategy
+from cleargs.splat.strategy import make_strategy
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
 
@@ -74,7 +75,7 @@ def train(
     round: int = 0,
     device: str = "cpu",
 ) -> Trained:
-    """Train ``scene`` on ``views`` for ``config.steps`` steps with fresh Adam moments.
+    """Train ``scene`` on ``views`` with fresh Adam moments, for as many steps as ``config`` says.
 
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
     otherwise with what the formation makes of it, which goes on learning in place. A share ``pseudo_share``
@@ -99,12 +100,12 @@ def train(
         reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
     elif saved is not None:
         trainer.restore(saved)
-        reporter.info(f"{label}: going on from step {trainer.done} of {config.steps}")
-    with support.memory_errors(), reporter.task(label, total=config.steps) as task:
+        reporter.info(f"{label}: going on from step {trainer.done} of {trainer.length}")
+    with support.memory_errors(), reporter.task(label, total=trainer.length) as task:
         progress = _Progress(task, trainer)
-        while trainer.done < config.steps:
+        while trainer.done < trainer.length:
             trainer.step()
-            due = trainer.done % config.checkpoint_interval == 0 and trainer.done < config.steps
+            due = trainer.done % config.checkpoint_interval == 0 and trainer.done < trainer.length
             if trainer.done % _NOTE_INTERVAL == 0:
                 progress.show()
             if due or trainer.done % _CHECK_INTERVAL == 0:
@@ -139,7 +140,8 @@ class Trainer:
         require_views(weighted)
         self._share = pseudo_share if self._real and self._pseudo else float(bool(self._pseudo))
         self._pseudo_weight = pseudo_weight
-        self._config = config
+        self._config = config = decided(config, self._real or self._pseudo)
+        self.length = config.length
         self._seed = tuple(seed)
         self._scene = scene
         self._engine = Engine(device)
@@ -152,14 +154,12 @@ class Trainer:
             )
         self._moments = Moments.zeros(self._gaussians)
         self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
-        budget = config.budget or budget_from_pixels(
-            sum(view.camera.width * view.camera.height for view in self._real or self._pseudo)
-        )
-        self._strategy = make_strategy(config, budget, seed)
+        assert config.budget is not None  # decided above
+        self._strategy = make_strategy(config, config.budget, seed)
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device)
         self._meter = backend_for(self._device).meter(config.ssim_lambda)
-        self._log = TrainLog(config.steps)
+        self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
             *self._seed,
@@ -184,7 +184,7 @@ class Trainer:
     def step(self) -> None:
         """One iteration: one view, one Adam step, and what densification is due."""
         config, view = self._config, self._view(self.done)
-        factor = config.coarse_factor if self.done < config.coarse_share * config.steps else 1.0
+        factor = config.coarse_factor if self.done < config.coarse_share * self.length else 1.0
         target, mask = self._cache.get(view, factor)
         formed = self._formed(view, factor, target, mask)
         weight = view.weight if formed is None else formed.weight
@@ -278,7 +278,7 @@ class Trainer:
     def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
         if self._formation is None:
             return None
-        progress = self.done / self._config.steps
+        progress = self.done / self.length
         return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
 
     def _render(self, camera: Camera, *, depth: bool) -> Render:
@@ -292,9 +292,9 @@ class Trainer:
         )
 
     def _sh_degree(self) -> int:
-        interval = self._config.sh_interval
+        every = self._config.sh_every * self.length
         largest = self._gaussians.sh_degree
-        return largest if interval == 0 else min(largest, self.done // interval)
+        return largest if every == 0 else min(largest, int(self.done / every))
 
     def _measure(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
         """The gradient of the loss by the image; its value goes into the log, from a GPU with some delay."""
@@ -324,7 +324,7 @@ class Trainer:
     def _densify(self) -> None:
         """What the strategy does, and its refinement where one is due."""
         config = self._config
-        between = config.refine_start * config.steps <= self.done <= config.refine_stop * config.steps
+        between = config.refine_start * self.length <= self.done <= config.refine_stop * self.length
         if between and self.done % config.refine_interval == 0:
             self.check_finite()  # relocation takes a Gaussian whose opacity is NaN for dead, and hides it
             self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, self.done)

@@ -28,7 +28,7 @@ CONFIG = TrainConfig(
     steps=60,
     densify=False,
     coarse_share=0.0,
-    sh_interval=0,
+    sh_every=0.0,
     checkpoint_interval=17,
     # Training starts from the truth: what changes it is what the frames teach, not the first steps of Adam.
     lr_means=0.0,

@@ -220,12 +220,12 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
 
 CONFIG = TrainConfig(
     steps=5,
-    refine_interval=2,
+    refine_every=2 / 5,
     refine_start=0.1,
     budget=14,
     growth=0.3,
     checkpoint_interval=3,
-    sh_interval=2,
+    sh_every=2 / 5,
     coarse_share=0.4,
     lr_means=2e-3,
 )

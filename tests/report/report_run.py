@@ -94,9 +94,8 @@ class FinishedRun:
         write_run_file(self.run)
         self._ingest()
         self._rva()
-        self._trained(
-            "g0", {"psnr_strong": 25.0, "gaussians": 1500, "exposure": True, "exposure_spread": 0.1}
-        )
+        g0 = {"psnr_strong": 25.0, "gaussians": 1500, "steps": 400, "exposure": True, "exposure_spread": 0.1}
+        self._trained("g0", g0)
         self._rivr()
         held = {"frames": [0], "harm": None, "psnr_before": 24.0, "psnr_after": 25.5}
         self._trained("consolidate", {"repairs": 5, "published": "consolidated scene", "held_back": held})

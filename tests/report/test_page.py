@@ -106,7 +106,7 @@ def test_settings_and_the_command_make_the_run_again(run: FinishedRun) -> None:
     changed = {
         setting.name: (setting.value, setting.default) for setting in facts.changed_settings(run.run.config)
     }
-    assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "200")
+    assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "unset")
     assert facts.command(run.run, run.dag) == (
         "cleargs run 'gone & <away>.mp4' -o run --workflow smoke --set rva.tau_R=0.61"
     )

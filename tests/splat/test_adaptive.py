@@ -26,7 +26,7 @@ CONFIG = TrainConfig(
     steps=40,
     strategy="adaptive",
     adaptive=AdaptiveConfig(grad=5e-5, reset=0.5),  # more are copied than faint ones removed
-    refine_interval=5,
+    refine_every=5 / 40,
     refine_start=0.1,
     budget=90,
     checkpoint_interval=7,

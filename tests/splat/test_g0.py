@@ -30,12 +30,12 @@ ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
 SUPPRESSED, HELD_OUT, UNREGISTERED = 3, 4, 6
 CONFIG = G0Config(
     steps=60,
-    refine_interval=5,
+    refine_every=5 / 60,
     min_points=100,
     budget=120,
     checkpoint_interval=20,
     lr_means=2e-3,
-    sh_interval=20,
+    sh_every=20 / 60,
 )
 
 

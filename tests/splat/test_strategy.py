@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cleargs.splat.strategy import budget_from_pixels
 from cleargs.splat.strategy.mcmc import (
     grow,
     mean_noise,
@@ -128,8 +127,3 @@ def test_rotations_are_rotations() -> None:
     )
     np.testing.assert_allclose(np.linalg.det(matrices), 1.0, atol=1e-5)
     assert np.array_equal(matrices[0], np.eye(3))
-
-
-def test_the_budget_follows_the_pixels_within_bounds() -> None:
-    assert 0 < budget_from_pixels(0) < budget_from_pixels(24 * 540 * 960) < budget_from_pixels(10**9)
-    assert budget_from_pixels(10**9) == budget_from_pixels(10**10)

@@ -33,11 +33,11 @@ from cleargs.splat.views import ImageCache, View
 
 CONFIG = TrainConfig(
     steps=40,
-    refine_interval=5,
+    refine_every=5 / 40,
     refine_start=0.1,
     budget=80,
     checkpoint_interval=7,
-    sh_interval=10,
+    sh_every=10 / 40,
     lr_means=2e-3,
 )
 
@@ -84,7 +84,7 @@ def assert_same(first: Trained, second: Trained) -> None:
 
 def test_it_learns_the_pictures(pictures: list[np.ndarray], tmp_path: Path) -> None:
     before = evaluate_views(start(sh_degree=1), views(pictures))
-    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 200}))
+    trained = run(pictures, tmp_path, CONFIG.model_copy(update={"steps": 200, "refine_every": 5 / 200}))
     after = evaluate_views(trained.scene, views(pictures))
     # Random blobs start near 12 dB; 200 steps gain far more than 5 dB, an optimiser that ignores one of its
     # groups still gains some, one with a wrong sign loses.
@@ -273,7 +273,7 @@ def test_the_last_good_checkpoint_survives_not_a_number(
 ) -> None:
     poison(monkeypatch, 16, lambda trainer: trainer.scene.gaussians.tensors()[name][3].fill_(value))
     # Found at step 20, long before the next checkpoint and the end, as no step is worth much after it.
-    config = CONFIG.model_copy(update={"steps": 60, "checkpoint_interval": 14, "refine_interval": 50})
+    config = CONFIG.model_copy(update={"steps": 60, "checkpoint_interval": 14, "refine_every": 1.0})
     with pytest.raises(StageError, match=rf"{name} is not finite in 1 of 60 Gaussians at step 20") as raised:
         run(pictures, tmp_path, config)
     assert "checkpoint is kept" in str(raised.value)

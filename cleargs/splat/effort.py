@@ -1,0 +1,57 @@
+"""How much is spent on a training where the settings leave it open: steps and Gaussians, from the capture.
+
+Neither is one number for all captures. Steps follow the frames, since each is to be seen often enough;
+Gaussians follow the pixels, since they have that much to say. ``quality`` scales both. docs/training.md has
+what each step up costs and brings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+if TYPE_CHECKING:
+    from cleargs.splat.config import TrainConfig
+    from cleargs.splat.views import View
+
+Quality = Literal["draft", "standard", "high"]
+
+STEPS_A_FRAME = 50
+LEAST_STEPS, MOST_STEPS = 3200, 7200
+STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
+
+PIXELS_A_GAUSSIAN = 160
+LEAST_BUDGET = 40_000
+BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
+
+Settings = TypeVar("Settings", bound="TrainConfig")
+
+
+def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
+    """Steps of the first scene of a capture with so many active frames."""
+    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, LEAST_STEPS), MOST_STEPS))
+
+
+def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") -> int:
+    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all; never over ``most``.
+
+    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames), and
+    40,000 at least: fewer cost a small capture a dB.
+    """
+    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, LEAST_BUDGET)), most)
+
+
+def quality_settings(quality: str) -> tuple[str, ...]:
+    """The settings that give all trainings of a run that quality."""
+    return tuple(f"{name}.quality={quality}" for name in ("g0", "rivr.distil", "consolidate.distil"))
+
+
+def decided(config: Settings, views: Sequence[View]) -> Settings:
+    """``config`` with the steps and the budget that it leaves open, for these views."""
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    return config.model_copy(
+        update={
+            "steps": config.steps_for(len(views)),
+            "budget": config.budget or budget_from_pixels(pixels, config.most, config.quality),
+        }
+    )

@@ -1,0 +1,52 @@
+"""Steps and Gaussians that the settings leave open."""
+
+from __future__ import annotations
+
+import pytest
+from splat_toy import gaussians, images, start, views
+
+from cleargs.cli.main import invoke
+from cleargs.pipeline.config import load_config, override
+from cleargs.pipeline.dag import installed
+from cleargs.splat.config import DistilConfig, G0Config, TrainConfig
+from cleargs.splat.effort import budget_from_pixels, decided, quality_settings, steps_from_frames
+from cleargs.splat.trainer import Trainer
+
+
+def test_steps_follow_the_frames_within_bounds() -> None:
+    found = [steps_from_frames(frames) for frames in (1, 60, 80, 120, 1000)]
+    assert found == sorted(found) and found[0] == found[1] < found[2] < found[3] < found[4]
+    assert steps_from_frames(1000) == steps_from_frames(10_000)
+    for frames in (16, 100):
+        draft, standard, high = (steps_from_frames(frames, q) for q in ("draft", "standard", "high"))  # type: ignore[arg-type]
+        assert 4 * draft == standard and 4 * standard == high
+
+
+def test_the_budget_follows_the_pixels_within_bounds() -> None:
+    found = [budget_from_pixels(pixels, 400_000) for pixels in (0, 24 * 540 * 960, 10**9, 10**10)]
+    assert 0 < found[0] < found[1] < found[2] == found[3] == 400_000
+    assert budget_from_pixels(0, 400_000, "draft") < found[0] < budget_from_pixels(0, 400_000, "high")
+    assert budget_from_pixels(10**9, 50_000, "high") == 50_000
+
+
+def test_what_is_given_stays() -> None:
+    seen = views(images(gaussians(), 3))
+    open_ = decided(G0Config(), seen)
+    assert open_.length == steps_from_frames(3) and open_.budget == budget_from_pixels(0, 10**6)
+    given = decided(G0Config(steps=7, budget=9, quality="high"), seen)
+    assert (given.length, given.budget) == (7, 9)
+    assert decided(DistilConfig(), seen).length * 16 == steps_from_frames(3)
+
+
+def test_a_training_decides_for_itself() -> None:
+    trainer = Trainer(start(), views(images(gaussians(), 3)), TrainConfig(quality="draft"), seed=(1,))
+    assert trainer.length == steps_from_frames(3, "draft")
+    with pytest.raises(ValueError, match="open"):
+        TrainConfig().length  # noqa: B018
+
+
+def test_quality_reaches_every_training() -> None:
+    config = override(installed(), load_config(installed(), "default"), quality_settings("high"))
+    found = (config.sections["g0"], config.sections["rivr"].distil, config.sections["consolidate"].distil)
+    assert {training.quality for training in found} == {"high"}
+    assert invoke(["run", "nowhere.mp4", "-o", "nowhere", "--quality", "best"]) == 2
