@@ -65,13 +65,14 @@ def preflight(config: ConsolidateConfig) -> None:
 
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
-    """A training step takes about 0.3 s a megapixel on two cores."""
+    """The training, and two looks at the frames that are held back."""
     from cleargs.capture.cost import capture_size, pace
+    from cleargs.splat.effort import training_cost
 
-    frames, megapixels = capture_size(context)
+    seconds, memory = training_cost(context.config.distil, *capture_size(context))
     return Estimate(
-        minutes=0.3 * megapixels * context.config.distil.steps_for(frames) * pace(context.threads) / 60.0,
-        memory_gb=1.0 + context.config.distil.cache_mb / 1024.0,
+        minutes=seconds * pace(context.threads) / 60.0,
+        memory_gb=1.0 + memory + context.config.distil.cache_mb / 1024.0,
         disk_gb=0.2,
     )
 

@@ -24,9 +24,6 @@ OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet"
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "triton", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
-_SECONDS_PER_STEP = 0.02
-_SECONDS_PER_MEGAPIXEL = 0.2
-
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
     """Nothing outside the store."""
@@ -38,15 +35,16 @@ def preflight(config: G0Config) -> None:
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
-    """Steps times a cost a pixel (two cores); memory is the image cache and the kernels' buffers."""
+    """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
+    buffers. A quarter more where frames are asked what their camera did."""
     from cleargs.capture.cost import capture_size, pace
+    from cleargs.splat.effort import training_cost
 
     config = context.config
     count, megapixels = capture_size(context)
-    seen = config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share
-    seconds = config.steps_for(count) * (_SECONDS_PER_STEP + _SECONDS_PER_MEGAPIXEL * megapixels * seen)
-    seconds *= pace(context.threads)
-    memory = 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
+    seconds, memory = training_cost(config, count, megapixels)
+    seconds *= (1.3 if config.formation.enabled else 1.0) * pace(context.threads)
+    memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
 
 

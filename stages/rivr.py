@@ -77,24 +77,24 @@ def preflight(config: RivrConfig) -> None:
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
-    one), making and scoring candidates 2 s, a training step 0.3 s (two cores). Every group leaves a scene."""
+    one), making and scoring candidates 2 s (two cores). Every group leaves a scene."""
     from cleargs.capture.cost import capture_size, pace
+    from cleargs.splat.effort import training_cost
 
     config = context.config
     frames, megapixels = capture_size(context)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
-    seconds = megapixels * (
-        frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-        + 0.3 * config.rounds * config.distil.steps_for(frames)
-    )
+    seconds = megapixels * frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
+    distilling, memory = training_cost(config.distil, frames, megapixels)
+    seconds += config.rounds * distilling
     scene = context.inputs.get("g0", Path()) / "scene.ply"
     groups = 1 if config.group is None else -(-frames // config.group)
     scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
-        memory_gb=1.0 + config.distil.cache_mb / 1024.0,
+        memory_gb=1.0 + memory + config.distil.cache_mb / 1024.0,
         disk_gb=0.02 * megapixels * frames * (config.rounds + 1) + scenes,
     )
 

@@ -24,6 +24,9 @@ PIXELS_A_GAUSSIAN = 160
 LEAST_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
+# Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
+STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
+
 Settings = TypeVar("Settings", bound="TrainConfig")
 
 
@@ -39,6 +42,15 @@ def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") ->
     40,000 at least: fewer cost a small capture a dB.
     """
     return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, LEAST_BUDGET)), most)
+
+
+def training_cost(config: TrainConfig, frames: int, megapixels: float) -> tuple[float, float]:
+    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames."""
+    pixels = round(frames * megapixels * 1e6)
+    gaussians = config.budget or budget_from_pixels(pixels, config.most, config.quality)
+    seen = megapixels * (config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share)
+    step = STEP_S + STEP_S_PER_MEGAPIXEL * seen + STEP_S_PER_GAUSSIAN * gaussians
+    return config.steps_for(frames) * step, 1.5e-6 * gaussians
 
 
 def quality_settings(quality: str) -> tuple[str, ...]:
