@@ -6,9 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 DRILL = Path(__file__).with_name("drill.py")
 
 
+@pytest.mark.slow
 def test_what_was_killed_ends_with_the_same_digests() -> None:
     done = subprocess.run([sys.executable, DRILL, "--kills", "6"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -53,7 +53,9 @@ TOTAL = 12 + 6 + 6
 
 def compare(capture: Path, *more: str) -> int:
     settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
-    return invoke(["compare", str(capture), "--workflow", "smoke", "--quiet", *settings, *more])
+    return invoke(
+        ["compare", str(capture), "--workflow", "smoke", "--quiet", "--lpips", "alex", *settings, *more]
+    )
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
@@ -212,7 +214,8 @@ def test_finished_runs_stand_side_by_side(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
-    assert invoke(["compare", *runs, "-o", str(tmp_path / "runs"), "--quiet", "--json"]) == 0
+    more = ["-o", str(tmp_path / "runs"), "--lpips", "alex", "--quiet", "--json"]
+    assert invoke(["compare", *runs, *more]) == 0
     cells = json.loads(capsys.readouterr().out)["cells"]
     old = json.loads((out / "comparison.json").read_text())["cells"]
     means = {(cell["variant"], cell["views"]): cell["means"] for cell in old}
