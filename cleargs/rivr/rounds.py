@@ -21,7 +21,7 @@ from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, Image, fuse
 from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import REFUSED, all_masked, objection
+from cleargs.rivr.gates import REFUSED, all_masked, rejection_reason
 from cleargs.rivr.restoring import Explained, Restoration, observation
 from cleargs.rivr.results import chosen_counts
 from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
@@ -134,7 +134,7 @@ def repair(
             and hardly_changes(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
-    refused = objection(shown["restored"], observed, shown["render"], rules.gate)
+    refused = rejection_reason(shown["restored"], observed, shown["render"], rules.gate)
     choice = (
         choose(primary, tiebreak, rules.margin)
         if refused is None
