@@ -27,7 +27,7 @@ SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
 FRAMES_A_STRETCH = 32
 STRETCH_SHARE = 0.375
-"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaken."""
+"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
 SHAKING = 12.0
 """How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
 STRETCH_EDGE = 1 / FPS
@@ -54,11 +54,11 @@ class Hand:
         share = (times[:, None] - self.swing_times) / SWING_SECONDS
         swings = share * np.exp((1 - share**2) / 2)
         if len(self.stretches):
-            shaken = self.shaken(times)[:, None]
-            tremor, swings = tremor * (1 + (SHAKING - 1) * shaken), swings * shaken
+            strength = self.shake_strength(times)[:, None]
+            tremor, swings = tremor * (1 + (SHAKING - 1) * strength), swings * strength
         return np.asarray(tremor + swings @ self.swing_turns, np.float64)
 
-    def shaken(self, times: Array) -> Array:  # [T] seconds
+    def shake_strength(self, times: Array) -> Array:  # [T] seconds
         """1 [T] within a stretch, 0 outside."""
         start, end = self.stretches.T
         inside = np.minimum(times[:, None] - start, end - times[:, None])

@@ -188,10 +188,10 @@ def test_relocation_moves_the_dead_and_keeps_the_sum_of_opacity_plausible(device
 def test_growth_stops_at_the_budget(device, densify):
     gaussians = crowd(40, device)
     moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
-    grown, forgotten = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    grown, reset_moments = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
     assert grown.num == 55
-    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in forgotten[0].values())
-    same, _ = densify.grow(grown, forgotten, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in reset_moments[0].values())
+    same, _ = densify.grow(grown, reset_moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
     assert same is grown
 
 
@@ -205,7 +205,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     gaussians.logit_opacities[:10] = 2.0
     gaussians = gaussians.to(device)
     start = gaussians.means.clone()
-    densify.shake(gaussians, amount=2.0, min_opacity=0.005, seed=11)
+    densify.add_position_noise(gaussians, amount=2.0, min_opacity=0.005, seed=11)
     offsets = (gaussians.means - start).double().cpu()
     assert not offsets[:10].any()
     rotation = mcmc.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)

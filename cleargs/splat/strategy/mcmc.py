@@ -1,7 +1,7 @@
 """Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
 As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
-the means are shaken by noise that only transparent Gaussians feel.
+noise that only transparent Gaussians feel is added to the means.
 
 The rules are pure functions on numpy arrays: one thread, so the results depend on no thread count. A GPU has
 the same rules, and draws other random numbers.
@@ -95,8 +95,8 @@ def relocate(
 ) -> int:
     """Move dead Gaussians onto live ones drawn by opacity, in place; returns how many moved.
 
-    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which are
-    forgotten for every Gaussian that changed.
+    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
+    become 0 for every Gaussian that changed.
     """
     opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
     dead = np.flatnonzero(~(opacity > min_opacity))
@@ -136,17 +136,17 @@ def grow(
     sources = sample(opacity, extra, rng)
     changed = _split(arrays, sources, min_opacity)
     grown = {name: np.concatenate([array, array[sources]]) for name, array in arrays.items()}
-    forgotten = []
+    reset_moments = []
     for moment in moments:
         for array in moment.values():
             array[changed] = 0
-        forgotten.append(
+        reset_moments.append(
             {
                 name: np.concatenate([array, np.zeros((extra, *array.shape[1:]), array.dtype)])
                 for name, array in moment.items()
             }
         )
-    return grown, forgotten
+    return grown, reset_moments
 
 
 def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> NDArray[np.int64]:

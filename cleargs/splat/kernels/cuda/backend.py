@@ -105,4 +105,4 @@ def relocate_and_grow(
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
-    densify.shake(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))
+    densify.add_position_noise(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))
