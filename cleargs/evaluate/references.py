@@ -224,15 +224,15 @@ def _listed(directory: Path) -> dict[str, _Listed]:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     folder = mask_folder(directory / "images")
     masks = {} if folder is None else _masks(folder)
-    ways: dict[Lens, Undistorter] = {}
+    undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
         lens = entry.camera
         assert lens is not None  # asked for with poses=True
-        if lens not in ways:
-            ways[lens] = undistorter(lens, sys.maxsize)
+        if lens not in undistorters:
+            undistorters[lens] = undistorter(lens, sys.maxsize)
         stem = stem_of(entry.name)
-        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), ways[lens])))
+        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), undistorters[lens])))
     return _by_stem(listed)
 
 

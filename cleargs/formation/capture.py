@@ -1,6 +1,6 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-A frame is asked again each time it has been drawn so often (`FormationConfig.every`), in the light of the
+A frame's formation is estimated again each time the frame has been drawn so often (`FormationConfig.every`), in the light of the
 scene as it is then: blurred frames have taught it some of their blur, and the sharper it becomes the more of
 their motion shows.
 """
@@ -32,9 +32,9 @@ SEARCH_EVERY = 4
 ROLLING = 0.03
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
 docs/formation.md."""
-FEWEST_ASKED, MOST_ASKED = 4, 16
-"""Frames that must have been asked before a rolling shutter is believed, and that are asked: half of the
-frames between these."""
+MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
+"""Frames that must have been tested before a rolling shutter is believed, and most that are tested; between
+these, half of the capture's frames are."""
 
 
 def rolls(frames: Iterable[FrameFormation]) -> bool:
@@ -44,7 +44,7 @@ def rolls(frames: Iterable[FrameFormation]) -> bool:
     the pose of one frame has wrong.
     """
     gains = [frame.skew_gain for frame in frames if frame.skew_gain is not None]
-    return len(gains) >= FEWEST_ASKED and median(gains) > ROLLING
+    return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
 
 
 class CaptureFormation:
@@ -68,7 +68,7 @@ class CaptureFormation:
         self._frames = {
             frame_id: replace(known.get(frame_id, FrameFormation(frame_id)), draws=0) for frame_id in real
         }
-        self._asked = {real[k] for k in _spread(len(real))}
+        self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 
     @property
@@ -201,14 +201,14 @@ class CaptureFormation:
             factor=factor,
             warm=again,
             rolling=rolls(self._frames.values()),
-            asked=frame_id in self._asked,
+            test_rolling=frame_id in self._tested,
         )
 
 
-def _spread(count: int) -> list[int]:
-    """Which of ``count`` frames in a row are asked whether the shutter rolls: evenly spread."""
-    asked = min(count, max(FEWEST_ASKED, min(MOST_ASKED, count // 2)))
-    return [(2 * k + 1) * count // (2 * asked) for k in range(asked)]
+def _tested_frames(count: int) -> list[int]:
+    """Which of ``count`` frames in a row are tested for a rolling shutter: evenly spread."""
+    tested = min(count, max(MIN_TESTED_FRAMES, min(MAX_TESTED_FRAMES, count // 2)))
+    return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
 def _affines(exposure: Exposure, views: Sequence[View], rate: float) -> AffineOptimiser:

@@ -20,7 +20,7 @@ OUTLIER = 0.15
 STEPS = 10
 """Of the solver; fifty more change the image by less than 1/255 on average."""
 
-DARKEST = 0.002
+MIN_LINEAR = 0.002
 """Linear light below which sRGB counts as steep as here."""
 
 
@@ -82,5 +82,5 @@ def _power(a: Floats, b: Floats) -> float:
 
 def _slope(linear: Floats) -> Floats:
     """Of sRGB over linear light."""
-    light = np.maximum(linear, DARKEST)
+    light = np.maximum(linear, MIN_LINEAR)
     return np.asarray(np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * light ** (1 / 2.4 - 1)), np.float32)

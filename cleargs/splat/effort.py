@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 Quality = Literal["draft", "standard", "high"]
 
 STEPS_A_FRAME = 50
-LEAST_STEPS, MOST_STEPS = 3200, 7200
+MIN_STEPS, MAX_STEPS = 3200, 7200
 STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
 
 PIXELS_A_GAUSSIAN = 160
-LEAST_BUDGET = 40_000
+MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
 Settings = TypeVar("Settings", bound="TrainConfig")
@@ -29,7 +29,7 @@ Settings = TypeVar("Settings", bound="TrainConfig")
 
 def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
     """Steps of the first scene of a capture with so many active frames."""
-    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, LEAST_STEPS), MOST_STEPS))
+    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
 
 
 def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") -> int:
@@ -38,7 +38,7 @@ def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") ->
     One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames), and
     40,000 at least: fewer cost a small capture a dB.
     """
-    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, LEAST_BUDGET)), most)
+    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), most)
 
 
 def quality_settings(quality: str) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from cleargs.errors import InputError
 from cleargs.synth.world import Array
 
 UP = np.array([0.0, 1.0, 0.0])
-DEGREES_A_FRAME, MOST_DEGREES = 4.0, 150.0
+DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
 SMOOTHING = 0.5
 """Weight of the curvature of a spline through cameras, which are one apart."""
 MIN_CAMERAS = 5
@@ -70,7 +70,7 @@ class Orbit:
 
 def orbit(focus: Array, frames: int, seed: int) -> Orbit:
     """A course on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
-    arc = np.radians(min(DEGREES_A_FRAME * frames, MOST_DEGREES))
+    arc = np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES))
     return Orbit(focus, float(arc), np.random.default_rng([seed, 17]).uniform(0, 2 * np.pi, 2))
 
 
