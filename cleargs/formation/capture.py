@@ -1,8 +1,8 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-A frame's formation is estimated again each time the frame has been drawn so often (`FormationConfig.every`), in the light of the
-scene as it is then: blurred frames have taught it some of their blur, and the sharper it becomes the more of
-their motion shows.
+A frame's formation is estimated again each time the frame has been drawn so often
+(`FormationConfig.every`), in the light of the scene as it is then: blurred frames have taught it some of
+their blur, and the sharper it becomes the more of their motion shows.
 """
 
 from __future__ import annotations

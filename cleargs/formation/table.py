@@ -37,11 +37,9 @@ FORMATION = pa.schema(
     [
         column("frame_id", pa.int32(), "active frame"),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
-        column("blur_px", pa.float64(), "mean length of the pixels' paths while they were exposed, px"),
+        column("blur_px", pa.float64(), "mean length of the pixels' ways while they were exposed, px"),
         column(
-            "skew_px",
-            pa.float64(),
-            "mean length of their paths from the first to the last row's exposure, px",
+            "skew_px", pa.float64(), "mean length of their ways from the first to the last row's exposure, px"
         ),
         column("defocus_px", pa.float64(), "mean radius of the discs of defocus, px"),
         column("reach_px", pa.float64(), "95 % of the pixels look less far from their place, px"),
