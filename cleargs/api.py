@@ -203,9 +203,10 @@ def score_frames(
     config = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     assert isinstance(config, RvaConfig)
     with tempfile.TemporaryDirectory() as cache:
-        evaluator = make_evaluator(config, cache=Path(cache))
         views = [View(number, Path(path)) for number, path in enumerate(paths)]
-        cues = evaluator.evaluate(views, threads=threads or usable_cores(), reporter=_reporter(progress))
+        cues = make_evaluator(config, cache=Path(cache)).evaluate(
+            views, threads=threads or usable_cores(), reporter=_reporter(progress)
+        )
     R, B = appearance_scores(cues, config)
     columns = dict(zip(CUE_COLUMNS, cues.T, strict=True))
     return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})

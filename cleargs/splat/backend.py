@@ -15,9 +15,9 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 
 if TYPE_CHECKING:
+    from cleargs.splat.adam import Moments
     from cleargs.splat.kernels.cuda.loss import Meter
     from cleargs.splat.losses import PhotometricLoss
-    from cleargs.splat.optimiser import Moments
 
 
 class Rasteriser(Protocol):

@@ -102,7 +102,7 @@ class TrainConfig(BaseModel):
         le=20_000_000,
         description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
     )
-    most: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
+    max_budget: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
     growth: float = Field(
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
     )

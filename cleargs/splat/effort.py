@@ -32,13 +32,13 @@ def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
     return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
 
 
-def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") -> int:
-    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all; never over ``most``.
+def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
+    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all, up to ``max_budget``.
 
     One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames), and
     40,000 at least: fewer cost a small capture a dB.
     """
-    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), most)
+    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), max_budget)
 
 
 def quality_settings(quality: str) -> tuple[str, ...]:
@@ -52,6 +52,6 @@ def decided(config: Settings, views: Sequence[View]) -> Settings:
     return config.model_copy(
         update={
             "steps": config.steps_for(len(views)),
-            "budget": config.budget or budget_from_pixels(pixels, config.most, config.quality),
+            "budget": config.budget or budget_from_pixels(pixels, config.max_budget, config.quality),
         }
     )

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Reporter, Task
+from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
@@ -31,8 +32,8 @@ from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
-from cleargs.splat.optimiser import Moments, Rates, step_gaussians
 from cleargs.splat.preview import preview_camera, write_preview
+from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.strategy import make_strategy

@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.optimiser import Moments
 from cleargs.splat.strategy.base import REFINE, Strategy
 from cleargs.splat.strategy.mcmc import Arrays, rotation_matrices, sigmoid
 

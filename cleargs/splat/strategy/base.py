@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from cleargs.splat.adam import Moments
     from cleargs.splat.camera import Camera
     from cleargs.splat.engine import Engine
     from cleargs.splat.gaussians import Gaussians
-    from cleargs.splat.optimiser import Moments
 
 REFINE, NOISE = 2, 3
 """Purposes of random numbers, after the training's seed and before the step; 0 and 1 choose views."""

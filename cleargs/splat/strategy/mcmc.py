@@ -20,9 +20,9 @@ from cleargs.splat.backend import backend_for
 from cleargs.splat.strategy.base import NOISE, REFINE, Strategy
 
 if TYPE_CHECKING:
+    from cleargs.splat.adam import Moments
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.gaussians import Gaussians
-    from cleargs.splat.optimiser import Moments
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
