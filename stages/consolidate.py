@@ -7,6 +7,7 @@ from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
+from cleargs.splat.random_streams import Stream
 
 VERSION = 8
 CONFIG = ConsolidateConfig
@@ -44,9 +45,6 @@ LIBRARIES = (
     "pyarrow",
     "safetensors",
 )
-
-_STREAM = 6
-"""Sets the random numbers of this stage apart from those of the others."""
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
@@ -113,7 +111,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             [*supervision.real, *pseudo],
             config.distil,
             context.checkpoints / "consolidation",
-            seed=(context.seed, _STREAM),
+            seed=(context.seed, Stream.CONSOLIDATION),
             label="consolidating",
             round=0,
             repaired=repaired_share(rows),

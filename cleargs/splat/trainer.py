@@ -1,7 +1,7 @@
 """Optimise a scene against weighted views: the one loop that G0, RIVR and the consolidation share.
 
 No torch autograd: engine forward -> loss and its gradient -> engine backward -> Adam -> densification. All
-randomness is drawn afresh from (seed, purpose, step), so that a resumed training is the same training.
+randomness is drawn afresh from (seed, stream, step), so that a resumed training is the same training.
 """
 
 from __future__ import annotations
@@ -33,15 +33,13 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.preview import preview_camera, write_preview
+from cleargs.splat.random_streams import Stream
 from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.strategy import make_strategy
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
-
-_REAL, _PSEUDO = range(2)
-"""Purposes of random numbers; the next two are those of densification."""
 
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
@@ -269,11 +267,11 @@ class Trainer:
         """The view of a step: pseudo ones spread evenly at their share, both in shuffled epochs."""
         before = math.floor(step * self._share)
         if math.floor((step + 1) * self._share) > before:
-            views, purpose, count = self._pseudo, _PSEUDO, before
+            views, stream, count = self._pseudo, Stream.PSEUDO_VIEWS, before
         else:
-            views, purpose, count = self._real, _REAL, step - before
+            views, stream, count = self._real, Stream.REAL_VIEWS, step - before
         epoch, position = divmod(count, len(views))
-        order = self._rng(purpose, epoch).permutation(len(views))
+        order = self._rng(stream, epoch).permutation(len(views))
         return views[int(order[position])]
 
     def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
@@ -341,8 +339,8 @@ class Trainer:
             self._slopes[size] = torch.empty_like(target)
         return self._slopes[size]
 
-    def _rng(self, purpose: int, count: int) -> np.random.Generator:
-        return np.random.default_rng([*self._seed, purpose, count])
+    def _rng(self, stream: Stream, count: int) -> np.random.Generator:
+        return np.random.default_rng([*self._seed, stream, count])
 
     def _stopped(self, fault: str) -> StageError:
         return StageError(

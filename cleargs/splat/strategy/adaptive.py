@@ -20,7 +20,8 @@ from torch import Tensor
 
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.strategy.base import REFINE, Strategy
+from cleargs.splat.random_streams import Stream
+from cleargs.splat.strategy.base import Strategy
 from cleargs.splat.strategy.mcmc import Arrays, rotation_matrices, sigmoid
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class AdaptiveDensityControl(Strategy):
         )
         if self._pull is not None:
             total, seen = self._pull.cpu().numpy()
-            rng = np.random.default_rng([*self._seed, REFINE, step])
+            rng = np.random.default_rng([*self._seed, Stream.REFINEMENT, step])
             grad, dense = config.adaptive.grad, config.adaptive.dense
             pull = total / np.maximum(seen, 1)
             arrays, running = densify(

@@ -12,15 +12,12 @@ if TYPE_CHECKING:
     from cleargs.splat.engine import Engine
     from cleargs.splat.gaussians import Gaussians
 
-REFINE, NOISE = 2, 3
-"""Purposes of random numbers, after the training's seed and before the step; 0 and 1 choose views."""
-
 
 class Strategy:
     """Changes the number and the places of the Gaussians. Another one overrides what it needs.
 
     Made with the settings of the training, the most Gaussians there may be, and the seed. Random numbers are
-    drawn afresh from (seed, purpose, step), and what is remembered from step to step is in `state`: a resumed
+    drawn afresh from (seed, `Stream`, step), and what is remembered from step to step is in `state`: a resumed
     training is the same training. Steps count from 1.
     """
 

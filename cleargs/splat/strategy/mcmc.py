@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.splat.backend import backend_for
-from cleargs.splat.strategy.base import NOISE, REFINE, Strategy
+from cleargs.splat.random_streams import Stream
+from cleargs.splat.strategy.base import Strategy
 
 if TYPE_CHECKING:
     from cleargs.splat.adam import Moments
@@ -51,7 +52,7 @@ class MCMC(Strategy):
             rate=self._config.growth,
             budget=self._budget,
             min_opacity=self._config.min_opacity,
-            seed=(*self._seed, REFINE, step),
+            seed=(*self._seed, Stream.REFINEMENT, step),
         )
 
     def after_step(self, gaussians: Gaussians, rate: float, step: int) -> None:
@@ -62,7 +63,7 @@ class MCMC(Strategy):
                 gaussians,
                 amount=config.noise * rate,
                 min_opacity=config.min_opacity,
-                seed=(*self._seed, NOISE, step),
+                seed=(*self._seed, Stream.POSITION_NOISE, step),
             )
 
 
