@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     Image = NDArray[np.uint8] | NDArray[np.float32]
 
 Progress = Reporter | Callable[[str], object] | None
-"""Who is told how work goes on: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
+"""Who is told how work progresses: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
 
 
 def run(
@@ -135,7 +135,7 @@ def train(
 
     ``formation`` says what the cameras made of the sharp scene: None compares the images with the render as
     it is, `cleargs.formation.capture.CaptureFormation` finds blur, rolling shutter and defocus. With a
-    ``checkpoint`` file a training that was cut off goes on from it, to the same result. On a CPU the result
+    ``checkpoint`` file a training that was cut off resumes from it, to the same result. On a CPU the result
     depends on the arguments alone, not on threads. Raises InputError without a weighted view.
     """
     from cleargs.splat.config import TrainConfig

@@ -13,7 +13,7 @@ GPU_STAGES = ("rva", "g0", "rivr", "consolidate")
 """Stages that compute on the GPU where the run's device is one."""
 
 TIME_ROOM, MIN_MINUTES = 3.0, 15
-"""Estimates are rough and nodes differ; a job that still meets its limit goes on from its checkpoint."""
+"""Estimates are rough and nodes differ; a job that still meets its limit resumes from its checkpoint."""
 MEMORY_ROOM, MIN_MEMORY_GB = 1.5, 2.0
 CPUS = 4
 

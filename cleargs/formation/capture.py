@@ -159,7 +159,7 @@ class CaptureFormation:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         rows = state["frames"].numpy()
         self._frames = {frame.frame_id: frame for frame in map(unpacked, rows)}
         if self._affines is not None:

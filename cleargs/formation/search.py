@@ -26,7 +26,7 @@ LEVELS = ((160, 6), (320, 5), (640, 3))
 NEAR_SIZE = 1.5
 """An image that is larger than a level by less is that level itself."""
 WARM_STEPS = 2
-"""Of a fit that goes on from the last one."""
+"""Of a fit that starts from the last one."""
 
 LENGTHS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 DIRECTIONS = 8

@@ -146,7 +146,7 @@ class Snapshot:
 
         repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
         go to the raw frames: drawn as often as all of them, a few repairs would drown these.
-        A training that is done already is read back; one that was cut off goes on from its checkpoint, which
+        A training that is done already is read back; one that was cut off resumes from its checkpoint, which
         is deleted in the end.
         """
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
 """One round of RIVR: the candidates of every target frame, scored, one of them chosen, recorded in an EXR.
 
 The EXR is the record of a frame: it holds the candidates and, as attributes, its row of the selection table.
-It appears whole or not at all, so a round that was cut off goes on at the first frame without one.
+It appears whole or not at all, so a round that was cut off resumes at the first frame without one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Explainer = Callable[[View], Explained | None]
 """What the training found of a raw frame's camera."""
 
 TRUSTED = 0.5
-"""Weight from which a frame that the formation explains goes on teaching by itself instead of by a repair."""
+"""Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
 EXPLAINED = "explained: "
 """How the reason of such a frame begins."""
 
@@ -104,7 +104,7 @@ def repair(
     """Make, score and choose the candidates of one frame.
 
     All work is on the images as the EXR will give them back (half floats, scene-linear), so that
-    whoever goes on from the file sees what was scored.
+    whoever resumes from the file sees what was scored.
     """
     observed, mask = observation(view)
     layers = {"render": to_layer(rendered), "restored": to_layer(restoration.image)}

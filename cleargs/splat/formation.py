@@ -63,7 +63,7 @@ class Formation(Protocol):
         ...
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         ...
 
     def fault(self) -> str | None:

@@ -77,8 +77,8 @@ def train(
     """Train ``scene`` on ``views`` with fresh Adam moments, for as many steps as ``config`` says.
 
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
-    otherwise with what the formation makes of it, which goes on learning in place. A share ``pseudo_share``
-    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Goes on from
+    otherwise with what the formation makes of it, which keeps learning in place. A share ``pseudo_share``
+    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Resumes from
     ``checkpoint`` where there is one, to the same result bit for bit. Beside each checkpoint lies a preview.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
@@ -99,7 +99,7 @@ def train(
         reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
     elif saved is not None:
         trainer.restore(saved)
-        reporter.info(f"{label}: going on from step {trainer.done} of {trainer.length}")
+        reporter.info(f"{label}: resuming from step {trainer.done} of {trainer.length}")
     with support.memory_errors(), reporter.task(label, total=trainer.length) as task:
         progress = _Progress(task, trainer)
         while trainer.done < trainer.length:
@@ -223,7 +223,7 @@ class Trainer:
             raise self._stopped(fault)
 
     def state(self) -> dict[str, Tensor]:
-        """All that a training needs to go on: parameters, moments, affines, step and the log so far."""
+        """All that a training needs to resume: parameters, moments, affines, step and the log so far."""
         self._read_meter()
         state = {
             "fingerprint": self._fingerprint,
@@ -243,7 +243,7 @@ class Trainer:
         return "fingerprint" in state and torch.equal(state["fingerprint"], self._fingerprint)
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned, in a training with the same arguments."""
+        """Resume from what `state` returned, in a training with the same arguments."""
 
         def group(prefix: str) -> dict[str, Tensor]:
             return {

@@ -5,7 +5,7 @@
 RUN holds the finished folders ``ingest`` and ``rva``, made by ``cleargs run CAPTURE -o RUN --until rva`` on
 any machine, with ``--set ingest.holdout=every:8`` for held-out frames, and ``--set ingest.max_size=...``
 where images are larger than 960 px. OUT gets the scene, its log and ``stages.json``: time, PSNR of the frames
-trained on and of those held out, and memory. What a time limit cuts off goes on from its checkpoint when the
+trained on and of those held out, and memory. What a time limit cuts off resumes from its checkpoint when the
 same command is given again.
 """
 

@@ -271,7 +271,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
     assert rows["width"] == [10, 10, 20, 20, 20]
     assert all(0.0 < loss < 1.0 for loss in rows["loss"])
     assert all(0.0 < value < 50.0 for value in rows["psnr"])
-    # The checkpoint of step 3 is still there: going on from it does steps 4 and 5 again.
+    # The checkpoint of step 3 is still there: resuming from it does steps 4 and 5 again.
     saved = load_state(tmp_path / "state.safetensors", SilentReporter())
     assert saved is not None
     assert int(saved["step"]) == 3

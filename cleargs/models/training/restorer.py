@@ -4,7 +4,7 @@
 
 trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
 renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A
-killed run goes on from its checkpoint; a finished one only exports. The export needs the ``onnx`` package.
+killed run resumes from its checkpoint; a finished one only exports. The export needs the ``onnx`` package.
 `evaluate_restorer` prints the table of the held-out sources.
 
 Cost of the default recipe: see ``cleargs/models/weights/README.md``.

@@ -1,4 +1,4 @@
-"""Frames in, cues out: keeps what is scored, goes on after a kill, marks what could not be scored."""
+"""Frames in, cues out: keeps what is scored, resumes after a kill, marks what could not be scored."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class AdaptiveDensityControl(Strategy):
         return {} if self._pull is None else {"pull": self._pull}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         self._pull = state.get("pull")
 
 
