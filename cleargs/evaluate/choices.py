@@ -145,7 +145,7 @@ def exposed(image: Image, stops: float) -> Image:
 
 
 def _psnr(image: Image, truth: Image) -> float:
-    """Of unrounded images, so that candidates which differ by less than 8 bits tell still differ, dB."""
+    """PSNR of unrounded images, dB: candidates that look equal in 8 bits still differ."""
     error = float(np.square(image - truth).mean(dtype=np.float64))
     return -10.0 * math.log10(max(error, _MIN_ERROR))
 

@@ -27,7 +27,7 @@ from cleargs.splat.formation import Renderer
 from cleargs.splat.views import View
 
 SEARCH_EVERY = 4
-"""Of the fits of a frame one in so many begins from scratch."""
+"""One in so many fits of a frame begins from scratch."""
 
 ROLLING = 0.03
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
@@ -82,7 +82,7 @@ class CaptureFormation:
         return dict(self._frames)
 
     def weight(self, frame_id: int) -> float:
-        """With which a raw frame teaches: RVA's weight, or what it has earned where that is more.
+        """The weight of a raw frame in the training: RVA's, or what it has earned where that is more.
 
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 
@@ -142,7 +142,7 @@ class CaptureFormation:
         )
 
     def digest(self) -> str:
-        """Of the settings and of what it starts from."""
+        """A digest of the settings and of what it starts from."""
         digest = hashlib.sha256(self._config.model_dump_json().encode())
         for name, tensor in sorted(self.state().items()):
             digest.update(name.encode())
@@ -169,7 +169,7 @@ class CaptureFormation:
             )
 
     def fault(self) -> str | None:
-        """What of it is not finite."""
+        """What in it is not finite; None where all is."""
         if self._affines is not None and not np.isfinite(self._affines.affines).all():
             return "exposure is not finite"
         return None
@@ -187,7 +187,7 @@ class CaptureFormation:
         mask: Tensor | None,
         render: Renderer,
     ) -> None:
-        """Ask how the frame was taken, in the light of the scene as it is."""
+        """Estimate how the frame was taken, in the light of the scene as it is."""
         frame = self._frames[frame_id]
         again = (frame.draws // self._config.every) % SEARCH_EVERY != 0
         self._frames[frame_id] = explain(

@@ -1,4 +1,4 @@
-"""How one frame was taken: what is known of it, and asking again in the light of a scene."""
+"""How one frame was taken: what is known of it, and estimating it again in the light of a scene."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
 
 MARGIN_STEP = 4
-"""Margins are multiples of it, px."""
+"""Margins are multiples of this, px."""
 MARGIN_SHARE = 0.25
-"""Most of a margin, as a share of the shorter side."""
+"""Largest margin, as a share of the shorter side."""
 
 NUMBERS = 3 + 3 * TWIST + 3 + 2 + 4 + 1
-"""Of a frame in a checkpoint."""
+"""How many numbers of a frame a checkpoint holds."""
 
 
 @dataclass(frozen=True)
@@ -206,13 +206,13 @@ def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
 
 
 def margin_for(reach: float, camera: Camera) -> int:
-    """That shows what moved in from beyond the border."""
+    """The margin that shows what moved in from beyond the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
     return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
 
 
 def _search_margin(camera: Camera) -> int:
-    """For a search, whose motions are not known yet."""
+    """The margin for a search, whose motions are not known yet."""
     return margin_for(0.05 * max(camera.width, camera.height), camera)
 
 

@@ -26,7 +26,7 @@ LEVELS = ((160, 6), (320, 5), (640, 3))
 NEAR_SIZE = 1.5
 """An image that is larger than a level by less is that level itself."""
 WARM_STEPS = 2
-"""Of a fit that starts from the last one."""
+"""Gauss-Newton steps of a fit that starts from the last one."""
 
 LENGTHS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 DIRECTIONS = 8
@@ -52,7 +52,7 @@ OUTLIER, LIMIT = 0.03, 0.1
 """Differences of linear light from which they count linearly, and no further."""
 
 MIN_MISFIT = 5e-4
-"""Of linear light, from which there is something to explain: what rounding to eight bits leaves."""
+"""Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
 
 JUDGE_BLOCK, JUDGE_EVERY = 16, 4
 """Side in pixels of the blocks of which every fourth judges."""

@@ -17,13 +17,13 @@ from cleargs.splat.kernels.cpu import launch
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
 
 SAMPLES_PER_PIXEL = 1.0
-"""Of a blur."""
+"""Samples per pixel of a blur's length."""
 SAMPLES_PER_DISC_PIXEL = 0.8
-"""Of a disc's area."""
+"""Samples per pixel of a disc's area."""
 MIN_SAMPLES, MAX_SAMPLES = 3, 64
 
 STRIDE = 8
-"""Of the pixels whose displacements set the number of samples."""
+"""Every so many rows and columns, a pixel's displacement helps to set the number of samples."""
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PLASTIC = 0.7548776662466927
@@ -72,7 +72,7 @@ def samples(count: int) -> Floats:
 def displacement_fields(
     motion: FrameMotion, camera: Camera, depth: Floats, alpha: Floats, margin: int = 0, scale: float = 1.0
 ) -> DisplacementFields:
-    """The fields of a frame.
+    """The displacement fields of a frame.
 
     camera: of the photograph. depth, alpha: as the render at the photograph's pose accumulated them, larger
     by ``margin`` pixels on every side. scale: size of this photograph over that in whose pixels ``motion``

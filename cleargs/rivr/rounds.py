@@ -29,7 +29,7 @@ from cleargs.rivr.tables import SELECTION, Selection
 from cleargs.splat.views import Mask, View
 
 PREFIX = "cleargs:"
-"""Of the attributes in the EXR."""
+"""How the names of the attributes in the EXR begin."""
 
 _NULLABLE = tuple(field.name for field in SELECTION if field.nullable)
 

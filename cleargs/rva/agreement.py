@@ -25,7 +25,7 @@ class EvaluatorCues:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A frame on which two evaluators part."""
+    """A frame about which two evaluators disagree."""
 
     row: int
     gap: float
@@ -71,7 +71,7 @@ class Agreement:
 
 
 def compare(first: EvaluatorCues, second: EvaluatorCues, config: RvaConfig, *, most: int) -> Agreement:
-    """Rank agreement of two evaluators and the ``most`` frames on which they part furthest.
+    """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """A frame as an evaluator meets it: files, so that nobody has to hold a video in memory."""
+    """A frame as an evaluator gets it: files, so that nobody has to hold a video in memory."""
 
     frame_id: int
     image: Path
