@@ -87,11 +87,11 @@ def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     return missed if low else f"{missed}, no new view"
 
 
-def _missed(row: Mapping[str, Any], least_R: float, most_B: float) -> str:
+def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
     """Which of the two thresholds the frame misses; "" for none."""
-    if row["R"] < least_R:
-        return f"R < {text_of(least_R)}"
-    return f"B > {text_of(most_B)}" if row["B"] > most_B else ""
+    if row["R"] < min_R:
+        return f"R < {text_of(min_R)}"
+    return f"B > {text_of(max_B)}" if row["B"] > max_B else ""
 
 
 def _repair(row: Mapping[str, Any] | None) -> str:

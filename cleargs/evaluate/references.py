@@ -24,7 +24,7 @@ from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.evaluate.results import Alignment, PosesFrom
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.manifest import linked_manifest

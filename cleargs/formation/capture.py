@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.colour import AffineOptimiser, Exposure
+from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import NUMBERS, FrameFormation, explain, packed, unpacked
 from cleargs.formation.view import FormedView
 from cleargs.splat.camera import Camera

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.colour import apply_affine
+from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, Floats, FrameMotion, Model
 from cleargs.formation.search import (
     Explanation,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cleargs.formation.colour import AffineOptimiser, affine_backward, apply_affine
+from cleargs.formation.exposure import AffineOptimiser, affine_backward, apply_affine
 from cleargs.formation.frame import FrameFormation, margin_for, widened
 from cleargs.formation.warp import (
     Warp,

@@ -12,7 +12,7 @@ import torch
 
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
-from cleargs.formation.colour import Exposure, apply_affine, read_exposure, write_exposure
+from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
 from cleargs.formation.photograph import photograph
 from cleargs.formation.table import read_formation, write_formation

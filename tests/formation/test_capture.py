@@ -16,7 +16,7 @@ from cleargs.formation.capture import (
     _tested_frames,
     rolls,
 )
-from cleargs.formation.colour import Exposure
+from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.photograph import photograph

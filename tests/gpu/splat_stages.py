@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from cleargs.capture.tables import load_frames
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter

@@ -12,7 +12,7 @@ import torch
 
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.colour import Exposure, affine_backward, apply_affine
+from cleargs.formation.exposure import Exposure, affine_backward, apply_affine
 from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
 from cleargs.splat.adam import adam_step

@@ -136,9 +136,9 @@ def prune(
     return kept, [{name: array[keep] for name, array in moment.items()} for moment in moments]
 
 
-def lower_opacities(arrays: Arrays, moments: Sequence[Arrays], most: float) -> None:
-    """No opacity stays above ``most``; Adam forgets how they moved. In place."""
-    limit = np.float32(np.log(most) - np.log1p(-most))
+def lower_opacities(arrays: Arrays, moments: Sequence[Arrays], max_opacity: float) -> None:
+    """No opacity stays above ``max_opacity``; Adam forgets how they moved. In place."""
+    limit = np.float32(np.log(max_opacity) - np.log1p(-max_opacity))
     np.minimum(arrays["logit_opacities"], limit, out=arrays["logit_opacities"])
     for moment in moments:
         moment["logit_opacities"][:] = 0
