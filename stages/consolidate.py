@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
-from cleargs.splat.random_streams import Stream
 
 VERSION = 8
 CONFIG = ConsolidateConfig

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.random_streams import Stream
 from cleargs.rivr.config import RivrConfig
-from cleargs.splat.random_streams import Stream
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot

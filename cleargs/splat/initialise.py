@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cleargs.random_streams import Stream
 from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.random_streams import Stream
 from cleargs.splat.views import View
 
 NEIGHBOURS = 3

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Reporter, Task
+from cleargs.random_streams import Stream
 from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
@@ -33,7 +34,6 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.preview import preview_camera, write_preview
-from cleargs.splat.random_streams import Stream
 from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from cleargs.errors import InputError
+from cleargs.random_streams import Stream
 from cleargs.synth.world import Array
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -71,7 +72,7 @@ class Orbit:
 def orbit(focus: Array, frames: int, seed: int) -> Orbit:
     """A course on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
     arc = np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES))
-    return Orbit(focus, float(arc), np.random.default_rng([seed, 17]).uniform(0, 2 * np.pi, 2))
+    return Orbit(focus, float(arc), np.random.default_rng([seed, Stream.ORBIT]).uniform(0, 2 * np.pi, 2))
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.random_streams import Stream
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.random_streams import Stream
 from cleargs.splat.strategy.base import Strategy
 from cleargs.splat.strategy.mcmc import Arrays, rotation_matrices, sigmoid
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.random_streams import Stream
 from cleargs.splat.backend import backend_for
-from cleargs.splat.random_streams import Stream
 from cleargs.splat.strategy.base import Strategy
 
 if TYPE_CHECKING:

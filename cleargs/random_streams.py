@@ -16,3 +16,16 @@ class Stream(IntEnum):
     CONSOLIDATION = 6
     ADDED_POINTS = 100
     LEFT_OUT_POINTS = 101
+
+    # Of synthetic captures.
+    ROOM = 11
+    HAND = 12
+    MIXED_FAULTS = 13
+    NOVEL_POSES = 14
+    EXPOSURES = 15
+    WALK = 16
+    ORBIT = 17
+    POSE_NOISE = 18
+    SHAKY_STRETCHES = 19
+    BALLOON = 20
+    PHONE_LOOK = 21
