@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     Image = NDArray[np.uint8] | NDArray[np.float32]
 
 Progress = Reporter | Callable[[str], object] | None
-"""Who is told how work goes on: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
+"""Who is told how work progresses: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
 
 
 def run(
@@ -135,7 +135,7 @@ def train(
 
     ``formation`` says what the cameras made of the sharp scene: None compares the images with the render as
     it is, `cleargs.formation.capture.CaptureFormation` finds blur, rolling shutter and defocus. With a
-    ``checkpoint`` file a training that was cut off goes on from it, to the same result. On a CPU the result
+    ``checkpoint`` file a training that was cut off resumes from it, to the same result. On a CPU the result
     depends on the arguments alone, not on threads. Raises InputError without a weighted view.
     """
     from cleargs.splat.config import TrainConfig
@@ -203,9 +203,10 @@ def score_frames(
     config = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     assert isinstance(config, RvaConfig)
     with tempfile.TemporaryDirectory() as cache:
-        judge = make_evaluator(config, cache=Path(cache))
         views = [View(number, Path(path)) for number, path in enumerate(paths)]
-        cues = judge.evaluate(views, threads=threads or usable_cores(), reporter=_reporter(progress))
+        cues = make_evaluator(config, cache=Path(cache)).evaluate(
+            views, threads=threads or usable_cores(), reporter=_reporter(progress)
+        )
     R, B = appearance_scores(cues, config)
     columns = dict(zip(CUE_COLUMNS, cues.T, strict=True))
     return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})

@@ -31,7 +31,7 @@ class Reporter(Protocol):
         """A remark worth a line."""
 
     def warn(self, text: str) -> None:
-        """Something the user should look at, although the work goes on."""
+        """Something the user should look at, although the work continues."""
 
 
 class Pace:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
 VERSION = 8
@@ -44,9 +45,6 @@ LIBRARIES = (
     "pyarrow",
     "safetensors",
 )
-
-_STREAM = 6
-"""Sets the random numbers of this stage apart from those of the others."""
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
@@ -114,7 +112,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             [*supervision.real, *pseudo],
             config.distil,
             context.checkpoints / "consolidation",
-            seed=(context.seed, _STREAM),
+            seed=(context.seed, Stream.CONSOLIDATION),
             label="consolidating",
             round=0,
             repaired=repaired_share(rows),

@@ -10,7 +10,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.splat.config import G0Config
 
 if TYPE_CHECKING:
-    from cleargs.formation.colour import Exposure
+    from cleargs.formation.exposure import Exposure
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
@@ -52,7 +52,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     """Sparse points -> Gaussians -> trained on the active frames, each with its RVA weight."""
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
-    from cleargs.formation.colour import Exposure, write_exposure
+    from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.photograph import evaluate_views
     from cleargs.formation.table import write_formation
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -130,7 +130,7 @@ def _exposure(
     config: G0Config, views: list[View], sparse: SparsePoints
 ) -> tuple[Exposure | None, float | None]:
     """Affines to learn, or None; and the measured spread of the frames' gains."""
-    from cleargs.formation.colour import Exposure, frame_gains, gain_spread
+    from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
 
     if config.exposure == "off":
         return None, None

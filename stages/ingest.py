@@ -76,7 +76,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     if capture.hdr is not None:
         reporter.warn(
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
-            "highlights bent; record in SDR where colours must be exact"
+            "highlights compressed; record in SDR where colours must be exact"
         )
     frames = prepare(capture, work, max(config.feature_size, config.max_size), reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)

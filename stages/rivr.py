@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.random_streams import Stream
 from cleargs.rivr.config import RivrConfig
 
 if TYPE_CHECKING:
@@ -46,9 +47,6 @@ LIBRARIES = (
     "pyarrow",
     "safetensors",
 )
-
-_STREAM = 5
-"""Sets the random numbers of this stage apart from those of the others."""
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
@@ -223,7 +221,7 @@ def _repair_and_distil(
                 [*supervision.real, *repairs],
                 config.distil.model_copy(update={"steps": steps}),
                 context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
-                seed=(context.seed, _STREAM, number, *([place] if place else [])),
+                seed=(context.seed, Stream.RIVR, number, *([place] if place else [])),
                 label=f"{label}: distilling",
                 round=number,
                 repaired=repaired_share(rows),

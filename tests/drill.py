@@ -36,7 +36,7 @@ SETTINGS = {
     "consolidate.distil.checkpoint_interval": 5,
 }
 HEAVY = ("torch", "numba", "pyarrow.parquet", "cv2", "OpenImageIO", "onnxruntime", "scipy.ndimage")
-LONGEST_S = 3600.0
+MAX_SECONDS = 3600.0
 """When a program counts as hung: far beyond what a busy machine needs."""
 
 
@@ -123,7 +123,7 @@ class Program:
 
     def wait_for(self, line: str) -> None:
         """Until the program says ``line``, or ends. Raises TimeoutError when it does neither for an hour."""
-        deadline = time.monotonic() + LONGEST_S
+        deadline = time.monotonic() + MAX_SECONDS
         while not self.ended() and line not in self.log.read_text():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{self.arguments} never said {line!r}")

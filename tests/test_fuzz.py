@@ -32,7 +32,7 @@ from cleargs.capture.transforms import read_transforms
 from cleargs.capture.world import Similarity
 from cleargs.errors import CleargsError
 from cleargs.files import write_json
-from cleargs.formation.colour import EXPOSURE
+from cleargs.formation.exposure import EXPOSURE
 from cleargs.media.encode import write_video
 from cleargs.media.exr import LayeredImage, read_exr, write_exr
 from cleargs.media.image import read_rgb

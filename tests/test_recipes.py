@@ -101,7 +101,7 @@ def test_the_recipes_are_the_papers_method(recipe: str, expected: dict[str, Any]
 
 def test_the_paper_has_as_many_gaussians_as_its_field() -> None:
     config = load_config(installed(), "paper")
-    assert value(config, "g0.budget") >= max(1_000_000, value(config, "g0.most"))
+    assert value(config, "g0.budget") >= max(1_000_000, value(config, "g0.max_budget"))
 
 
 def test_the_open_row_trains_as_the_default_does() -> None:

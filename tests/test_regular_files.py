@@ -18,7 +18,7 @@ from cleargs.models.fetch import read_checked
 from cleargs.models.installed import read_receipt
 from cleargs.models.registry import find_model
 from cleargs.report.record import noted
-from cleargs.rva.kept import KeptRows
+from cleargs.rva.item_cache import ItemCache
 
 DEEP = "[" * 200_000
 
@@ -28,7 +28,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "list of evidence": ("evidence.toml", lambda folder: read_evidence(folder / "evidence.toml")),
     "note of a synthetic capture": ("truth/capture.json", lambda folder: Sample(folder, 0, None).column),
     "note of a report": ("report/report.json", noted),
-    "kept findings": (f"{'0' * 64}.json", lambda folder: KeptRows(folder, ("a",)).find("0" * 64)),
+    "kept findings": (f"{'0' * 64}.json", lambda folder: ItemCache(folder, ("a",)).find("0" * 64)),
     "receipt of a model": (
         "musiq.receipt.json",
         lambda folder: read_receipt(find_model("musiq"), folder),

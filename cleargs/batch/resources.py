@@ -12,9 +12,9 @@ from cleargs.pipeline.stage import Estimate
 GPU_STAGES = ("rva", "g0", "rivr", "consolidate")
 """Stages that compute on the GPU where the run's device is one."""
 
-TIME_ROOM, LEAST_MINUTES = 3.0, 15
-"""Estimates are rough and nodes differ; a job that still meets its limit goes on from its checkpoint."""
-MEMORY_ROOM, LEAST_MEMORY_GB = 1.5, 2.0
+TIME_ROOM, MIN_MINUTES = 3.0, 15
+"""Estimates are rough and nodes differ; a job that still meets its limit resumes from its checkpoint."""
+MEMORY_ROOM, MIN_MEMORY_GB = 1.5, 2.0
 CPUS = 4
 
 
@@ -50,7 +50,7 @@ def resources(stage: str, estimate: Estimate | None, wanted: Wanted, device: Dev
     gpus = 1 if device == "cuda" and stage in GPU_STAGES else 0
     return Resources(
         threads=wanted.cpus or CPUS,
-        mem_mb=math.ceil(1000 * (wanted.memory_gb or max(LEAST_MEMORY_GB, memory_gb))),
-        runtime=wanted.minutes or max(LEAST_MINUTES, math.ceil(minutes)),
+        mem_mb=math.ceil(1000 * (wanted.memory_gb or max(MIN_MEMORY_GB, memory_gb))),
+        runtime=wanted.minutes or max(MIN_MINUTES, math.ceil(minutes)),
         gpu=gpus if wanted.gpus is None else wanted.gpus,
     )

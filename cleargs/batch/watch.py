@@ -24,7 +24,7 @@ LOOK_EVERY = 0.5
 """Seconds between two looks at signals and checkpoints."""
 PATIENCE = 90.0
 """Seconds that a stage gets for its next checkpoint; SIGTERM comes 120 before the limit (the profile)."""
-MOST_REQUEUES = 50
+MAX_REQUEUES = 50
 """A job that meets its time limit more often makes no progress."""
 
 
@@ -44,7 +44,7 @@ class SlurmJob:
         """Whether Slurm calls the job running (a cancelled one is not) and it has not come back too often."""
         question = ["squeue", "--noheader", "--jobs", self.number, "--Format", "State:20,RestartCnt:10"]
         answer = subprocess.run(question, capture_output=True, text=True, check=False).stdout.split()
-        return len(answer) == 2 and answer[0] == "RUNNING" and int(answer[1]) < MOST_REQUEUES
+        return len(answer) == 2 and answer[0] == "RUNNING" and int(answer[1]) < MAX_REQUEUES
 
     def requeue(self) -> bool:
         """Put the job back into the queue; Slurm then ends all of it. Returns whether that was accepted."""

@@ -35,7 +35,7 @@ from cleargs.splat.kernels.reference import Splats
 
 RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagate")
 """Our side of the comparison of rasterisers. The last adds the pairs up per Gaussian, which torch's side does
-too, and goes on to the raw parameters, which it does not."""
+too, and continues to the raw parameters, which it does not."""
 
 
 def run(plan: Plan, reporter: Reporter) -> Benchmark:

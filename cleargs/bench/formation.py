@@ -26,7 +26,7 @@ from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.view import FormedView
 from cleargs.formation.warp import (
-    fields_of,
+    displacement_fields,
     linear_curve,
     srgb_curve,
     through_curve,
@@ -182,7 +182,7 @@ class _FormedStep(Iteration):
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion) -> None:
         super().__init__(gaussians, camera)
         depth = _depth(self.engine, gaussians, camera)
-        fields = fields_of(motion, camera, depth, np.ones_like(depth))
+        fields = displacement_fields(motion, camera, depth, np.ones_like(depth))
         frame = FrameFormation(0, motion, "blur", reach_px=reach_of(fields))
         self._formed = FormedView(camera, 1.0, formation=frame)
 

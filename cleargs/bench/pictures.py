@@ -22,7 +22,7 @@ COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "ta
 MARKERS = "os^Dvp"
 
 FLOAT32_ROUNDING = 2.0**-24
-LEAST_RANGE = (3e-8, 1e-4)
+MIN_RANGE = (3e-8, 1e-4)
 """Errors that are always in the picture, so that its scale does not blow up differences of a few percent."""
 
 
@@ -51,7 +51,7 @@ def plot_speed_error(path: Path, benchmark: Benchmark) -> None:
         panel.set_ylabel("largest gradient error against float64")
         show_plain_numbers(panel.xaxis)
         low, high = panel.get_ylim()
-        panel.set_ylim(min(low, LEAST_RANGE[0]), max(high, LEAST_RANGE[1]))
+        panel.set_ylim(min(low, MIN_RANGE[0]), max(high, MIN_RANGE[1]))
         panel.axhline(FLOAT32_ROUNDING, color="0.5", linestyle=":", label="rounding of a float32")
     _legend(rasterisers)
     handles, names = iterations.get_legend_handles_labels()

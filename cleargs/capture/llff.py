@@ -82,7 +82,7 @@ def _view(row: NDArray[np.float64], path: Path) -> LlffView:
     # Columns: the camera's down, right and back axes in the world, its centre, and (height, width, focal).
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     if not np.isfinite(row[:15]).all() or min(height, width, focal) < 1:
-        raise InputError(f"the camera of {path.name} in {POSES_BOUNDS} is no finite camera", hint=hint)
+        raise InputError(f"the camera of {path.name} in {POSES_BOUNDS} is not finite", hint=hint)
     pose = rigid_pose(np.column_stack([right, -down, back, centre]), path.name, hint)
     size = round(float(width)), round(float(height))
     return LlffView(path, pinhole(*size, float(focal), float(focal), size[0] / 2, size[1] / 2), pose)

@@ -58,25 +58,25 @@ def publish(
     views: list[_View] = []
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
-    ways: dict[Camera, Undistorter] = {}
+    undistorters: dict[Camera, Undistorter] = {}
     cameras = _cameras(frames, model)
     registered = {image.name: image for image in model.images.values()}
     with reporter.task("undistorting", len(frames)) as task:
         for index, frame in enumerate(frames):
             lens = cameras[index]
-            if lens not in ways:
-                ways[lens] = undistorter(lens, max_size)
-            way = ways[lens]
-            rgb = _write_picture(frame, way, work, out, reporter)
+            if lens not in undistorters:
+                undistorters[lens] = undistorter(lens, max_size)
+            undistortion = undistorters[lens]
+            rgb = _write_picture(frame, undistortion, work, out, reporter)
             image = registered.get(frame.image)
             if image is not None:
-                image = _flattened(image, way)
+                image = _flattened(image, undistortion)
                 if index not in test:
                     rows = np.searchsorted(model.point_ids, image.point_ids)
                     x, y = image.xy.astype(np.int64).T
                     sums[rows] += rgb[y, x]
                     samples[rows] += 1
-            views.append(_View(frame, way.pinhole, image))
+            views.append(_View(frame, undistortion.pinhole, image))
             task.advance()
     counts = _track_lengths(views, model.point_ids)
     kept = (counts >= 2) & (samples >= 1)
@@ -116,24 +116,26 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
 
 
 def _write_picture(
-    frame: WorkFrame, way: Undistorter, work: Path, out: Path, reporter: Reporter
+    frame: WorkFrame, undistortion: Undistorter, work: Path, out: Path, reporter: Reporter
 ) -> NDArray[np.uint8]:
     """Undistort image and mask of a frame (a killed run may have done so) and return the image."""
     target = out / "images" / frame.image
     if resumable(target, reporter):
         rgb = read_rgb(target)
     else:
-        rgb = way.image(read_rgb(work / "images" / frame.image))
+        rgb = undistortion.image(read_rgb(work / "images" / frame.image))
         write_rgb(target, rgb)
     if frame.masked:
-        write_mask(out / "masks" / frame.image, way.mask(read_mask(work / "masks" / f"{frame.image}.png")))
+        write_mask(
+            out / "masks" / frame.image, undistortion.mask(read_mask(work / "masks" / f"{frame.image}.png"))
+        )
     return rgb
 
 
-def _flattened(image: ModelImage, way: Undistorter) -> ModelImage:
+def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
     """The observations in the published image; those in the cropped margin are gone."""
-    xy = way.points(image.xy)
-    inside = way.inside(xy)
+    xy = undistortion.points(image.xy)
+    inside = undistortion.inside(xy)
     return ModelImage(image.name, image.camera_id, image.pose, xy[inside], image.point_ids[inside])
 
 

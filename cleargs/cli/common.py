@@ -24,7 +24,6 @@ store_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and results only.")
-force_help = "Make the stage again, even if its results are there."
 partial_option = click.option(
     "--allow-partial", is_flag=True, help="Continue after a stage that is done only in part."
 )

@@ -28,8 +28,8 @@ LIBRARIES = (
     "pyarrow",
     "av",
 )
-LEAST_MEMORY_GB = 4.0
-LEAST_DISK_GB = 5.0
+MIN_MEMORY_GB = 4.0
+MIN_DISK_GB = 5.0
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,14 @@ def _memory() -> Finding:
         available = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) / 1e6
     except (OSError, StopIteration, ValueError):
         return Finding("memory", "note", "unknown")
-    enough = available >= LEAST_MEMORY_GB
-    advice = "" if enough else f"; a run may want {LEAST_MEMORY_GB:.0f} GB: lower ingest.max_size"
+    enough = available >= MIN_MEMORY_GB
+    advice = "" if enough else f"; a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size"
     return Finding("memory", "ok" if enough else "note", f"{available:.1f} GB free{advice}")
 
 
 def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(folder).free / 1e9
-    enough = free >= LEAST_DISK_GB
+    enough = free >= MIN_DISK_GB
     advice = "" if enough else "; cleargs gc frees what no run needs"
     return Finding("disk", "ok" if enough else "note", f"{free:.1f} GB free at {folder.absolute()}{advice}")
 

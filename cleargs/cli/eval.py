@@ -248,7 +248,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
     """Name -> scene file of all that is to be rendered; empty where finished images are evaluated."""
     if renders is not None:
         if stages or (target is not None and not target.is_dir()):
-            raise InputError("--renders stands instead of a scene", hint="leave out --stage and SCENE.ply")
+            raise InputError("--renders takes the place of a scene", hint="leave out --stage and SCENE.ply")
         return {}
     if target is None:
         raise InputError("there is nothing to evaluate", hint="give a RUN, a SCENE.ply, or --renders DIR")

@@ -42,7 +42,7 @@ Examples:
 @click.option(
     "--captures",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Folder of the real captures, by their names in the list; without it their sections say so.",
+    help="Folder of the real captures, by their names in the list; without it the page calls them missing.",
 )
 @click.option(
     "--page",

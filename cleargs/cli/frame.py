@@ -11,7 +11,7 @@ import numpy as np
 
 from cleargs.cli.frames import reason, worst_cue
 from cleargs.errors import InputError
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import write_rgb
 from cleargs.report.contact import Tile, contact_sheet
 from cleargs.report.frames import CHOICES, FrameRow, formation_meanings, last_scene, load_rows

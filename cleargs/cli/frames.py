@@ -9,7 +9,7 @@ from cleargs.cli.words import AS_FILMED, text_of
 
 COLUMNS = ("frame", "name", "role", "weight", "R", "B", "worst cue", "reason", "repair")
 
-LONGEST_NAME = 14
+MAX_NAME_LENGTH = 14
 """Characters of a frame's name on the terminal."""
 
 HARDLY = 0.2
@@ -48,7 +48,7 @@ def frame_rows(
 def short_name(name: str) -> str:
     """The end of a frame's name, which tells it from the others."""
     last = name.rpartition("/")[2]
-    return last if len(last) <= LONGEST_NAME else f"…{last[1 - LONGEST_NAME :]}"
+    return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
 
 
 def worst_cue(row: Mapping[str, Any]) -> str:
@@ -87,11 +87,11 @@ def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     return missed if low else f"{missed}, no new view"
 
 
-def _missed(row: Mapping[str, Any], least_R: float, most_B: float) -> str:
+def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
     """Which of the two thresholds the frame misses; "" for none."""
-    if row["R"] < least_R:
-        return f"R < {text_of(least_R)}"
-    return f"B > {text_of(most_B)}" if row["B"] > most_B else ""
+    if row["R"] < min_R:
+        return f"R < {text_of(min_R)}"
+    return f"B > {text_of(max_B)}" if row["B"] > max_B else ""
 
 
 def _repair(row: Mapping[str, Any] | None) -> str:

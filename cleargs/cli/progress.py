@@ -1,4 +1,4 @@
-"""What the user sees while work goes on: bars on a terminal, plain lines elsewhere, always on stderr."""
+"""What the user sees while work is under way: bars on a terminal, plain lines elsewhere, always on stderr."""
 
 from __future__ import annotations
 

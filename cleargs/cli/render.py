@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cleargs.render.shots import CaptureShots
 
 SECONDS = 10.0
-"""Of a film, unless told otherwise."""
+"""Length of a film, unless told otherwise."""
 
 
 @click.command(
@@ -197,12 +197,12 @@ def _check_choices(
     """Raise InputError where options contradict each other."""
     if (frame is not None) + turntable + (poses is not None) > 1:
         raise InputError(
-            "--frame, --turntable and --poses say each where the camera is", hint="give one of them"
+            "--frame, --turntable and --poses each say where the camera is", hint="give one of them"
         )
     if frame is not None and output.suffix.lower() == ".mp4":
         raise InputError("--frame is a still", hint="end --output with .png or .exr, or leave out --frame")
     if world is not None and poses is None:
-        raise InputError("--world is that of the poses in a file", hint="give --poses, or leave it out")
+        raise InputError("--world describes the poses of a file", hint="give --poses, or leave it out")
     if seconds is not None and (poses is not None or frame is not None):
         raise InputError(
             "--seconds is the length of the path or of a turn",

@@ -32,7 +32,7 @@ from cleargs.progress import Reporter
 
 if TYPE_CHECKING:
     from cleargs.capture.tables import Frame
-    from cleargs.rva.agreement import Agreement, Judgement
+    from cleargs.rva.agreement import Agreement, EvaluatorCues
     from cleargs.rva.config import RvaConfig
 
 FOLDER = "agree"
@@ -108,25 +108,25 @@ def agree(
     ingest = (run / "ingest").resolve()
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]
     configs = [_config(dag, settings.config, name, overrides) for name in evaluators]
-    judgements = [
-        _own_judgement(dag, run, config, frames)
-        or _judgement(run, ingest, config, frames, settings.config.seed, settings.device, threads, reporter)
+    sides = [
+        _own_cues(dag, run, config, frames)
+        or _cues_of(run, ingest, config, frames, settings.config.seed, settings.device, threads, reporter)
         for config in configs
     ]
 
     frame_id, names = [frame.frame_id for frame in frames], [frame.name for frame in frames]
     documents, agreements = [], []
-    for (i, first), (j, second) in combinations(enumerate(judgements), 2):
+    for (i, first), (j, second) in combinations(enumerate(sides), 2):
         agreement = compare(first, second, configs[0], most=most)
         sheet = run / FOLDER / f"{_plain(evaluators[i])}--{_plain(evaluators[j])}.png"
         shown = str(_write_sheet(sheet, agreement, frames, ingest)) if agreement.disagreements else None
         agreements.append(agreement)
         documents.append({**agreement.document(frame_id, names), "sheet": shown})
     unscored = {
-        judgement.evaluator: [
-            id_ for id_, row in zip(frame_id, judgement.cues, strict=True) if bool((row != row).any())
+        side.evaluator: [
+            id_ for id_, row in zip(frame_id, side.cues, strict=True) if bool((row != row).any())
         ]
-        for judgement in judgements
+        for side in sides
     }
     document = {"run": str(run), "frames": len(frames), "unscored": unscored, "pairs": documents}
     write_json(run / FOLDER / "agreement.json", document)
@@ -153,11 +153,11 @@ def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> Rv
     return section
 
 
-def _own_judgement(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Frame]) -> Judgement | None:
+def _own_cues(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Frame]) -> EvaluatorCues | None:
     """The cues in the run's own table, where this evaluator made them of these images; else None."""
     import numpy as np
 
-    from cleargs.rva.agreement import Judgement
+    from cleargs.rva.agreement import EvaluatorCues
     from cleargs.rva.tables import CUE_COLUMNS, FRAMES
     from cleargs.tables import read_table
 
@@ -175,10 +175,10 @@ def _own_judgement(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Fram
     if table["frame_id"].to_pylist() != [frame.frame_id for frame in frames]:
         return None
     cues = np.column_stack([table[column].to_numpy() for column in CUE_COLUMNS])
-    return Judgement(table["evaluator"][0].as_py(), cues)
+    return EvaluatorCues(table["evaluator"][0].as_py(), cues)
 
 
-def _judgement(
+def _cues_of(
     run: Path,
     ingest: Path,
     config: RvaConfig,
@@ -187,9 +187,9 @@ def _judgement(
     device: Any,
     threads: int | None,
     reporter: Reporter,
-) -> Judgement:
+) -> EvaluatorCues:
     """Score the frames, or take what RUN/agree keeps of an earlier call."""
-    from cleargs.rva.agreement import Judgement
+    from cleargs.rva.agreement import EvaluatorCues
     from cleargs.rva.evaluator import View, label, make_evaluator
 
     evaluator = make_evaluator(config, seed=seed, device=device, cache=run / FOLDER / "scores")
@@ -198,7 +198,7 @@ def _judgement(
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=threads_or_all(threads), reporter=reporter)
-    return Judgement(label(evaluator), cues)
+    return EvaluatorCues(label(evaluator), cues)
 
 
 def _write_sheet(path: Path, agreement: Agreement, frames: Sequence[Frame], ingest: Path) -> Path:

@@ -13,7 +13,7 @@ import torch
 from cleargs.capture.tables import load_frames
 from cleargs.cli.progress import make_reporter
 from cleargs.errors import InputError
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.rva.tables import FRAMES

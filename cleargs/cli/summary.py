@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-MOST_COUNTED = 12
+MAX_COUNTED_VALUES = 12
 """A column of words with more different values than this is not counted value by value."""
 
 
@@ -31,7 +31,7 @@ def _describe(field: pa.Field, column: pa.ChunkedArray) -> dict[str, Any]:
         counts = {item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()}
         counts.pop(None, None)
         names = len(counts) > 2 and len(counts) == len(column) - column.null_count
-        if len(counts) <= MOST_COUNTED and not names:
+        if len(counts) <= MAX_COUNTED_VALUES and not names:
             ordered = sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))
             return {**facts, "counts": {_word(value): count for value, count in ordered}}
         return {**facts, "distinct": len(counts)}

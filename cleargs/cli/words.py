@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-LONGEST = 16
+MAX_LISTED = 16
 """Most items of a list that are spelt out."""
 
 HEADLINES = frozenset(
@@ -148,8 +148,8 @@ def text_of(value: Any) -> str:
         case float():
             return f"{value:.4g}"
         case list():
-            return ", ".join(text_of(item) for item in value[:LONGEST]) + (
-                " ..." if len(value) > LONGEST else ""
+            return ", ".join(text_of(item) for item in value[:MAX_LISTED]) + (
+                " ..." if len(value) > MAX_LISTED else ""
             )
         case Mapping():
             counts = all(isinstance(item, int) for item in value.values())

@@ -24,7 +24,7 @@ Distance = Callable[[Image, Image], float]
 RAW = "observed"
 """The layer of the raw frame, which a method that keeps frames may choose too."""
 
-_LEAST_ERROR = 1e-10
+_MIN_ERROR = 1e-10
 """Equal images have a PSNR of 100 dB, not an infinite one."""
 
 
@@ -145,9 +145,9 @@ def exposed(image: Image, stops: float) -> Image:
 
 
 def _psnr(image: Image, truth: Image) -> float:
-    """Of unrounded images, so that candidates which differ by less than 8 bits tell still differ, dB."""
+    """PSNR of unrounded images, dB: candidates that look equal in 8 bits still differ."""
     error = float(np.square(image - truth).mean(dtype=np.float64))
-    return -10.0 * math.log10(max(error, _LEAST_ERROR))
+    return -10.0 * math.log10(max(error, _MIN_ERROR))
 
 
 def _candidates(exr: Path, chosen: str) -> Mapping[str, Image]:

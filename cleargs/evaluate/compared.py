@@ -107,13 +107,13 @@ def roles_of(made: Made) -> Roles:
 
 def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
     """How RIVR chose, against the truth; None where there is no RIVR or no truth. Kept by content."""
-    from cleargs.evaluate.judges import load_judges
+    from cleargs.evaluate.metric_set import load_metrics
 
     rivr = next((manifest for manifest in made.manifests if manifest.stage == "rivr"), None)
     truth = made.sample.capture / "truth"
     if rivr is None or not truth.is_dir():
         return None
-    distances = load_judges(EvalOptions(lpips=("alex",), scorers=())).lpips
+    distances = load_metrics(EvalOptions(lpips=("alex",), scorers=())).lpips
     parts = {
         "version": EVALUATION_VERSION,
         "rivr": rivr.digest,

@@ -1,7 +1,7 @@
 """Runs variants of captures over one store and judges each scene: the cells of the paper's tables.
 
 ``OUT/<capture>-<seed>/<variant>`` are ordinary run folders that share ``OUT/.store``, so that a stage which
-several variants agree on is made once, and a killed comparison goes on where it stopped. Evaluations are kept
+several variants agree on is made once, and a killed comparison resumes where it stopped. Evaluations are kept
 by content in ``OUT/evaluations``.
 """
 

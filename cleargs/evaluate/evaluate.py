@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.colour import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.judges import Judges, load_judges
+from cleargs.evaluate.metric_set import MetricSet, load_metrics
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.references import Reference, ReferenceView, reference_in, reference_of, require_match
 from cleargs.evaluate.refinement import refine_pose
@@ -184,7 +184,7 @@ def _evaluate(
     save: Path | None,
 ) -> Evaluation:
     """Predictions are made one after the other (a render uses all threads) and measured in parallel."""
-    judges = load_judges(options)
+    metrics = load_metrics(options)
     if save is not None:
         try:
             save.mkdir(parents=True, exist_ok=True)
@@ -200,7 +200,7 @@ def _evaluate(
         for view in reference.views:
             target, mask = view.load()
             prediction = predictions.predict(view, target, mask)
-            waiting.append(pool.submit(_measure, judges, options, view.name, prediction, target, mask, save))
+            waiting.append(pool.submit(_measure, metrics, options, view.name, prediction, target, mask, save))
             if len(waiting) > 2 * threads:  # so that memory does not grow with the number of images
                 images.append(waiting.popleft().result())
                 task.advance()
@@ -216,15 +216,15 @@ def _evaluate(
         alignment=reference.alignment,
         options=options,
         means=mean_values(images, options.metrics),
-        unavailable=dict(judges.unavailable),
-        weights=dict(judges.weights),
+        unavailable=dict(metrics.unavailable),
+        weights=dict(metrics.weights),
         versions={**versions(), **{name: version(name) for name in _LIBRARIES}},
         images=tuple(images),
     )
 
 
 def _measure(
-    judges: Judges,
+    metrics: MetricSet,
     options: EvalOptions,
     name: str,
     prediction: _Prediction,
@@ -243,7 +243,7 @@ def _measure(
         name=name,
         width=pixels.shape[1],
         height=pixels.shape[0],
-        values=judges.measure(pixels, target, mask),
+        values=metrics.measure(pixels, target, mask),
         prediction=_digest(pixels),
         reference=_digest(target, mask),
         colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),

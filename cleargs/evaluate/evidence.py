@@ -1,7 +1,7 @@
 """The evidence for the method: what is compared on which captures, and how all of it is made.
 
 ``evidence.toml`` lists the frozen test set and the sections of the page. Every section is a comparison like
-those of ``cleargs compare``, in one folder with one store, so that a killed call goes on where it stopped.
+those of ``cleargs compare``, in one folder with one store, so that a killed call resumes where it stopped.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.evaluate.results import Alignment, PosesFrom
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.manifest import linked_manifest
@@ -224,15 +224,15 @@ def _listed(directory: Path) -> dict[str, _Listed]:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     folder = mask_folder(directory / "images")
     masks = {} if folder is None else _masks(folder)
-    ways: dict[Lens, Undistorter] = {}
+    undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
         lens = entry.camera
         assert lens is not None  # asked for with poses=True
-        if lens not in ways:
-            ways[lens] = undistorter(lens, sys.maxsize)
+        if lens not in undistorters:
+            undistorters[lens] = undistorter(lens, sys.maxsize)
         stem = stem_of(entry.name)
-        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), ways[lens])))
+        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), undistorters[lens])))
     return _by_stem(listed)
 
 

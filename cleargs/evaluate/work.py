@@ -74,7 +74,7 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
     return Work(
         steps=steps or steps_of(config, len(frames)).total,
         frames=len(frames),
-        budget=g0.budget or budget_from_pixels(pixels, g0.most, g0.quality),
+        budget=g0.budget or budget_from_pixels(pixels, g0.max_budget, g0.quality),
         sh_degree=sh_degree_from_views(len(frames)) if g0.sh_degree is None else g0.sh_degree,
     )
 

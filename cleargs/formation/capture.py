@@ -1,8 +1,8 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-A frame is asked again each time it has been drawn so often (`FormationConfig.every`), in the light of the
-scene as it is then: blurred frames have taught it some of their blur, and the sharper it becomes the more of
-their motion shows.
+A frame's formation is estimated again each time the frame has been drawn so often
+(`FormationConfig.every`), in the light of the scene as it is then: blurred frames have taught it some of
+their blur, and the sharper it becomes the more of their motion shows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.colour import AffineOptimiser, Exposure
+from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import NUMBERS, FrameFormation, explain, packed, unpacked
 from cleargs.formation.view import FormedView
 from cleargs.splat.camera import Camera
@@ -27,14 +27,14 @@ from cleargs.splat.formation import Renderer
 from cleargs.splat.views import View
 
 SEARCH_EVERY = 4
-"""Of the fits of a frame one in so many begins from scratch."""
+"""One in so many fits of a frame begins from scratch."""
 
 ROLLING = 0.03
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
 docs/formation.md."""
-FEWEST_ASKED, MOST_ASKED = 4, 16
-"""Frames that must have been asked before a rolling shutter is believed, and that are asked: half of the
-frames between these."""
+MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
+"""Frames that must have been tested before a rolling shutter is believed, and most that are tested; between
+these, half of the capture's frames are."""
 
 
 def rolls(frames: Iterable[FrameFormation]) -> bool:
@@ -44,7 +44,7 @@ def rolls(frames: Iterable[FrameFormation]) -> bool:
     the pose of one frame has wrong.
     """
     gains = [frame.skew_gain for frame in frames if frame.skew_gain is not None]
-    return len(gains) >= FEWEST_ASKED and median(gains) > ROLLING
+    return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
 
 
 class CaptureFormation:
@@ -68,7 +68,7 @@ class CaptureFormation:
         self._frames = {
             frame_id: replace(known.get(frame_id, FrameFormation(frame_id)), draws=0) for frame_id in real
         }
-        self._asked = {real[k] for k in _spread(len(real))}
+        self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 
     @property
@@ -82,7 +82,7 @@ class CaptureFormation:
         return dict(self._frames)
 
     def weight(self, frame_id: int) -> float:
-        """With which a raw frame teaches: RVA's weight, or what it has earned where that is more.
+        """The weight of a raw frame in the training: RVA's, or what it has earned where that is more.
 
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 
@@ -142,7 +142,7 @@ class CaptureFormation:
         )
 
     def digest(self) -> str:
-        """Of the settings and of what it starts from."""
+        """A digest of the settings and of what it starts from."""
         digest = hashlib.sha256(self._config.model_dump_json().encode())
         for name, tensor in sorted(self.state().items()):
             digest.update(name.encode())
@@ -159,7 +159,7 @@ class CaptureFormation:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         rows = state["frames"].numpy()
         self._frames = {frame.frame_id: frame for frame in map(unpacked, rows)}
         if self._affines is not None:
@@ -169,7 +169,7 @@ class CaptureFormation:
             )
 
     def fault(self) -> str | None:
-        """What of it is not finite."""
+        """What in it is not finite; None where all is."""
         if self._affines is not None and not np.isfinite(self._affines.affines).all():
             return "exposure is not finite"
         return None
@@ -187,7 +187,7 @@ class CaptureFormation:
         mask: Tensor | None,
         render: Renderer,
     ) -> None:
-        """Ask how the frame was taken, in the light of the scene as it is."""
+        """Estimate how the frame was taken, in the light of the scene as it is."""
         frame = self._frames[frame_id]
         again = (frame.draws // self._config.every) % SEARCH_EVERY != 0
         self._frames[frame_id] = explain(
@@ -201,14 +201,14 @@ class CaptureFormation:
             factor=factor,
             warm=again,
             rolling=rolls(self._frames.values()),
-            asked=frame_id in self._asked,
+            test_rolling=frame_id in self._tested,
         )
 
 
-def _spread(count: int) -> list[int]:
-    """Which of ``count`` frames in a row are asked whether the shutter rolls: evenly spread."""
-    asked = min(count, max(FEWEST_ASKED, min(MOST_ASKED, count // 2)))
-    return [(2 * k + 1) * count // (2 * asked) for k in range(asked)]
+def _tested_frames(count: int) -> list[int]:
+    """Which of ``count`` frames in a row are tested for a rolling shutter: evenly spread."""
+    tested = min(count, max(MIN_TESTED_FRAMES, min(MAX_TESTED_FRAMES, count // 2)))
+    return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
 def _affines(exposure: Exposure, views: Sequence[View], rate: float) -> AffineOptimiser:

@@ -1,4 +1,4 @@
-"""How one frame was taken: what is known of it, and asking again in the light of a scene."""
+"""How one frame was taken: what is known of it, and estimating it again in the light of a scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.colour import apply_affine
+from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, Floats, FrameMotion, Model
 from cleargs.formation.search import (
     Explanation,
@@ -20,19 +20,19 @@ from cleargs.formation.search import (
     refine,
     search,
 )
-from cleargs.formation.warp import Fields, fields_of
+from cleargs.formation.warp import DisplacementFields, displacement_fields
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
 
 MARGIN_STEP = 4
-"""Margins are multiples of it, px."""
+"""Margins are multiples of this, px."""
 MARGIN_SHARE = 0.25
-"""Most of a margin, as a share of the shorter side."""
+"""Largest margin, as a share of the shorter side."""
 
 NUMBERS = 3 + 3 * TWIST + 3 + 2 + 4 + 1
-"""Of a frame in a checkpoint."""
+"""How many numbers of a frame a checkpoint holds."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class FrameFormation:
     """Mean difference of high-passed linear luminance that the model leaves, see `search.Explanation`."""
     misfit_still: float = 0.0
     blur_px: float = 0.0
-    """Mean length of the pixels' ways while they were exposed."""
+    """Mean length of the pixels' paths while they were exposed."""
     skew_px: float = 0.0
-    """Mean length of their ways from the first to the last row's exposure."""
+    """Mean length of their paths from the first to the last row's exposure."""
     defocus_px: float = 0.0
     """Mean radius of the discs."""
     reach_px: float = 0.0
@@ -84,7 +84,7 @@ def explain(
     factor: float = 1.0,
     warm: bool = False,
     rolling: bool = False,
-    asked: bool = False,
+    test_rolling: bool = False,
 ) -> FrameFormation:
     """How a raw frame was taken, in the light of the scene that ``render`` shows.
 
@@ -95,7 +95,7 @@ def explain(
         target, mask: the frame, [H, W, 3] sRGB and [H, W].
         warm: refine what is known instead of searching among all models.
         rolling: whether models with a skew are in the race.
-        asked: whether to tell, where they are not, what such a model would explain (`skew_gain`).
+        test_rolling: whether to tell, where they are not, what such a model would explain (`skew_gain`).
     """
     # What was found under the other belief about the shutter is searched for anew.
     untold = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -109,8 +109,8 @@ def explain(
         found = refine(sight, frame.model, known, pose=config.pose)
         best = found[-1]
     else:
-        found = search(sight, skew=rolling or asked, pose=config.pose)
-        frame = replace(frame, skew_gain=_skew_gain(found) if rolling or asked else None)
+        found = search(sight, skew=rolling or test_rolling, pose=config.pose)
+        frame = replace(frame, skew_gain=_skew_gain(found) if rolling or test_rolling else None)
         if frame.model != "none":
             found += refine(sight, frame.model, known, pose=config.pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
@@ -172,8 +172,8 @@ def _described(
     assert rendered.depth is not None
     depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
 
-    def fields(of: FrameMotion) -> Fields:
-        return fields_of(of, camera, depth, alpha, margin, factor)
+    def fields(of: FrameMotion) -> DisplacementFields:
+        return displacement_fields(of, camera, depth, alpha, margin, factor)
 
     whole, turned = fields(motion), fields(replace(motion, pose=np.zeros(TWIST), blur=motion.skew))
     return replace(
@@ -189,10 +189,10 @@ def _described(
     )
 
 
-def reach_of(fields: Fields) -> float:
+def reach_of(fields: DisplacementFields) -> float:
     """See `FrameFormation.reach_px`."""
-    ways = np.abs(fields.offset) + 0.5 * np.abs(fields.sweep) + fields.radius
-    return float(np.quantile(ways.max(axis=0)[::4, ::4], 0.95))
+    displacements = np.abs(fields.offset) + 0.5 * np.abs(fields.sweep) + fields.radius
+    return float(np.quantile(displacements.max(axis=0)[::4, ::4], 0.95))
 
 
 def _mean_length(field: Floats) -> float:
@@ -206,13 +206,13 @@ def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
 
 
 def margin_for(reach: float, camera: Camera) -> int:
-    """That shows what moved in from beyond the border."""
+    """The margin that shows what moved in from beyond the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
     return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
 
 
 def _search_margin(camera: Camera) -> int:
-    """For a search, whose motions are not known yet."""
+    """The margin for a search, whose motions are not known yet."""
     return margin_for(0.05 * max(camera.width, camera.height), camera)
 
 

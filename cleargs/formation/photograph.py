@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.colour import Exposure
+from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.view import FormedView
 from cleargs.splat.engine import Engine

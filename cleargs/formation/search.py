@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.formation.motion import TWIST, Floats, FrameMotion, Model, Vector, flow_basis
-from cleargs.formation.warp import Fields, samples
+from cleargs.formation.warp import DisplacementFields, samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import formation as kernels
@@ -26,7 +26,7 @@ LEVELS = ((160, 6), (320, 5), (640, 3))
 NEAR_SIZE = 1.5
 """An image that is larger than a level by less is that level itself."""
 WARM_STEPS = 2
-"""Of a fit that goes on from the last one."""
+"""Gauss-Newton steps of a fit that starts from the last one."""
 
 LENGTHS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 DIRECTIONS = 8
@@ -41,7 +41,7 @@ NARROWING = (0.25, 0.12, 0.06)
 """Steps of its pattern search, as shares of the radius and of the range of nearness."""
 
 FINE, COARSE = samples(13), samples(9)
-"""Instants of an exposure."""
+"""Sample times of an exposure."""
 DISC = samples(32)
 
 HIGH_PASS = 6.0
@@ -51,8 +51,8 @@ light does, says nothing of motion."""
 OUTLIER, LIMIT = 0.03, 0.1
 """Differences of linear light from which they count linearly, and no further."""
 
-LEAST_MISFIT = 5e-4
-"""Of linear light, from which there is something to explain: what rounding to eight bits leaves."""
+MIN_MISFIT = 5e-4
+"""Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
 
 JUDGE_BLOCK, JUDGE_EVERY = 16, 4
 """Side in pixels of the blocks of which every fourth judges."""
@@ -107,13 +107,13 @@ class Explanation:
 
 def explained_share(misfit: float, misfit_still: float) -> float:
     """Share of ``misfit_still`` that is gone in ``misfit``; 0 where there was next to nothing."""
-    return 1.0 - misfit / misfit_still if misfit_still > LEAST_MISFIT else 0.0
+    return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
 def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Explanation]:
     """Every model at its best, from scratch. The first is ``none``.
 
-    skew: whether models with a rolling shutter are asked too; without them it takes half the time.
+    skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
     """
     levels = _levels(sight)
@@ -220,7 +220,9 @@ class _Level:
         """How well a motion explains the pixels that judge."""
         total = max(self._total, 1.0)
         still = self._misfit(FrameMotion(), FINE, self._judging) / total
-        misfit = still if model == "none" else self._misfit(motion, _instants(model), self._judging) / total
+        misfit = (
+            still if model == "none" else self._misfit(motion, _samples_for(model), self._judging) / total
+        )
         return Explanation(model, motion, misfit, still)
 
     def best(self, starts: list[FrameMotion], model: Model, steps: int, pose: bool) -> FrameMotion:
@@ -289,14 +291,14 @@ class _Level:
             )
         return math.fsum(self._rows)
 
-    def _fields(self, motion: FrameMotion) -> Fields:
+    def _fields(self, motion: FrameMotion) -> DisplacementFields:
         def flow(twist: Vector) -> Floats:
             # einsum, for its fixed order of summation.
             return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
 
         offset = flow(motion.pose) + flow(motion.skew) * self._down[:, None]
         radius = np.abs(self._nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self._scale)
-        return Fields(offset, flow(motion.blur), radius, 0.0)
+        return DisplacementFields(offset, flow(motion.blur), radius, 0.0)
 
     def _descend(self, motion: FrameMotion, active: Vector, steps: int) -> FrameMotion:
         """Levenberg-Marquardt over the ``active`` numbers from ``motion``."""
@@ -345,7 +347,7 @@ class _Level:
         return lower + np.tril(lower, -1).T, sides.sum(axis=0)
 
 
-def _instants(model: Model) -> Floats:
+def _samples_for(model: Model) -> Floats:
     return DISC if model == "defocus" else FINE
 
 

@@ -18,9 +18,9 @@ OUTLIER = 0.15
 """Difference in sRGB between raw frame and exposed render from which a pixel counts less: what moved."""
 
 STEPS = 10
-"""Of the solver; fifty more change the image by less than 1/255 on average."""
+"""Steps of the solver; fifty more change the image by less than 1/255 on average."""
 
-DARKEST = 0.002
+MIN_LINEAR = 0.002
 """Linear light below which sRGB counts as steep as here."""
 
 
@@ -51,7 +51,7 @@ def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats
     seen = _slope(start)
 
     def normal(change: Floats) -> Floats:
-        """Of the change as it is seen: dark and bright parts then converge alike."""
+        """The normal equations of the change in sRGB: dark and bright parts then converge alike."""
         return warp.transpose(data * warp.forward(change / seen)) / seen + np.float32(PRIOR) * change
 
     change = _conjugate_gradients(normal, warp.transpose(data * left) / seen)
@@ -81,6 +81,6 @@ def _power(a: Floats, b: Floats) -> float:
 
 
 def _slope(linear: Floats) -> Floats:
-    """Of sRGB over linear light."""
-    light = np.maximum(linear, DARKEST)
+    """The slope of sRGB over linear light."""
+    light = np.maximum(linear, MIN_LINEAR)
     return np.asarray(np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * light ** (1 / 2.4 - 1)), np.float32)

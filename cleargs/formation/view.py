@@ -7,9 +7,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cleargs.formation.colour import AffineOptimiser, affine_backward, apply_affine
+from cleargs.formation.exposure import AffineOptimiser, affine_backward, apply_affine
 from cleargs.formation.frame import FrameFormation, margin_for, widened
-from cleargs.formation.warp import Warp, fields_of, linear_curve, srgb_curve, through_curve, times_slope
+from cleargs.formation.warp import (
+    Warp,
+    displacement_fields,
+    linear_curve,
+    srgb_curve,
+    through_curve,
+    times_slope,
+)
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Render
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
@@ -50,7 +57,7 @@ class FormedView:
     def warp(self, render: Render) -> Warp:
         """B of the frame, from a render at ``camera`` with depth."""
         assert self.formation is not None and render.depth is not None
-        fields = fields_of(
+        fields = displacement_fields(
             self.formation.motion,
             self._photo,
             render.depth.cpu().numpy(),

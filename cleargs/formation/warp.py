@@ -17,13 +17,13 @@ from cleargs.splat.kernels.cpu import launch
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
 
 SAMPLES_PER_PIXEL = 1.0
-"""Of a blur."""
+"""Samples per pixel of a blur's length."""
 SAMPLES_PER_DISC_PIXEL = 0.8
-"""Of a disc's area."""
-FEWEST_SAMPLES, MOST_SAMPLES = 3, 64
+"""Samples per pixel of a disc's area."""
+MIN_SAMPLES, MAX_SAMPLES = 3, 64
 
 STRIDE = 8
-"""Of the pixels whose ways set the number of samples."""
+"""Every so many rows and columns, a pixel's displacement helps to set the number of samples."""
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PLASTIC = 0.7548776662466927
@@ -31,7 +31,7 @@ _PLASTIC = 0.7548776662466927
 
 
 @dataclass(frozen=True, eq=False)
-class Fields:
+class DisplacementFields:
     """Where the pixels of a photograph look while they are exposed, in pixels: see the kernels."""
 
     offset: Floats  # [2, H, W]
@@ -41,22 +41,22 @@ class Fields:
     """Farthest that a pixel looks up or down."""
 
     def samples(self) -> Floats:
-        """Enough instants and disc points that neighbouring ones lie about a pixel apart: [K, 3]."""
-        ways = np.hypot(*self.sweep[:, ::STRIDE, ::STRIDE])
-        longest = float(np.quantile(ways, 0.95))
+        """Enough sample times and disc points that neighbouring ones lie about a pixel apart: [K, 3]."""
+        sweeps = np.hypot(*self.sweep[:, ::STRIDE, ::STRIDE])
+        longest = float(np.quantile(sweeps, 0.95))
         widest = float(np.quantile(self.radius[::STRIDE, ::STRIDE], 0.95))
-        instants = math.ceil(SAMPLES_PER_PIXEL * longest) if longest > 0.05 else 1
+        times = math.ceil(SAMPLES_PER_PIXEL * longest) if longest > 0.05 else 1
         points = math.ceil(SAMPLES_PER_DISC_PIXEL * math.pi * widest**2) if widest > 0.05 else 1
-        if (count := max(instants, points)) > 1:
-            count = min(max(FEWEST_SAMPLES, count), MOST_SAMPLES)
+        if (count := max(times, points)) > 1:
+            count = min(max(MIN_SAMPLES, count), MAX_SAMPLES)
         return samples(count)
 
 
 @cache
 def samples(count: int) -> Floats:
-    """``count`` instants and points of the disc: [count, 3] t, u, v.
+    """``count`` sample times and points of the disc: [count, 3] t, u, v.
 
-    The instants are the middles of equal parts of an exposure, from -1/2 to 1/2. The points are a sunflower's
+    The times are the middles of equal parts of an exposure, from -1/2 to 1/2. The points are a sunflower's
     in an order that has nothing to do with time, their centre moved to the disc's.
     """
     if count == 1:
@@ -65,14 +65,14 @@ def samples(count: int) -> Floats:
     place = np.argsort(np.argsort(index * _PLASTIC % 1.0, kind="stable"), kind="stable")
     out, turn = np.sqrt((place + 0.5) / count), place * _GOLDEN_ANGLE
     points = np.stack([out * np.cos(turn), out * np.sin(turn)], axis=1)
-    instants = (index + 0.5) / count - 0.5
-    return np.column_stack([instants, points - points.mean(axis=0)]).astype(np.float32)
+    sample_times = (index + 0.5) / count - 0.5
+    return np.column_stack([sample_times, points - points.mean(axis=0)]).astype(np.float32)
 
 
-def fields_of(
+def displacement_fields(
     motion: FrameMotion, camera: Camera, depth: Floats, alpha: Floats, margin: int = 0, scale: float = 1.0
-) -> Fields:
-    """The fields of a frame.
+) -> DisplacementFields:
+    """The displacement fields of a frame.
 
     camera: of the photograph. depth, alpha: as the render at the photograph's pose accumulated them, larger
     by ``margin`` pixels on every side. scale: size of this photograph over that in whose pixels ``motion``
@@ -94,19 +94,19 @@ def fields_of(
         radius,
         reach,
     )
-    return Fields(offset, sweep, radius, float(reach.max()))
+    return DisplacementFields(offset, sweep, radius, float(reach.max()))
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
     """B for one frame. ``margin``: pixels by which the image is larger than the photograph on every side."""
 
-    fields: Fields
+    fields: DisplacementFields
     margin: int
     samples: Floats
 
     @classmethod
-    def of(cls, fields: Fields, margin: int = 0) -> Warp:
+    def of(cls, fields: DisplacementFields, margin: int = 0) -> Warp:
         return cls(fields, margin, fields.samples())
 
     def forward(self, image: Floats) -> Floats:

@@ -26,7 +26,7 @@ COEFFICIENTS = "naturalness.toml"
 _TILE = 128  # the side of the patches that the quadratic was fitted on
 _SCALES = 2
 _WINDOW_SIGMA = 7.0 / 6.0  # as in BRISQUE
-_LEAST_CONTRAST = 1.0 / 255.0
+_STABILISER = 1.0 / 255.0  # keeps the division finite where there is no contrast
 _LIMIT = 4.0  # features beyond so many deviations are cut: a quadratic must not extrapolate
 _ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README.md``
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
@@ -111,7 +111,7 @@ def terms(
 def _scale_features(luma: Image) -> list[float]:
     mean = _blur(luma)
     contrast = np.sqrt(np.maximum(_blur(luma * luma) - mean * mean, 0.0))
-    mscn = ((luma - mean) / (contrast + _LEAST_CONTRAST)).astype(np.float64)
+    mscn = ((luma - mean) / (contrast + _STABILISER)).astype(np.float64)
     variance = float((mscn * mscn).mean()) + 1e-9
 
     def correlation(dy: int, dx: int) -> float:

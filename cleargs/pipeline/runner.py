@@ -210,7 +210,7 @@ class Runner:
         try:
             with noted(self.reporter, self.run.folder, name, work.folder) as reporter:
                 result = stage.run(replace(context, reporter=reporter))
-        except BaseException:  # an interruption too: what it had done counts when it goes on
+        except BaseException:  # an interruption too: what it had done counts when it resumes
             work.note_seconds(earlier + time.monotonic() - clock)
             raise
         seconds = earlier + time.monotonic() - clock

@@ -79,7 +79,7 @@ class Stage(Protocol):
     OUTPUTS: tuple[str, ...]
     """Files and folders that exist when the stage is done."""
     LEFTOVERS: tuple[str, ...]
-    """Patterns of the files in ``out`` from which it goes on after a killed try (``*`` within one name).
+    """Patterns of the files in ``out`` from which it resumes after a killed try (``*`` within one name).
     Whatever else such a try left there is thrown away."""
     LIBRARIES: tuple[str, ...]
     """Distributions whose version changes results; their versions enter the key."""

@@ -3,7 +3,7 @@
 ::
 
     STORE/<stage>/<key>/                      finished: every output and manifest.json; never written again
-    STORE/work/<key>@<writer>/{out,checkpoints}/  unfinished: survives kill -9, the next try goes on from it
+    STORE/work/<key>@<writer>/{out,checkpoints}/  unfinished: survives kill -9, the next try resumes from it
     STORE/leases/<writer>.json                who that writer is, with a heartbeat
     STORE/kept/<stage>/                       findings about single items, by digest; safe to delete
     STORE/locks/  STORE/roots/  STORE/digests.sqlite
@@ -216,10 +216,10 @@ class Store:
                 folder.rename(folder.with_name(f"{folder.name.partition('@')[0]}@left"))
 
     def open_work(self, key: str, *, fresh: bool, entry: Entry | None, leftovers: Sequence[str] = ()) -> Work:
-        """The work folder of ``key``, ready to go on: of the outputs that dead writers left, only those stay
+        """The work folder of ``key``, ready to resume: of the outputs that dead writers left, only those stay
         that match one of the patterns ``leftovers``.
 
-        A forced rebuild (``fresh``) has a folder of its own, which goes on only from an interrupted forced
+        A forced rebuild (``fresh``) has a folder of its own, which resumes only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
         """
         work = Work(self._claim(f"{key}.forced" if fresh else key))

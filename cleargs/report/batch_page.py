@@ -31,7 +31,7 @@ BYTES = 15_000_000
 ORDER = ("failed", "partial", "running", "waiting", "done")
 """Of the scenes: what needs a look comes first."""
 
-_SIDE, _LEAST = 480, 96  # px, of a thumbnail
+_MAX_SIDE, _MIN_SIDE = 480, 96  # px, of a thumbnail
 _FOLDER = "scenes"
 _ASPECT = 9 / 16  # of most captures
 
@@ -66,7 +66,7 @@ def write_batch(folder: BatchFolder, plan: Plan, states: Sequence[SceneState]) -
     Raises StoreError when it cannot be written.
     """
     ordered = sorted(states, key=lambda state: ORDER.index(state.state))
-    side = min(_SIDE, side_of(len(states), _ASPECT, BYTES, _LEAST))
+    side = min(_MAX_SIDE, side_of(len(states), _ASPECT, BYTES, _MIN_SIDE))
     kinds: Counter[str] = Counter(state.state for state in states)
     with new_report(folder.root) as report:
         (report / _FOLDER).mkdir()

@@ -15,7 +15,7 @@ from cleargs.capture.tables import load_frames
 from cleargs.evaluate.cells import Cell, Cells, ViewSet
 from cleargs.evaluate.compared import Compared
 from cleargs.evaluate.comparison import Made, view_sets
-from cleargs.evaluate.losses import compared_with, losses_of, losses_table
+from cleargs.evaluate.gaps import compared_with, losses_of, losses_table
 from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.evaluate.results import Evaluation
 from cleargs.evaluate.tables import (

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cleargs.capture.tables import Frame, load_frames
-from cleargs.formation.colour import Exposure, read_exposure
+from cleargs.formation.exposure import Exposure, read_exposure
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 from cleargs.tables import read_table

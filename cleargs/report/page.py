@@ -9,7 +9,7 @@ from typing import Any
 
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.pipeline.freshness import stale_stages
 from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan

@@ -9,7 +9,7 @@ from importlib.resources import files
 
 from cleargs.evaluate.cells import Cells, ViewSet
 from cleargs.evaluate.evidence import Outcome, Section
-from cleargs.evaluate.losses import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
+from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
 from cleargs.evaluate.tables import (
     COMPARED,
     NAMES,

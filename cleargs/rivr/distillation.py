@@ -12,7 +12,7 @@ import torch
 
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
-from cleargs.formation.colour import Exposure, apply_affine, read_exposure, write_exposure
+from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
 from cleargs.formation.photograph import photograph
 from cleargs.formation.table import read_formation, write_formation
@@ -146,7 +146,7 @@ class Snapshot:
 
         repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
         go to the raw frames: drawn as often as all of them, a few repairs would drown these.
-        A training that is done already is read back; one that was cut off goes on from its checkpoint, which
+        A training that is done already is read back; one that was cut off resumes from its checkpoint, which
         is deleted in the end.
         """
         folder.mkdir(parents=True, exist_ok=True)

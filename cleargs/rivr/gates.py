@@ -32,7 +32,7 @@ _AT_REST = 0.8  # see `_lengths`
 Array = NDArray[np.float64]
 
 
-def objection(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:
+def rejection_reason(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:
     """Why ``repair`` [H, W, 3] of a frame must not become supervision; None when it may.
 
     Masked pixels must be the same in all three images (`selection.hide_masked`).
@@ -68,9 +68,9 @@ def shifts(repair: Image, observed: Image, render: Image) -> Array:
         lengths = np.zeros(len(row[0]))
         textured = row[0].std(axis=(1, 2)) > _FLAT
         if textured.any():
-            spectra, *witnesses = (_spectra(blocks[textured]) for blocks in row)
+            spectra, *references = (_spectra(blocks[textured]) for blocks in row)
             side = row[0].shape[1]
-            lengths[textured] = np.minimum(*(_lengths(spectra * other.conj(), side) for other in witnesses))
+            lengths[textured] = np.minimum(*(_lengths(spectra * other.conj(), side) for other in references))
         found.append(lengths)
     return np.stack(found)
 
@@ -78,8 +78,8 @@ def shifts(repair: Image, observed: Image, render: Image) -> Array:
 def colour_differences(repair: Image, observed: Image, render: Image) -> Array:
     """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
     farthest, in sRGB [rows, columns]."""
-    means, *witnesses = (_block_means(image) for image in (repair, observed, render))
-    nearer: Array = np.minimum(*(np.abs(means - other).max(axis=2) for other in witnesses))
+    means, *references = (_block_means(image) for image in (repair, observed, render))
+    nearer: Array = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
     return nearer
 
 

@@ -24,7 +24,7 @@ class Group:
 
     targets: Sequence[View]
     steps: int
-    """That distil what was accepted so far, after its frames."""
+    """Steps of the distillation of what was accepted so far, after its frames."""
 
 
 def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> list[Group]:

@@ -13,7 +13,7 @@ class Fidelity:
     """How well a scene explains the frames that were held back from repair."""
 
     psnr: tuple[float, ...]
-    """Of each frame's render, with the frame's motion, against its raw observation, dB."""
+    """PSNR of each frame's render, with the frame's motion, against its raw observation, dB."""
     score: tuple[float, ...]
     """Primary score of each render, 0-100, higher is better."""
 
@@ -31,7 +31,7 @@ class Verdict:
     """Whether a distilled scene may be published, with the figures that decided."""
 
     frames: tuple[int, ...]
-    """Those held back; without any nothing is judged."""
+    """The frames held back; without any, nothing is judged."""
     psnr_before: float | None
     psnr_after: float | None
     score_before: float | None

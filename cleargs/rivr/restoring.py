@@ -34,7 +34,7 @@ class Explained:
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
-    """With which the frame taught at the end: RVA's, or what it has earned by being explained."""
+    """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Restoration:
     image: Image
     source: Source
     deblurred: Deblurred | None = None
-    """Where that is the source."""
+    """The raw frame without its motion, where that is the source."""
 
 
 class Restorations:

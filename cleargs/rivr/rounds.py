@@ -1,7 +1,7 @@
 """One round of RIVR: the candidates of every target frame, scored, one of them chosen, recorded in an EXR.
 
 The EXR is the record of a frame: it holds the candidates and, as attributes, its row of the selection table.
-It appears whole or not at all, so a round that was cut off goes on at the first frame without one.
+It appears whole or not at all, so a round that was cut off resumes at the first frame without one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, Image, fuse
 from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import REFUSED, all_masked, objection
+from cleargs.rivr.gates import REFUSED, all_masked, rejection_reason
 from cleargs.rivr.restoring import Explained, Restoration, observation
 from cleargs.rivr.results import chosen_counts
 from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
@@ -29,7 +29,7 @@ from cleargs.rivr.tables import SELECTION, Selection
 from cleargs.splat.views import Mask, View
 
 PREFIX = "cleargs:"
-"""Of the attributes in the EXR."""
+"""How the names of the attributes in the EXR begin."""
 
 _NULLABLE = tuple(field.name for field in SELECTION if field.nullable)
 
@@ -41,7 +41,7 @@ Explainer = Callable[[View], Explained | None]
 """What the training found of a raw frame's camera."""
 
 TRUSTED = 0.5
-"""Weight from which a frame that the formation explains goes on teaching by itself instead of by a repair."""
+"""Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
 EXPLAINED = "explained: "
 """How the reason of such a frame begins."""
 
@@ -104,7 +104,7 @@ def repair(
     """Make, score and choose the candidates of one frame.
 
     All work is on the images as the EXR will give them back (half floats, scene-linear), so that
-    whoever goes on from the file sees what was scored.
+    whoever resumes from the file sees what was scored.
     """
     observed, mask = observation(view)
     layers = {"render": to_layer(rendered), "restored": to_layer(restoration.image)}
@@ -134,7 +134,7 @@ def repair(
             and hardly_changes(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
-    refused = objection(shown["restored"], observed, shown["render"], rules.gate)
+    refused = rejection_reason(shown["restored"], observed, shown["render"], rules.gate)
     choice = (
         choose(primary, tiebreak, rules.margin)
         if refused is None

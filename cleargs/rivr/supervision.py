@@ -66,5 +66,7 @@ def load_supervision(ingest: Path, rva: Path, held_back: float) -> Supervision:
     views = {a.frame_id: view_of(frames[a.frame_id], ingest, weights[a.frame_id]) for a in appraisals}
     judges = held_back_frames(appraisals, held_back)
     if held_back > 0.0 and not judges:
-        raise StageError("no frame is reliable and none stands in", hint="run rva again with --force rva")
+        raise StageError(
+            "no frame is reliable, and no frame takes the place of one", hint="run rva again with --force rva"
+        )
     return Supervision(views, appraisals, judges)

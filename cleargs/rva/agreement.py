@@ -15,7 +15,7 @@ from cleargs.rva.tables import CUE_COLUMNS
 
 
 @dataclass(frozen=True)
-class Judgement:
+class EvaluatorCues:
     """What one evaluator says of n frames."""
 
     evaluator: str
@@ -25,7 +25,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A frame on which two evaluators part."""
+    """A frame about which two evaluators disagree."""
 
     row: int
     gap: float
@@ -70,15 +70,15 @@ class Agreement:
         }
 
 
-def compare(first: Judgement, second: Judgement, config: RvaConfig, *, most: int) -> Agreement:
-    """Rank agreement of two evaluators and the ``most`` frames on which they part furthest.
+def compare(first: EvaluatorCues, second: EvaluatorCues, config: RvaConfig, *, most: int) -> Agreement:
+    """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.
     """
     rows = np.flatnonzero(~np.isnan(first.cues).any(axis=1) & ~np.isnan(second.cues).any(axis=1))
     sides = []
-    for judgement in (first, second):
-        cues = judgement.cues[rows]
+    for given in (first, second):
+        cues = given.cues[rows]
         R, B = appearance_scores(cues, config)
         sides.append(np.column_stack([R, B, R - B, cues]))
     a, b = sides

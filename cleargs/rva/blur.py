@@ -23,7 +23,7 @@ length.
 """
 FINE, COARSE = 1.0, 3.0
 """Standard deviations, px, of the two scales. Finer is noise; coarser mixes neighbouring edges."""
-LARGEST_EXTENT = 6.0
+MAX_EXTENT = 6.0
 """Extents, px, beyond which the ratio of the two scales says nothing more."""
 
 TILE = 40
@@ -31,8 +31,8 @@ TILE = 40
 pixels at once the parts of strongest contrast would speak for the whole."""
 
 _NOISE_GAIN = 0.2  # standard deviation of a derivative at sigma = 1 over that of white noise: 1 / sqrt(8 pi)
-_LEAST_ENERGY = 1.0  # squared levels a pixel, at the coarse scale: a tile with less has no structure
-_LEAST_SHARE = 0.25  # of a tile's pixels; with fewer in view it is not measured
+_MIN_ENERGY = 1.0  # squared levels a pixel, at the coarse scale: a tile with less has no structure
+_MIN_VISIBLE_SHARE = 0.25  # of a tile's pixels; with fewer in view it is not measured
 _MARGIN = 13  # px: the support of the coarse scale, four deviations and the difference
 
 
@@ -50,7 +50,7 @@ def detail_ratios(luminance: Plane, valid: Mask, noise: float) -> Floats:  # [h,
     inner = away_from_masked(valid, _MARGIN)
     share = _tile_means(inner.astype(np.float32))
     fine, coarse = (_directional_energy(luminance, inner, share, noise, sigma) for sigma in (FINE, COARSE))
-    measured = (share > _LEAST_SHARE)[:, None] & (coarse > _LEAST_ENERGY)
+    measured = (share > _MIN_VISIBLE_SHARE)[:, None] & (coarse > _MIN_ENERGY)
     ratio = np.clip(fine / np.where(measured, coarse, 1.0), 1.0, (COARSE / FINE) ** 2)
     counts = np.count_nonzero(measured, axis=0)
     return np.where(counts > 0, np.sum(ratio, axis=0, where=measured) / np.maximum(counts, 1), 0.0)
@@ -62,7 +62,9 @@ def _directional_energy(
     """u' T(sigma) u of each tile, in squared levels a pixel."""
     smooth = cv2.GaussianBlur(luminance, (0, 0), sigma)
     x, y = (0.5 * cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=1) * inner for dx in (1, 0))
-    xx, xy, yy = (_tile_means(a * b) / np.maximum(share, _LEAST_SHARE) for a, b in ((x, x), (x, y), (y, y)))
+    xx, xy, yy = (
+        _tile_means(a * b) / np.maximum(share, _MIN_VISIBLE_SHARE) for a, b in ((x, x), (x, y), (y, y))
+    )
     white = (_NOISE_GAIN * noise / sigma**2) ** 2
     angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     cos, sin = np.cos(angle), np.sin(angle)
@@ -80,10 +82,10 @@ def _tile_means(plane: Plane) -> Floats:  # [h, w] -> [tiles]
 def extents_from_ratios(
     ratio: Floats,  # [...] as `detail_ratios`
     content: Floats,  # [...] > 1: what sharp views of the same content have
-) -> Floats:  # [...] px, in [0, LARGEST_EXTENT]
+) -> Floats:  # [...] px, in [0, MAX_EXTENT]
     """Standard deviation s of the blur: solves ratio = ((COARSE^2 + s^2) / (FINE^2 + s^2))^p with the p that
     ``content`` has at s = 0."""
     p = np.log(content) / np.log(COARSE**2 / FINE**2)
     quotient = np.maximum(ratio, 1.0) ** (1.0 / p)
     square = (COARSE**2 - quotient * FINE**2) / np.maximum(quotient - 1.0, 1e-6)
-    return np.asarray(np.sqrt(np.clip(square, 0.0, LARGEST_EXTENT**2)))
+    return np.asarray(np.sqrt(np.clip(square, 0.0, MAX_EXTENT**2)))

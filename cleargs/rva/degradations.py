@@ -14,7 +14,7 @@ _MAD_TO_SIGMA = 1.4826
 _BLOCK = 8  # px: JPEG and most video codecs transform blocks of 8
 _DARK, _BRIGHT = 4.0, 251.0  # levels at and beyond which an sRGB luma counts as clipped
 _STRONG_EDGE = 200.0  # Sobel response, levels of 255: a step of 50
-_LEAST_PIXELS = 200  # fewer do not make a quantile
+_MIN_PIXELS = 200  # fewer do not make a quantile
 _TILE = 256  # px
 _NEAREST_LAG = 5  # px: nearer, content hides the peak of a double image
 
@@ -70,7 +70,7 @@ def ringing(luminance: Plane, valid: Mask, noise: float) -> float:
     strong = (cv2.magnitude(x, y) > _STRONG_EDGE).astype(np.uint8)
     near, far = (cv2.dilate(strong, np.ones((2 * r + 1, 2 * r + 1), dtype=np.uint8)) for r in (2, 5))
     band = (far > 0) & (near == 0) & away_from_masked(valid, 6)
-    if np.count_nonzero(band) < _LEAST_PIXELS:
+    if np.count_nonzero(band) < _MIN_PIXELS:
         return 0.0
     response = np.abs(cv2.filter2D(luminance, cv2.CV_32F, _LAPLACIAN_DIFFERENCE)) / 6.0
     # For white noise the lower quartile of |x| is 0.319 standard deviations.

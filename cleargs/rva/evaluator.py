@@ -13,12 +13,12 @@ from cleargs.rva.config import EVALUATORS, RvaConfig
 from cleargs.rva.scores import Floats
 
 if TYPE_CHECKING:
-    from cleargs.rva.vlm.judge import Judge
+    from cleargs.rva.vlm.picture_scorer import PictureScorer
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame as an evaluator meets it: files, so that nobody has to hold a video in memory."""
+    """A frame as an evaluator gets it: files, so that nobody has to hold a video in memory."""
 
     frame_id: int
     image: Path
@@ -94,13 +94,13 @@ def make_evaluator(
 
     if cache is None:
         raise ValueError("qwen3-vl needs a cache folder")
-    judge: Judge
+    scorer: PictureScorer
     if config.qwen.model_dir:
-        from cleargs.rva.vlm.local import LocalJudge  # loads torch
+        from cleargs.rva.vlm.local import LocalPictureScorer  # loads torch
 
-        judge = LocalJudge(config.qwen, device=device)
+        scorer = LocalPictureScorer(config.qwen, device=device)
     else:
-        from cleargs.rva.vlm.server import ServerJudge
+        from cleargs.rva.vlm.server import ServerPictureScorer
 
-        judge = ServerJudge(config.qwen, seed=seed)
-    return QwenEvaluator(judge, image_size=config.qwen.image_size, cache=cache)
+        scorer = ServerPictureScorer(config.qwen, seed=seed)
+    return QwenEvaluator(scorer, image_size=config.qwen.image_size, cache=cache)

@@ -20,7 +20,7 @@ from cleargs.rva import degradations
 from cleargs.rva.blur import DIRECTIONS, detail_ratios, extents_from_ratios
 from cleargs.rva.calibration import Calibration, decay, ramp
 from cleargs.rva.evaluator import View
-from cleargs.rva.kept import KeptRows, view_digest
+from cleargs.rva.item_cache import ItemCache, view_digest
 from cleargs.rva.luminance import Luminance, load_luminance
 from cleargs.rva.scores import Floats
 
@@ -75,7 +75,7 @@ class StatisticsEvaluator:
 
     def __init__(self, cache: Path | None = None) -> None:
         """``cache`` is a folder in which the measures of single frames are kept."""
-        self._kept = KeptRows(cache, MEASURE_COLUMNS) if cache else None
+        self._cache = ItemCache(cache, MEASURE_COLUMNS) if cache else None
 
     def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
         """See `Evaluator.evaluate`. Raises StoreError when an image cannot be read."""
@@ -89,13 +89,13 @@ class StatisticsEvaluator:
         return cues_from_measures(as_measures(np.stack(rows)), Calibration())
 
     def _measure(self, view: View) -> Floats:
-        if self._kept is None:
+        if self._cache is None:
             return measure(load_luminance(view))
         digest = view_digest([self.name, self.version, cv2.__version__], view)
-        row = self._kept.find(digest)
+        row = self._cache.find(digest)
         if row is None:
             row = measure(load_luminance(view))
-            self._kept.add(digest, row)
+            self._cache.add(digest, row)
         return row
 
 

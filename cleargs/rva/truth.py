@@ -9,11 +9,11 @@ import numpy as np
 from cleargs.rva.agreement import spearman
 from cleargs.rva.scores import Bools, Floats
 
-LEAST_BLUR = 1.0
+MIN_BLUR_PX = 1.0
 """px: a shorter motion is no fault, and all such frames are equal."""
-LEAST_STOPS = 0.25
+MIN_EXPOSURE_ERROR_EV = 0.25
 """Smaller exposure errors are no fault: automatic exposure drifts by as much."""
-LEAST_RADIUS = 0.1
+MIN_DEFOCUS_PX = 0.1
 """px, of the disc of defocus."""
 
 
@@ -29,9 +29,9 @@ class Faults:
         """The same with 0 for what is too small to be a fault, and exposure errors without sign."""
         stops = np.abs(self.exposure_ev)
         return Faults(
-            np.where(self.blur_px < LEAST_BLUR, 0.0, self.blur_px),
-            np.where(self.defocus_px < LEAST_RADIUS, 0.0, self.defocus_px),
-            np.where(stops < LEAST_STOPS, 0.0, stops),
+            np.where(self.blur_px < MIN_BLUR_PX, 0.0, self.blur_px),
+            np.where(self.defocus_px < MIN_DEFOCUS_PX, 0.0, self.defocus_px),
+            np.where(stops < MIN_EXPOSURE_ERROR_EV, 0.0, stops),
         )
 
 

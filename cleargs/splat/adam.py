@@ -1,11 +1,48 @@
-"""Adam (Kingma and Ba 2015) in place, one fused kernel per parameter."""
+"""Adam (Kingma and Ba 2015) in place, one fused kernel per parameter: its moments, and its steps."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import torch
 from torch import Tensor
 
 from cleargs.errors import InputError
 from cleargs.splat.backend import backend_for
+from cleargs.splat.gaussians import Gaussians
+
+
+@dataclass
+class Moments:
+    """Adam's running means of the gradients and of their squares, by parameter name."""
+
+    first: dict[str, Tensor]
+    second: dict[str, Tensor]
+
+    @classmethod
+    def zeros(cls, gaussians: Gaussians) -> Moments:
+        """Fresh moments for these parameters."""
+        tensors = gaussians.tensors()
+        return cls(
+            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
+            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
+        )
+
+
+def step_gaussians(
+    gaussians: Gaussians,
+    gradients: Gaussians,
+    moments: Moments,
+    rates: dict[str, float | Tensor],
+    *,
+    step: int,
+) -> None:
+    """One Adam step of every group in place; ``step`` counts from 1 (bias correction)."""
+    slopes = gradients.tensors()
+    for name, parameter in gaussians.tensors().items():
+        adam_step(
+            parameter, slopes[name], moments.first[name], moments.second[name], step=step, lr=rates[name]
+        )
 
 
 def adam_step(

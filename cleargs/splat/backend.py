@@ -15,9 +15,9 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 
 if TYPE_CHECKING:
+    from cleargs.splat.adam import Moments
     from cleargs.splat.kernels.cuda.loss import Meter
     from cleargs.splat.losses import PhotometricLoss
-    from cleargs.splat.optimiser import Moments
 
 
 class Rasteriser(Protocol):
@@ -48,8 +48,8 @@ class Rasteriser(Protocol):
 class Backend(Protocol):
     """The kernels of one kind of device; `cleargs.splat.kernels.cpu.backend` and ``cuda.backend`` are two.
 
-    What is called like a function of `cleargs.splat.losses`, ``adam`` or `cleargs.formation.colour` does what
-    that function says. All sums run in a fixed order. Tensors lie on the device.
+    What is called like a function of `cleargs.splat.losses`, ``adam`` or `cleargs.formation.exposure` does
+    what that function says. All sums run in a fixed order. Tensors lie on the device.
     """
 
     def rasteriser(self, device: torch.device) -> Rasteriser:

@@ -23,8 +23,12 @@ class FormationConfig(BaseModel):
         description="compare raw frames with the render as their camera saw it: blurred by its motion, "
         "skewed by its rolling shutter, out of focus",
     )
-    start: float = Field(0.25, ge=0, le=1, description="share of the steps before frames are first asked")
-    every: int = Field(10, ge=1, description="a frame is asked again after so many steps on it")
+    start: float = Field(
+        0.25, ge=0, le=1, description="share of the steps before formations are first estimated"
+    )
+    every: int = Field(
+        10, ge=1, description="a frame's formation is estimated again after so many steps on it"
+    )
     accept: float = Field(
         0.02, ge=0, le=1, description="share of a frame's misfit that a model must explain to be taken"
     )
@@ -102,7 +106,7 @@ class TrainConfig(BaseModel):
         le=20_000_000,
         description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
     )
-    most: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
+    max_budget: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
     growth: float = Field(
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
     )
@@ -165,7 +169,7 @@ class TrainConfig(BaseModel):
     )
 
     share_of_steps: ClassVar[float] = 1.0
-    """Of a first scene's, where ``steps`` is unset."""
+    """Share of a first scene's steps that it takes where ``steps`` is unset."""
 
     def steps_for(self, frames: int) -> int:
         """Steps of a training of so many active frames."""
@@ -173,9 +177,9 @@ class TrainConfig(BaseModel):
 
     @property
     def length(self) -> int:
-        """The steps; raises ValueError while they are open (`cleargs.splat.effort.decided`)."""
+        """The steps; raises ValueError while they are not decided (`cleargs.splat.effort.decided`)."""
         if self.steps is None:
-            raise ValueError("the steps of this training are still open")
+            raise ValueError("the steps of this training are not decided yet")
         return self.steps
 
     @property

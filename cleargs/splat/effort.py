@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 Quality = Literal["draft", "standard", "high"]
 
 STEPS_A_FRAME = 50
-LEAST_STEPS, MOST_STEPS = 3200, 7200
+MIN_STEPS, MAX_STEPS = 3200, 7200
 STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
 
 PIXELS_A_GAUSSIAN = 160
-LEAST_BUDGET = 40_000
+MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
 # Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
@@ -32,22 +32,22 @@ Settings = TypeVar("Settings", bound="TrainConfig")
 
 def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
     """Steps of the first scene of a capture with so many active frames."""
-    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, LEAST_STEPS), MOST_STEPS))
+    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
 
 
-def budget_from_pixels(pixels: int, most: int, quality: Quality = "standard") -> int:
-    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all; never over ``most``.
+def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
+    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all, up to ``max_budget``.
 
     One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames), and
     40,000 at least: fewer cost a small capture a dB.
     """
-    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, LEAST_BUDGET)), most)
+    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), max_budget)
 
 
 def training_cost(config: TrainConfig, frames: int, megapixels: float) -> tuple[float, float]:
     """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames."""
     pixels = round(frames * megapixels * 1e6)
-    gaussians = config.budget or budget_from_pixels(pixels, config.most, config.quality)
+    gaussians = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
     seen = megapixels * (config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share)
     step = STEP_S + STEP_S_PER_MEGAPIXEL * seen + STEP_S_PER_GAUSSIAN * gaussians
     return config.steps_for(frames) * step, 1.5e-6 * gaussians
@@ -64,6 +64,6 @@ def decided(config: Settings, views: Sequence[View]) -> Settings:
     return config.model_copy(
         update={
             "steps": config.steps_for(len(views)),
-            "budget": config.budget or budget_from_pixels(pixels, config.most, config.quality),
+            "budget": config.budget or budget_from_pixels(pixels, config.max_budget, config.quality),
         }
     )

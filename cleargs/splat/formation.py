@@ -19,10 +19,10 @@ class Formed(Protocol):
     """What the camera of one view makes of a sharp render."""
 
     camera: Camera
-    """To render: the view's, or a larger one where the view shows what moved in from beyond its border."""
+    """The camera to render: the view's, or a larger one where it shows what moved in from outside."""
     needs_depth: bool
     weight: float
-    """Of the view: its own, or what it has earned by being explained."""
+    """The weight of the view: its own, or what it has earned by being explained."""
 
     def forward(self, render: Render) -> Tensor:
         """The photograph [H, W, 3] sRGB."""
@@ -55,7 +55,7 @@ class Formation(Protocol):
         ...
 
     def digest(self) -> str:
-        """Of all that it starts from."""
+        """A digest of all that it starts from."""
         ...
 
     def state(self) -> dict[str, Tensor]:
@@ -63,9 +63,9 @@ class Formation(Protocol):
         ...
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         ...
 
     def fault(self) -> str | None:
-        """What of it is not finite."""
+        """What in it is not finite; None where all is."""
         ...

@@ -38,7 +38,7 @@ class Format:
     axes: tuple[float, float, float]
     """Signs of our axes in the file: half a turn, or none."""
     y_up: bool = False
-    """Whether the format's own text leaves no other up."""
+    """Whether the format allows no other up axis than y."""
 
 
 FORMATS: Mapping[str, Format] = {

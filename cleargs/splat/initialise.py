@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cleargs.random_streams import Stream
 from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
@@ -20,12 +21,6 @@ NEIGHBOURS = 3
 
 DEPTH_JITTER = 0.05
 """Standard deviation of the log depth of added points around their neighbours' depth."""
-
-ADDED_POINTS = 100
-"""Purpose of the random numbers of added points; the trainer's purposes are below it."""
-
-FEWER_POINTS = 101
-"""Purpose of the random numbers by which points are left out."""
 
 BLIND_DEPTHS = (0.5, 5.0)
 """Depths between which points are added where a view sees no sparse point; the cameras span a radius of 1."""
@@ -117,7 +112,7 @@ def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init
 
 def fewer_points(sparse: SparsePoints, count: int, *, seed: int) -> SparsePoints:
     """``count`` of the points, drawn at random, in their order."""
-    rng = np.random.default_rng([seed, FEWER_POINTS])
+    rng = np.random.default_rng([seed, Stream.LEFT_OUT_POINTS])
     kept = np.sort(rng.permutation(len(sparse.xyz))[:count])
     place = np.full(len(sparse.xyz), -1)
     place[kept] = np.arange(count)
@@ -137,7 +132,7 @@ def add_points(sparse: SparsePoints, views: Sequence[View], count: int, *, seed:
     xyz, rgb = [sparse.xyz], [sparse.rgb]
     for view, seen, share in zip(views, sparse.observed, shares, strict=True):
         if share:
-            rng = np.random.default_rng([seed, ADDED_POINTS, view.frame_id])
+            rng = np.random.default_rng([seed, Stream.ADDED_POINTS, view.frame_id])
             added, colours = _points_of_view(view, sparse.xyz[seen], int(share), rng)
             xyz.append(added)
             rgb.append(colours)

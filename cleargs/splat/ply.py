@@ -20,7 +20,7 @@ from cleargs.untrusted import FAULTS, cause, open_regular
 
 _ANTIALIAS = "cleargs antialias"
 _BACKGROUND = "cleargs background"
-_LONGEST_LINE = 4096
+_MAX_LINE_BYTES = 4096
 """Most bytes of a line of the header."""
 
 
@@ -115,7 +115,7 @@ def _properties(coefficients: int) -> list[str]:
 def _read_header(file: BinaryIO) -> tuple[int, list[str], dict[str, str]]:
     """Number of vertices, property names, and ClearGS's comments; leaves ``file`` at the first vertex."""
     lines: list[list[str]] = []
-    while (line := file.readline(_LONGEST_LINE)) not in (b"end_header\n", b"end_header\r\n"):
+    while (line := file.readline(_MAX_LINE_BYTES)) not in (b"end_header\n", b"end_header\r\n"):
         if not line.endswith(b"\n") or len(lines) > 1000:
             raise ValueError("the header does not end")
         if words := line.decode("ascii").split():

@@ -68,7 +68,7 @@ class TrainLog:
         return torch.from_numpy(self._rows[:done].view(np.uint8).copy())
 
     def restore(self, packed: Tensor) -> None:
-        """Go on from what `packed` gave."""
+        """Resume from what `packed` gave."""
         rows = packed.numpy().view(_ROW)
         self._rows[: len(rows)] = rows
 

@@ -1,7 +1,7 @@
 """Optimise a scene against weighted views: the one loop that G0, RIVR and the consolidation share.
 
 No torch autograd: engine forward -> loss and its gradient -> engine backward -> Adam -> densification. All
-randomness is drawn afresh from (seed, purpose, step), so that a resumed training is the same training.
+randomness is drawn afresh from (seed, stream, step), so that a resumed training is the same training.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Reporter, Task
+from cleargs.random_streams import Stream
+from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
@@ -31,16 +33,13 @@ from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.losses import photometric_loss, psnr
-from cleargs.splat.optimiser import Moments, Rates, step_gaussians
 from cleargs.splat.preview import preview_camera, write_preview
+from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.strategy import make_strategy
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
-
-_REAL, _PSEUDO = range(2)
-"""Purposes of random numbers; the next two are those of densification."""
 
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
@@ -78,8 +77,8 @@ def train(
     """Train ``scene`` on ``views`` with fresh Adam moments, for as many steps as ``config`` says.
 
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
-    otherwise with what the formation makes of it, which goes on learning in place. A share ``pseudo_share``
-    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Goes on from
+    otherwise with what the formation makes of it, which keeps learning in place. A share ``pseudo_share``
+    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Resumes from
     ``checkpoint`` where there is one, to the same result bit for bit. Beside each checkpoint lies a preview.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
@@ -100,7 +99,7 @@ def train(
         reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
     elif saved is not None:
         trainer.restore(saved)
-        reporter.info(f"{label}: going on from step {trainer.done} of {trainer.length}")
+        reporter.info(f"{label}: resuming from step {trainer.done} of {trainer.length}")
     with support.memory_errors(), reporter.task(label, total=trainer.length) as task:
         progress = _Progress(task, trainer)
         while trainer.done < trainer.length:
@@ -224,7 +223,7 @@ class Trainer:
             raise self._stopped(fault)
 
     def state(self) -> dict[str, Tensor]:
-        """All that a training needs to go on: parameters, moments, affines, step and the log so far."""
+        """All that a training needs to resume: parameters, moments, affines, step and the log so far."""
         self._read_meter()
         state = {
             "fingerprint": self._fingerprint,
@@ -244,7 +243,7 @@ class Trainer:
         return "fingerprint" in state and torch.equal(state["fingerprint"], self._fingerprint)
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned, in a training with the same arguments."""
+        """Resume from what `state` returned, in a training with the same arguments."""
 
         def group(prefix: str) -> dict[str, Tensor]:
             return {
@@ -268,11 +267,11 @@ class Trainer:
         """The view of a step: pseudo ones spread evenly at their share, both in shuffled epochs."""
         before = math.floor(step * self._share)
         if math.floor((step + 1) * self._share) > before:
-            views, purpose, count = self._pseudo, _PSEUDO, before
+            views, stream, count = self._pseudo, Stream.PSEUDO_VIEWS, before
         else:
-            views, purpose, count = self._real, _REAL, step - before
+            views, stream, count = self._real, Stream.REAL_VIEWS, step - before
         epoch, position = divmod(count, len(views))
-        order = self._rng(purpose, epoch).permutation(len(views))
+        order = self._rng(stream, epoch).permutation(len(views))
         return views[int(order[position])]
 
     def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
@@ -340,8 +339,8 @@ class Trainer:
             self._slopes[size] = torch.empty_like(target)
         return self._slopes[size]
 
-    def _rng(self, purpose: int, count: int) -> np.random.Generator:
-        return np.random.default_rng([*self._seed, purpose, count])
+    def _rng(self, stream: Stream, count: int) -> np.random.Generator:
+        return np.random.default_rng([*self._seed, stream, count])
 
     def _stopped(self, fault: str) -> StageError:
         return StageError(

@@ -16,6 +16,7 @@ from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.encode import require_even, write_video
 from cleargs.progress import Reporter
+from cleargs.random_streams import Stream
 from cleargs.synth.course import Course, orbit
 from cleargs.synth.motion import FrameMotion, follow
 from cleargs.synth.path import FPS, frame_times, make_path
@@ -123,7 +124,7 @@ def make_capture(
         if film is not None:
             (out / "truth" / "moving").mkdir()
         for number, (motion, fault, depth_means) in enumerate(zip(motions, faults, depths, strict=True)):
-            rng = np.random.default_rng([seed, 15, number])
+            rng = np.random.default_rng([seed, Stream.EXPOSURES, number])
             light, seen = _expose(setting, film, motion, fault, depth_means, rng)
             shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             seen_shares.append(float((seen > 0).mean()))
@@ -238,7 +239,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _novel_poses(course: Course, count: int, seed: int) -> Array:
-    rng = np.random.default_rng([seed, 14])
+    rng = np.random.default_rng([seed, Stream.NOVEL_POSES])
     return np.stack([course.novel((number + 0.5) / count, rng) for number in range(count)])
 
 

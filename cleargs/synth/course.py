@@ -13,10 +13,11 @@ import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from cleargs.errors import InputError
+from cleargs.random_streams import Stream
 from cleargs.synth.world import Array
 
 UP = np.array([0.0, 1.0, 0.0])
-DEGREES_A_FRAME, MOST_DEGREES = 4.0, 150.0
+DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
 SMOOTHING = 0.5
 """Weight of the curvature of a spline through cameras, which are one apart."""
 MIN_CAMERAS = 5
@@ -70,8 +71,8 @@ class Orbit:
 
 def orbit(focus: Array, frames: int, seed: int) -> Orbit:
     """A course on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
-    arc = np.radians(min(DEGREES_A_FRAME * frames, MOST_DEGREES))
-    return Orbit(focus, float(arc), np.random.default_rng([seed, 17]).uniform(0, 2 * np.pi, 2))
+    arc = np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES))
+    return Orbit(focus, float(arc), np.random.default_rng([seed, Stream.ORBIT]).uniform(0, 2 * np.pi, 2))
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class FrameMotion:
     lens: Lens
 
     def blur(self, exposure: float) -> float:
-        """Mean length in pixels of the points' ways in the image during ``exposure`` seconds."""
+        """Mean length in pixels of the points' paths in the image during ``exposure`` seconds."""
         return float(self._lengths(exposure).mean())
 
     def skew(self, readout: float) -> float:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cleargs.random_streams import Stream
 from cleargs.synth.course import Course
 from cleargs.synth.world import Array
 
@@ -27,7 +28,7 @@ SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
 FRAMES_A_STRETCH = 32
 STRETCH_SHARE = 0.375
-"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaken."""
+"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
 SHAKING = 12.0
 """How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
 STRETCH_EDGE = 1 / FPS
@@ -54,11 +55,11 @@ class Hand:
         share = (times[:, None] - self.swing_times) / SWING_SECONDS
         swings = share * np.exp((1 - share**2) / 2)
         if len(self.stretches):
-            shaken = self.shaken(times)[:, None]
-            tremor, swings = tremor * (1 + (SHAKING - 1) * shaken), swings * shaken
+            strength = self.shake_strength(times)[:, None]
+            tremor, swings = tremor * (1 + (SHAKING - 1) * strength), swings * strength
         return np.asarray(tremor + swings @ self.swing_turns, np.float64)
 
-    def shaken(self, times: Array) -> Array:  # [T] seconds
+    def shake_strength(self, times: Array) -> Array:  # [T] seconds
         """1 [T] within a stretch, 0 outside."""
         start, end = self.stretches.T
         inside = np.minimum(times[:, None] - start, end - times[:, None])
@@ -71,7 +72,7 @@ def make_hand(duration: float, seed: int, *, stretched: bool = False) -> Hand:
 
     ``stretched``: and that shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
     """
-    rng = np.random.default_rng([seed, 12])
+    rng = np.random.default_rng([seed, Stream.HAND])
     frequencies = np.geomspace(*TREMOR_HZ, 12)[:, None] * rng.uniform(0.92, 1.0, (12, 3))
     amplitudes = 1 / frequencies
     amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
@@ -86,7 +87,7 @@ def make_hand(duration: float, seed: int, *, stretched: bool = False) -> Hand:
 
 def _stretches(duration: float, seed: int) -> Array:
     count = max(1, round(duration * FPS / FRAMES_A_STRETCH))
-    free = np.random.default_rng([seed, 19]).uniform(0, 1 - STRETCH_SHARE, count)
+    free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
     starts = np.arange(count) + free
     return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
 
@@ -118,7 +119,7 @@ class HandheldPath:
 
 def make_path(course: Course, frames: int, seed: int, *, stretched: bool = False) -> HandheldPath:
     """The walk of ``seed`` along ``course`` that takes ``frames`` frames at `FPS`; see `make_hand`."""
-    rng = np.random.default_rng([seed, 16])
+    rng = np.random.default_rng([seed, Stream.WALK])
     duration, pauses = frames / FPS, max(1, round(frames / FRAMES_A_PAUSE))
     hand = make_hand(duration, seed, stretched=stretched)
     return HandheldPath(course, hand, duration, pauses, rng.uniform(0, 2 * np.pi))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cleargs.media.colour import LUMA
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, read_timeline
+from cleargs.random_streams import Stream
 from cleargs.synth.world import Array
 
 NOISE = 1.5 / 255
@@ -69,7 +70,7 @@ PLAIN = Look()
 
 def phone_look(seed: int) -> Look:
     """The look of a phone: contrast up to a third higher in the middle tones, visible sharpening."""
-    rng = np.random.default_rng([seed, 21])
+    rng = np.random.default_rng([seed, Stream.PHONE_LOOK])
     return Look(rng.uniform(3.0, 4.5), rng.uniform(0.4, 0.5), rng.uniform(0.4, 0.7))
 
 

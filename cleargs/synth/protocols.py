@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.random_streams import Stream
 from cleargs.synth import phone
 from cleargs.synth.motion import FrameMotion, duration_for
 from cleargs.synth.path import FPS
@@ -106,7 +107,7 @@ def plan(
     """The fault of each frame of a walk; ``luminances`` is what each frame's meter sees, in linear light."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
     if protocol.mixed:
-        return _mixed(motions, scale, np.random.default_rng([seed, 13]))
+        return _mixed(motions, scale, np.random.default_rng([seed, Stream.MIXED_FAULTS]))
     exposure = protocol.shutter / FPS or duration_for(
         protocol.blur * scale, lambda time: float(np.mean([motion.blur(time) for motion in motions]))
     )
@@ -163,7 +164,7 @@ def noisy_poses(
     """The poses that the user is given, ``depth`` being the mean depth of the capture in world units."""
     from scipy.spatial.transform import Rotation
 
-    rng = np.random.default_rng([seed, 18])
+    rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
     shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))
     rotations = poses[:, :, :3] @ Rotation.from_rotvec(turns).as_matrix()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.random_streams import Stream
 from cleargs.synth.textures import TextureSet, make_textures
 
 BOX, SPHERE, ROD = 0, 1, 2
@@ -81,7 +82,7 @@ def _primitive(
 
 def make_room(seed: int) -> Room:
     """The room of ``seed``: the same layout idea, other furniture, textures and light."""
-    rng = np.random.default_rng([seed, 11])
+    rng = np.random.default_rng([seed, Stream.ROOM])
     textures = make_textures(rng, SURFACES, PRINTS)
 
     def material() -> int:
@@ -139,7 +140,7 @@ def make_room(seed: int) -> Room:
 
 def make_balloon(room: Room, seed: int) -> Balloon:
     """The balloon of ``seed``: it crosses the view from side to side in two or three seconds."""
-    rng = np.random.default_rng([seed, 20])
+    rng = np.random.default_rng([seed, Stream.BALLOON])
     centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
     item = _primitive(SPHERE, centre, (0.11, 0, 0), SURFACES + int(rng.integers(PRINTS)), gloss=0.5)
     rates = 2 * np.pi / rng.uniform(4, 6, 3)

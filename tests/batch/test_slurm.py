@@ -267,7 +267,7 @@ def test_three_scenes_and_a_job_killed_amid_g0(tmp_path: Path, slurm: Slurm) -> 
     assert {name: state["state"] for name, state in scenes.items()} == dict.fromkeys(
         ("kitchen", "hall", "hall-short"), "done"
     )
-    assert "going on from step" in log.read_text()
+    assert "resuming from step" in log.read_text()
     made = {stage: len(list((folder.store / stage).iterdir())) for stage in STAGES}
     assert made == {"ingest": 2, "rva": 2, "g0": 2, "rivr": 2, "consolidate": 3}
     settings = SHEET.partition("[set]")[2].partition("[resources]")[0].split("\n")

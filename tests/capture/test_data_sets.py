@@ -149,7 +149,7 @@ def test_llff_beside_a_sparse_model(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "column", "value", "words"),
     [
-        (4, 0, np.nan, r"004\.png in poses_bounds\.npy is no finite camera"),
+        (4, 0, np.nan, r"004\.png in poses_bounds\.npy is not finite"),
         (4, 3, np.inf, r"004\.png"),
         (4, 14, 0.0, r"004\.png"),
         (4, 9, -5.0, r"004\.png"),

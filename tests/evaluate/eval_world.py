@@ -18,7 +18,7 @@ from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.capture.world import Similarity
 from cleargs.evaluate.evaluate import EvalOptions
-from cleargs.formation.colour import Exposure, write_exposure
+from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed

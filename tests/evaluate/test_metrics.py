@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.judges import load_judges
+from cleargs.evaluate.metric_set import load_metrics
 from cleargs.evaluate.metrics import psnr, ssim
 from cleargs.models.lpips import LpipsNetwork, weights_file
 
@@ -72,16 +72,16 @@ def test_nothing_left_by_the_mask() -> None:
 def test_what_is_not_installed_is_null_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path))
     options = EvalOptions()
-    judges = load_judges(options)
+    metrics = load_metrics(options)
     a, b = pair()
-    values = judges.measure(a, b, None)
+    values = metrics.measure(a, b, None)
     assert set(values) == set(options.metrics)
     for metric in ("lpips_alex", "lpips_vgg"):
-        assert values[metric] is None and "cleargs models install lpips" in judges.unavailable[metric]
+        assert values[metric] is None and "cleargs models install lpips" in metrics.unavailable[metric]
     # The two that ship with ClearGS are always there.
     for metric in ("clarity-net", "naturalness-stats"):
-        assert values[metric] is not None and len(judges.weights[metric]) == 64
-    assert set(judges.weights) | set(judges.unavailable) == set(options.metrics) - {"psnr", "ssim"}
+        assert values[metric] is not None and len(metrics.weights[metric]) == 64
+    assert set(metrics.weights) | set(metrics.unavailable) == set(options.metrics) - {"psnr", "ssim"}
 
 
 def test_lpips_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,18 +91,18 @@ def test_lpips_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for head in network.heads:
         head.get_parameter("weight").data.abs_()
     save_file(network.state_dict(), tmp_path / weights_file("alex"))
-    judges = load_judges(EvalOptions(lpips=("alex",), scorers=()))
+    metrics = load_metrics(EvalOptions(lpips=("alex",), scorers=()))
     a, b = pair(height=80)
-    assert judges.measure(a, a, None)["lpips_alex"] == 0.0
-    whole = judges.measure(b, a, None)["lpips_alex"]
+    assert metrics.measure(a, a, None)["lpips_alex"] == 0.0
+    whole = metrics.measure(b, a, None)["lpips_alex"]
     mask = np.zeros(a.shape[:2], bool)
     assert whole is not None and whole > 0.0
-    assert judges.measure(b, a, mask)["lpips_alex"] == 0.0  # nothing but the reference is left to see
+    assert metrics.measure(b, a, mask)["lpips_alex"] == 0.0  # nothing but the reference is left to see
     (tmp_path / weights_file("alex")).write_bytes(b"damaged")
     with pytest.raises(InputError, match="does not hold"):
-        load_judges(EvalOptions(lpips=("alex",), scorers=()))
+        load_metrics(EvalOptions(lpips=("alex",), scorers=()))
 
 
 def test_a_scorer_nobody_knows() -> None:
     with pytest.raises(InputError, match="bestnet"):
-        load_judges(EvalOptions(lpips=(), scorers=("bestnet",)))
+        load_metrics(EvalOptions(lpips=(), scorers=("bestnet",)))

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.search import Sight, luminance
-from cleargs.formation.warp import Warp, fields_of, padded, samples
+from cleargs.formation.warp import Warp, displacement_fields, padded, samples
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera
 
@@ -44,7 +44,7 @@ def picture() -> Image:
 
 def photograph(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Image:
     """What a camera that moves so records, with more samples than the code under test takes."""
-    fields = fields_of(motion, CAMERA, wall(), ALPHA)
+    fields = displacement_fields(motion, CAMERA, wall(), ALPHA)
     light = Warp(fields, 0, samples(301)).forward(padded(linear_from_srgb(truth)))[..., :3]
     grain = noise * np.random.default_rng(0).standard_normal(truth.shape)
     return np.clip(srgb_from_linear(light) + grain, 0, 1).astype(np.float32)

@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from cleargs.formation.capture import FEWEST_ASKED, MOST_ASKED, CaptureFormation, _spread, rolls
-from cleargs.formation.colour import Exposure
+from cleargs.formation.capture import (
+    MAX_TESTED_FRAMES,
+    MIN_TESTED_FRAMES,
+    CaptureFormation,
+    _tested_frames,
+    rolls,
+)
+from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.photograph import photograph
@@ -178,22 +184,26 @@ def test_a_shutter_rolls_in_the_whole_capture_or_not_at_all(tmp_path: Path, fram
     assert found == (set(range(FRAMES)) if len(frames) == FRAMES else set())
 
 
-def test_some_frames_spread_evenly_are_asked_whether_the_shutter_rolls(tmp_path: Path) -> None:
+def test_some_frames_spread_evenly_are_tested_for_a_rolling_shutter(tmp_path: Path) -> None:
     formation = CaptureFormation(views(), FormationConfig(start=0.0, every=3))
     run(tmp_path, views(), formation)
-    assert sum(frame.skew_gain is not None for frame in formation.frames.values()) == FEWEST_ASKED
-    assert _spread(3) == [0, 1, 2] and _spread(10) == [1, 3, 5, 7, 9]
-    assert len(_spread(150)) == MOST_ASKED and _spread(150)[0] == 4 and _spread(150)[-1] == 145
+    assert sum(frame.skew_gain is not None for frame in formation.frames.values()) == MIN_TESTED_FRAMES
+    assert _tested_frames(3) == [0, 1, 2] and _tested_frames(10) == [1, 3, 5, 7, 9]
+    assert (
+        len(_tested_frames(150)) == MAX_TESTED_FRAMES
+        and _tested_frames(150)[0] == 4
+        and _tested_frames(150)[-1] == 145
+    )
 
 
 def test_few_frames_or_little_gain_tell_no_rolling_shutter() -> None:
-    def asked(gains: list[float | None]) -> list[FrameFormation]:
+    def tested(gains: list[float | None]) -> list[FrameFormation]:
         return [FrameFormation(k, skew_gain=gain) for k, gain in enumerate(gains)]
 
-    assert rolls(asked([0.2, 0.1, 0.1, 0.3]))
-    assert not rolls(asked([0.2, 0.1, 0.1]))
-    assert not rolls(asked([0.2, 0.1, 0.1, None]))
-    assert not rolls(asked([0.4, 0.4, 0.0, 0.0, 0.0]))
+    assert rolls(tested([0.2, 0.1, 0.1, 0.3]))
+    assert not rolls(tested([0.2, 0.1, 0.1]))
+    assert not rolls(tested([0.2, 0.1, 0.1, None]))
+    assert not rolls(tested([0.4, 0.4, 0.0, 0.0, 0.0]))
 
 
 def test_trust_is_earned() -> None:

@@ -11,7 +11,7 @@ from photographs import CAMERA, HEIGHT, MEDIAN, WIDTH, Image, photograph, pictur
 
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
 from cleargs.formation.search import preferred, refine, search
-from cleargs.formation.warp import fields_of
+from cleargs.formation.warp import displacement_fields
 from cleargs.splat.kernels.runtime import set_threads
 
 BLUR = FrameMotion(blur=twist(0, 0, 0, 3, 6, 0), median_depth=MEDIAN)
@@ -63,7 +63,7 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
     assert found.model == model
     assert found.explained > 0.3
     alpha = np.ones((HEIGHT, WIDTH), np.float32)
-    ours, theirs = (fields_of(m, CAMERA, wall(), alpha) for m in (found.motion, motion))
+    ours, theirs = (displacement_fields(m, CAMERA, wall(), alpha) for m in (found.motion, motion))
     assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.5
     # An exposure is the same from its end to its start. A soft render leaves part of a blur unseen.
     apart = [np.hypot(*(ours.sweep - sign * theirs.sweep)).mean() for sign in (1, -1)]
@@ -90,7 +90,7 @@ def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
     observed = photograph(truth, shifted)
     found = preferred(search(sight(soft(truth), observed), pose=True))
     alpha = np.ones((HEIGHT, WIDTH), np.float32)
-    ours, theirs = (fields_of(m, CAMERA, wall(), alpha) for m in (found.motion, shifted))
+    ours, theirs = (displacement_fields(m, CAMERA, wall(), alpha) for m in (found.motion, shifted))
     assert np.hypot(*theirs.offset).mean() > 2.0
     assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.3
 

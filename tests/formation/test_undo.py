@@ -9,7 +9,7 @@ from photographs import ALPHA, CAMERA, MEDIAN, Image, photograph, picture, psnr,
 from cleargs.formation import undo as module
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.undo import undo
-from cleargs.formation.warp import Warp, fields_of
+from cleargs.formation.warp import Warp, displacement_fields
 
 MOTIONS = [
     FrameMotion(blur=twist(0, 0, 0, 2, 5, 0), median_depth=MEDIAN),
@@ -25,7 +25,7 @@ def truth() -> Image:
 
 
 def warp(motion: FrameMotion) -> Warp:
-    return Warp.of(fields_of(motion, CAMERA, wall(), ALPHA))
+    return Warp.of(displacement_fields(motion, CAMERA, wall(), ALPHA))
 
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=["turn", "long turn with roll", "both", "defocus"])

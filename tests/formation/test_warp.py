@@ -10,9 +10,9 @@ from photographs import CAMERA, MEDIAN, Image, twist, wall
 
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.warp import (
-    Fields,
+    DisplacementFields,
     Warp,
-    fields_of,
+    displacement_fields,
     linear_curve,
     padded,
     samples,
@@ -38,7 +38,7 @@ ALL = FrameMotion(
 )
 
 
-def oracle(image: Doubles, fields: Fields, margin: int, points: Image) -> torch.Tensor:
+def oracle(image: Doubles, fields: DisplacementFields, margin: int, points: Image) -> torch.Tensor:
     """What `Warp.forward` should give, in float64 torch with autograd: the mean of bilinear looks-up."""
     pixels = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     rows, columns = image.shape[:2]
@@ -68,17 +68,17 @@ def random_image(rows: int, columns: int) -> Image:
     return padded(np.random.default_rng(1).random((rows, columns, 3)).astype(np.float32))
 
 
-def constant_fields(height: int, width: int, dx: float, dy: float, radius: float = 0.0) -> Fields:
+def constant_fields(height: int, width: int, dx: float, dy: float, radius: float = 0.0) -> DisplacementFields:
     sweep = np.empty((2, height, width), np.float32)
     sweep[0], sweep[1] = dx, dy
     disc = np.full((height, width), radius, np.float32)
-    return Fields(np.zeros_like(sweep), sweep, disc, abs(dy) / 2 + radius)
+    return DisplacementFields(np.zeros_like(sweep), sweep, disc, abs(dy) / 2 + radius)
 
 
 @pytest.mark.parametrize("margin", [0, 12])
 def test_forward_and_transpose_equal_the_oracle(margin: int) -> None:
     wide = np.pad(wall(), margin, mode="edge")
-    fields = fields_of(ALL, CAMERA, wide, np.ones_like(wide), margin)
+    fields = displacement_fields(ALL, CAMERA, wide, np.ones_like(wide), margin)
     warp = Warp.of(fields, margin)
     image = random_image(*wide.shape)
     expected = oracle(image[..., :3].astype(np.float64), fields, margin, warp.samples)
@@ -96,7 +96,7 @@ def test_forward_and_transpose_equal_the_oracle(margin: int) -> None:
 
 def test_transpose_is_the_transpose() -> None:
     rng = np.random.default_rng(0)
-    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
     warp = Warp.of(fields)
     a, b = (padded(rng.standard_normal((*wall().shape, 3)).astype(np.float32)) for _ in range(2))
     forth, back = warp.forward(a), warp.transpose(b)
@@ -127,7 +127,7 @@ def test_hard_sizes_and_lengths(height: int, width: int, dx: float, dy: float, r
 
 
 def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
-    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
     warp = Warp.of(fields)
     flat = padded(np.full((*wall().shape, 3), 0.25, np.float32))
     np.testing.assert_allclose(warp.forward(flat)[..., :3], 0.25, atol=1e-6)
@@ -138,7 +138,7 @@ def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
 
 def test_a_still_frame_is_the_image_itself() -> None:
     still = FrameMotion()
-    warp = Warp.of(fields_of(still, CAMERA, wall(), np.ones_like(wall())))
+    warp = Warp.of(displacement_fields(still, CAMERA, wall(), np.ones_like(wall())))
     image = random_image(*wall().shape)
     np.testing.assert_array_equal(warp.forward(image), image)
     np.testing.assert_array_equal(warp.transpose(image), image)
@@ -151,8 +151,8 @@ def test_depth_that_is_no_number_counts_as_the_median() -> None:
     alpha = np.ones_like(depth)
     alpha[50:60] = 0.0
     alpha[70:80] = np.nan
-    fields = fields_of(ALL, CAMERA, depth, alpha)
-    flat = fields_of(ALL, CAMERA, np.full_like(depth, MEDIAN), np.ones_like(depth))
+    fields = displacement_fields(ALL, CAMERA, depth, alpha)
+    flat = displacement_fields(ALL, CAMERA, np.full_like(depth, MEDIAN), np.ones_like(depth))
     for rows in (slice(10, 20), slice(30, 40), slice(50, 60), slice(70, 80)):
         np.testing.assert_array_equal(fields.sweep[:, rows], flat.sweep[:, rows])
     assert np.isfinite([fields.offset, fields.sweep]).all()
@@ -164,7 +164,7 @@ def test_a_depth_edge_moves_each_side_by_its_own_way() -> None:
     depth = np.full_like(wall(), 4.0)
     depth[:, :100] = 2.0
     motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=4.0)
-    fields = fields_of(motion, CAMERA, depth, np.ones_like(depth))
+    fields = displacement_fields(motion, CAMERA, depth, np.ones_like(depth))
     np.testing.assert_allclose(fields.sweep[0, :, :100], -12.0)
     np.testing.assert_allclose(fields.sweep[0, :, 100:], -6.0)
 
@@ -173,7 +173,7 @@ def test_floaters_do_not_move_by_whole_images() -> None:
     depth = wall().copy()
     depth[:10, :10] = 1e-4
     motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=MEDIAN)
-    fields = fields_of(motion, CAMERA, depth, np.ones_like(depth))
+    fields = displacement_fields(motion, CAMERA, depth, np.ones_like(depth))
     assert np.abs(fields.sweep).max() <= 6.0 * kernels.MAX_NEARNESS
 
 
@@ -197,7 +197,7 @@ def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
         mean += wave(at_x, at_y) / count
     motion = FrameMotion(blur=twist(0, 0, 0, 0, 8, 0), median_depth=MEDIAN)
     still = padded(np.repeat(wave(x, y)[..., None], 3, 2).astype(np.float32))
-    made = Warp.of(fields_of(motion, CAMERA, wall(), np.ones_like(wall()))).forward(still)[..., 0]
+    made = Warp.of(displacement_fields(motion, CAMERA, wall(), np.ones_like(wall()))).forward(still)[..., 0]
     inner = np.s_[4:-4, 8:-8]  # a turn bends the rows near the corners
     assert np.abs(wave(x, y) - mean)[inner].max() > 0.02
     # Eight samples of a way of eight pixels, and bilinear interpolation of the waves.
@@ -225,7 +225,7 @@ def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
 
 
 def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None:
-    fields = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
     warp = Warp.of(fields)
     rng = np.random.default_rng(3)
     image = rng.uniform(0.2, 0.8, (*wall().shape, 3)).astype(np.float32)
@@ -249,7 +249,7 @@ def test_threads_do_not_change_a_bit() -> None:
     results = []
     for threads in (1, 2):
         set_threads(threads)
-        warp = Warp.of(fields_of(ALL, CAMERA, wall(), np.ones_like(wall())))
+        warp = Warp.of(displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall())))
         results.append((warp.forward(image), warp.transpose(image)))
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
@@ -269,8 +269,8 @@ def test_samples_are_centred() -> None:
 def test_a_camera_of_another_size_scales_the_motion() -> None:
     half = CAMERA.scaled(0.5)
     assert isinstance(half, Camera)
-    full = fields_of(ALL, CAMERA, wall(), np.ones_like(wall()))
+    full = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
     small = wall()[::2, ::2].copy()
-    reduced = fields_of(ALL, half, small, np.ones_like(small), scale=0.5)
+    reduced = displacement_fields(ALL, half, small, np.ones_like(small), scale=0.5)
     # A reduced pixel's centre lies half a pixel from the ones it is compared with.
     np.testing.assert_allclose(reduced.sweep, 0.5 * full.sweep[:, ::2, ::2], atol=0.06)

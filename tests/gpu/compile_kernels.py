@@ -81,7 +81,7 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {},
         ),
         (
-            densify.shake_kernel,
+            densify.position_noise_kernel,
             {
                 **{name: kind for name, kind in SCENE.items() if name != "sh"},
                 **{"n": "i32", "seed": "i64", "amount": "fp32", "min_opacity": "fp32", "cut": "fp32"},

@@ -5,7 +5,7 @@
 RUN holds the finished folders ``ingest`` and ``rva``, made by ``cleargs run CAPTURE -o RUN --until rva`` on
 any machine, with ``--set ingest.holdout=every:8`` for held-out frames, and ``--set ingest.max_size=...``
 where images are larger than 960 px. OUT gets the scene, its log and ``stages.json``: time, PSNR of the frames
-trained on and of those held out, and memory. What a time limit cuts off goes on from its checkpoint when the
+trained on and of those held out, and memory. What a time limit cuts off resumes from its checkpoint when the
 same command is given again.
 """
 
@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from cleargs.capture.tables import load_frames
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter

@@ -12,7 +12,7 @@ import torch
 
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.colour import Exposure, affine_backward, apply_affine
+from cleargs.formation.exposure import Exposure, affine_backward, apply_affine
 from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
 from cleargs.splat.adam import adam_step
@@ -188,10 +188,10 @@ def test_relocation_moves_the_dead_and_keeps_the_sum_of_opacity_plausible(device
 def test_growth_stops_at_the_budget(device, densify):
     gaussians = crowd(40, device)
     moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
-    grown, forgotten = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    grown, reset_moments = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
     assert grown.num == 55
-    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in forgotten[0].values())
-    same, _ = densify.grow(grown, forgotten, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in reset_moments[0].values())
+    same, _ = densify.grow(grown, reset_moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
     assert same is grown
 
 
@@ -205,7 +205,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     gaussians.logit_opacities[:10] = 2.0
     gaussians = gaussians.to(device)
     start = gaussians.means.clone()
-    densify.shake(gaussians, amount=2.0, min_opacity=0.005, seed=11)
+    densify.add_position_noise(gaussians, amount=2.0, min_opacity=0.005, seed=11)
     offsets = (gaussians.means - start).double().cpu()
     assert not offsets[:10].any()
     rotation = mcmc.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
@@ -271,7 +271,7 @@ def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_p
     assert rows["width"] == [10, 10, 20, 20, 20]
     assert all(0.0 < loss < 1.0 for loss in rows["loss"])
     assert all(0.0 < value < 50.0 for value in rows["psnr"])
-    # The checkpoint of step 3 is still there: going on from it does steps 4 and 5 again.
+    # The checkpoint of step 3 is still there: resuming from it does steps 4 and 5 again.
     saved = load_state(tmp_path / "state.safetensors", SilentReporter())
     assert saved is not None
     assert int(saved["step"]) == 3

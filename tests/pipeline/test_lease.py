@@ -132,7 +132,7 @@ def test_a_writer_that_was_taken_for_dead_publishes_nothing(bench: Bench) -> Non
             pretend(lost, host="another-node", age=DEAD_AFTER + 1)  # it stood still
             taken = second.open_work(manifest.key, fresh=False, entry=None)
             assert taken.folder != work.folder and not work.folder.exists()
-            work.out.mkdir(parents=True)  # it goes on as if nothing had happened
+            work.out.mkdir(parents=True)  # it continues as if nothing had happened
             with pytest.raises(StoreError, match="took over"):
                 first.publish(work, manifest)
 

@@ -316,7 +316,7 @@ def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.Monk
 
 
 def test_foreign_files_among_leftovers_are_not_published(bench: Bench) -> None:
-    """Only what a stage says that it goes on from is left of a killed try."""
+    """Only what a stage says that it resumes from is left of a killed try."""
     healthy = bench.digests()
     manifests = {name: read_manifest(bench.folder / name) for name in ("count", "square")}
     for name, places in {

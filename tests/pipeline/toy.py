@@ -99,7 +99,7 @@ class Count:
 
 @dataclass
 class Square:
-    """numbers -> powers/*.txt, one at a time, so that a killed try goes on.
+    """numbers -> powers/*.txt, one at a time, so that a killed try resumes.
 
     Notes ``held`` behind the first number, and waits there while the file ``hold`` exists: a test has all the
     time it needs to meet this stage at work.

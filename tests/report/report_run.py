@@ -11,7 +11,7 @@ import pyarrow as pa
 import torch
 
 from cleargs.capture.tables import FRAMES
-from cleargs.formation.colour import Exposure, write_exposure
+from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config

@@ -15,7 +15,7 @@ import numpy as np
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.rivr.candidates import Image, gaussian_blur
 from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import objection
+from cleargs.rivr.gates import rejection_reason
 
 Fault: TypeAlias = Callable[[Image, np.random.Generator], Image]
 
@@ -101,7 +101,9 @@ def main(runs: list[Path]) -> None:
         cases = {"none": layers["restored"]}
         cases |= {name: fault(layers["restored"], np.random.default_rng(k)) for name, fault in FAULTS.items()}
         for name, image in cases.items():
-            refused[name] += objection(image, layers["observed"], layers["render"], GateConfig()) is not None
+            refused[name] += (
+                rejection_reason(image, layers["observed"], layers["render"], GateConfig()) is not None
+            )
     for name, count in refused.items():
         print(f"{name:24} {count / len(exrs):6.1%}  of {len(exrs)}")
 

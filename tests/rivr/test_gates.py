@@ -18,7 +18,7 @@ from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import Image
 from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import all_masked, colour_differences, objection, shifts
+from cleargs.rivr.gates import all_masked, colour_differences, rejection_reason, shifts
 from cleargs.rivr.rounds import recorded_row
 from cleargs.rivr.tables import read_selection
 from cleargs.stages import rivr
@@ -60,7 +60,7 @@ def render(sharp: Image) -> Image:
 
 
 def test_a_perfect_repair_is_admitted(sharp: Image, observed: Image, render: Image) -> None:
-    assert objection(sharp, observed, render, LIMITS) is None
+    assert rejection_reason(sharp, observed, render, LIMITS) is None
     # No block is nearer to its limit than a quarter.
     assert shifts(sharp, observed, render).max() < 0.15
     assert colour_differences(sharp, observed, render).max() < 0.01
@@ -69,9 +69,9 @@ def test_a_perfect_repair_is_admitted(sharp: Image, observed: Image, render: Ima
 def test_either_witness_suffices(sharp: Image, observed: Image, render: Image) -> None:
     """What lies where the raw frame lies may be far from the render, and the other way round."""
     off = np.roll(render, 4, axis=0)
-    assert objection(sharp, observed, off, LIMITS) is None
-    assert objection(np.roll(sharp, 4, axis=0), observed, off, LIMITS) is None
-    assert objection(np.roll(sharp, 2, axis=0), observed, off, LIMITS) is not None
+    assert rejection_reason(sharp, observed, off, LIMITS) is None
+    assert rejection_reason(np.roll(sharp, 4, axis=0), observed, off, LIMITS) is None
+    assert rejection_reason(np.roll(sharp, 2, axis=0), observed, off, LIMITS) is not None
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 4])
@@ -93,7 +93,7 @@ FOUND = {
 def test_gross_faults_are_found(name: str, sharp: Image, observed: Image, render: Image) -> None:
     for seed in range(4):
         faulty = FAULTS[name](sharp, np.random.default_rng(seed))
-        assert FOUND[name] in (objection(faulty, observed, render, LIMITS) or "")
+        assert FOUND[name] in (rejection_reason(faulty, observed, render, LIMITS) or "")
 
 
 def test_one_bad_block_shows_but_does_not_condemn_the_rest(
@@ -102,15 +102,15 @@ def test_one_bad_block_shows_but_does_not_condemn_the_rest(
     strict = LIMITS.model_copy(update={"max_share": 0.0})
     for name in ("block shifted 4 px", "block tinted 16%"):
         faulty = FAULTS[name](sharp, np.random.default_rng(0))
-        assert objection(faulty, observed, render, LIMITS) is None
-        assert objection(faulty, observed, render, strict) is not None
+        assert rejection_reason(faulty, observed, render, LIMITS) is None
+        assert rejection_reason(faulty, observed, render, strict) is not None
 
 
 def test_along_heavy_blur_the_place_is_uncertain(sharp: Image, render: Image) -> None:
     """A shift by 2 px along 15 px of motion explains the raw frame as well; across the motion it does not."""
     observed = cv2.blur(sharp, (15, 1))
-    assert objection(np.roll(sharp, 2, axis=1), observed, render, LIMITS) is None
-    assert objection(np.roll(sharp, 2, axis=0), observed, render, LIMITS) is not None
+    assert rejection_reason(np.roll(sharp, 2, axis=1), observed, render, LIMITS) is None
+    assert rejection_reason(np.roll(sharp, 2, axis=0), observed, render, LIMITS) is not None
 
 
 def test_a_lone_edge_has_no_place_along_itself() -> None:
@@ -124,8 +124,8 @@ def test_a_lone_edge_has_no_place_along_itself() -> None:
 def test_flat_images_agree() -> None:
     """No texture, nothing to align; no division by zero either."""
     flat = np.full((70, 90, 3), 0.4, np.float32)
-    assert objection(flat, flat, flat, LIMITS) is None
-    assert objection(flat + np.float32(0.1), flat, flat, LIMITS) == "100% of its blocks off colour"
+    assert rejection_reason(flat, flat, flat, LIMITS) is None
+    assert rejection_reason(flat + np.float32(0.1), flat, flat, LIMITS) == "100% of its blocks off colour"
 
 
 @settings(max_examples=20, deadline=None)
@@ -147,9 +147,9 @@ def test_blur_keeps_the_mean_light_but_not_the_mean_of_srgb(sharp: Image) -> Non
 
 def test_limits_and_switch(sharp: Image, observed: Image) -> None:
     moved = np.roll(sharp, -4, axis=0)
-    assert objection(moved, observed, observed, LIMITS) is not None
-    assert objection(moved, observed, observed, GateConfig(max_share=1.0)) is None
-    assert objection(moved, observed, observed, GateConfig(max_shift=5.0, max_colour=1.0)) is None
+    assert rejection_reason(moved, observed, observed, LIMITS) is not None
+    assert rejection_reason(moved, observed, observed, GateConfig(max_share=1.0)) is None
+    assert rejection_reason(moved, observed, observed, GateConfig(max_shift=5.0, max_colour=1.0)) is None
 
 
 def test_refused_repairs_stay_on_disk_and_the_render_is_taken(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cleargs.capture.tables import FRAMES
 from cleargs.files import write_json
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.colour import Exposure, write_exposure
+from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.formation.table import write_formation
 from cleargs.media.image import write_mask, write_rgb
 from cleargs.pipeline.stage import StageContext

@@ -12,7 +12,7 @@ from rva_scenes import uniform_cues
 from vlm_server import FRAMES, Answer, Asked, truth, two_stages, vlm_server
 
 from cleargs.cli.main import invoke
-from cleargs.rva.agreement import Judgement, compare, spearman
+from cleargs.rva.agreement import EvaluatorCues, compare, spearman
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import CUE_COLUMNS
 
@@ -31,8 +31,8 @@ def test_spearman_by_hand() -> None:
 
 def test_the_widest_gaps_come_first_and_unscored_frames_stay_out() -> None:
     R = [0.9, 0.8, 0.7, 0.6, 0.5]
-    first = Judgement("a", uniform_cues(R, [0.1] * 5))
-    second = Judgement("b", uniform_cues([0.5, 0.8, 0.7, 0.6, 0.9], [0.1] * 5))
+    first = EvaluatorCues("a", uniform_cues(R, [0.1] * 5))
+    second = EvaluatorCues("b", uniform_cues([0.5, 0.8, 0.7, 0.6, 0.9], [0.1] * 5))
     agreement = compare(first, second, RvaConfig(), most=1)
     (worst,) = agreement.disagreements
     assert (worst.row, worst.gap, worst.rank) == (0, 1.0, (1, 5))  # ties go to the earlier frame
@@ -51,10 +51,10 @@ def test_the_widest_gaps_come_first_and_unscored_frames_stay_out() -> None:
 
 
 def test_evaluators_that_agree_have_nothing_to_show() -> None:
-    same = Judgement("a", uniform_cues([0.9, 0.2], [0.1, 0.8]))
+    same = EvaluatorCues("a", uniform_cues([0.9, 0.2], [0.1, 0.8]))
     agreement = compare(same, same, RvaConfig(), most=9)
     assert agreement.disagreements == () and agreement.spearman["B"] == 1.0
-    nothing = Judgement("b", np.full((2, len(CUE_COLUMNS)), np.nan))
+    nothing = EvaluatorCues("b", np.full((2, len(CUE_COLUMNS)), np.nan))
     assert compare(same, nothing, RvaConfig(), most=9).frames == 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splat_toy import HEIGHT, WIDTH, camera, keep
 
-from cleargs.formation.colour import (
+from cleargs.formation.exposure import (
     IDENTITY,
     Exposure,
     centred,

@@ -15,7 +15,7 @@ import torch
 from splat_scenes import make_camera, make_gaussians
 from cleargs.splat.adam import adam_step
 from cleargs.splat.engine import Engine
-from cleargs.formation.colour import affine_backward
+from cleargs.formation.exposure import affine_backward
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.losses import photometric_loss, psnr
 

@@ -41,7 +41,7 @@ def test_what_is_given_stays() -> None:
 def test_a_training_decides_for_itself() -> None:
     trainer = Trainer(start(), views(images(gaussians(), 3)), TrainConfig(quality="draft"), seed=(1,))
     assert trainer.length == steps_from_frames(3, "draft")
-    with pytest.raises(ValueError, match="open"):
+    with pytest.raises(ValueError, match="not decided yet"):
         TrainConfig().length  # noqa: B018
 
 

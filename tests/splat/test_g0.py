@@ -14,7 +14,7 @@ from splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.errors import InputError
-from cleargs.formation.colour import read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rva.tables import FRAMES as RVA_FRAMES

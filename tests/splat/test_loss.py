@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own name for it
 
 from cleargs.errors import InputError
-from cleargs.formation.colour import affine_backward, apply_affine
+from cleargs.formation.exposure import affine_backward, apply_affine
 from cleargs.splat.adam import adam_step
 from cleargs.splat.losses import photometric_loss, psnr, ssim
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cleargs.splat.config import DistilConfig, G0Config, TrainConfig
-from cleargs.splat.optimiser import INRIA_STEPS, Rates, rate_factor
+from cleargs.splat.rates import INRIA_STEPS, Rates, rate_factor
 
 GROUPS = ("means", "log_scales", "rotations", "sh", "logit_opacities")
 

@@ -83,12 +83,12 @@ def test_relocation_with_nobody_alive_changes_nothing() -> None:
 def test_growth_stops_at_the_budget(budget: int, expected: int) -> None:
     made = arrays(100, np.random.default_rng(0))
     moments = [{name: np.ones_like(array) for name, array in made.items()}]
-    grown, forgotten = grow(
+    grown, reset_moments = grow(
         made, moments, rate=0.05, budget=budget, min_opacity=OPEN, rng=np.random.default_rng(1)
     )
     assert {len(array) for array in grown.values()} == {expected}
-    assert {len(array) for array in forgotten[0].values()} == {expected}
-    assert (forgotten[0]["sh"][100:] == 0).all()
+    assert {len(array) for array in reset_moments[0].values()} == {expected}
+    assert (reset_moments[0]["sh"][100:] == 0).all()
     assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in grown.values())
 
 

@@ -15,7 +15,7 @@ from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, vie
 
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.colour import Exposure, centred
+from cleargs.formation.exposure import Exposure, centred
 from cleargs.formation.photograph import evaluate_views, photograph
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter

@@ -178,5 +178,5 @@ def test_a_stretch_leaves_bins_without_a_frame_that_is_worth_its_pixels() -> Non
     bins = cut_into_bins(cumulative_motion(poses[:, :, 3], poses[:, :, 2], RvaConfig()), 8).index
     spoilt = [number for number in np.unique(bins) if blurred[bins == number].all()]
     assert len(spoilt) >= 1
-    calm = path.hand.shaken(times) < 0.01
+    calm = path.hand.shake_strength(times) < 0.01
     assert calm.sum() > 48 and (~blurred[calm]).mean() > 0.9

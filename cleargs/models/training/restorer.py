@@ -4,7 +4,7 @@
 
 trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
 renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A
-killed run goes on from its checkpoint; a finished one only exports. The export needs the ``onnx`` package.
+killed run resumes from its checkpoint; a finished one only exports. The export needs the ``onnx`` package.
 `evaluate_restorer` prints the table of the held-out sources.
 
 Cost of the default recipe: see ``cleargs/models/weights/README.md``.
@@ -46,7 +46,7 @@ MARGIN = 20
 RENDERED_SHARE, DRAWN_SHARE = 0.3, 0.1
 """Shares of the patches that are not photographs but renders, and drawn shapes: their edges are as sharp as
 the pixels allow, which those of photographs rarely are."""
-SHRUNK_SHARE, MOST_SHRUNK = 0.6, 3.0
+SHRUNK_SHARE, MAX_SHRINK = 0.6, 3.0
 """Share of the photographs' patches that are shrunk, and the largest factor: it makes them crisper."""
 
 SHALLOW_SHARE = 0.25
@@ -178,7 +178,7 @@ def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Im
         sharp = _cut(contents.renders, 1.0, rng)
     else:
         shrunk = rng.random() < SHRUNK_SHARE
-        sharp = _cut(contents.photos, rng.uniform(1.0, MOST_SHRUNK) if shrunk else 1.0, rng)
+        sharp = _cut(contents.photos, rng.uniform(1.0, MAX_SHRINK) if shrunk else 1.0, rng)
     if rng.random() < SHALLOW_SHARE:
         sharp = shallow_focus(sharp, rng)
     blurred = degrade(sharp, handheld_degradation(rng), rng)

@@ -139,7 +139,7 @@ def train(
 ) -> QualityNet:
     """AdamW with a one-cycle rate; ends after ``epochs``, or earlier when ``seconds`` are over.
 
-    ``start`` is a checkpoint of an earlier training to go on from (with a rate cycle of its own, which peaks
+    ``start`` is a checkpoint of an earlier training to resume from (with a rate cycle of its own, which peaks
     at ``rate``). ``head_only`` leaves the convolutions as they are.
     Returns the running average of the weights, ready for inference; now and then it is saved to
     ``checkpoint``.
@@ -313,7 +313,7 @@ def export(net: QualityNet, path: Path) -> None:
 @click.option("--contents", default=16, show_default=True, help="Patches a training photo.")
 @click.option("--versions", default=8, show_default=True, help="Versions of each, the clean one included.")
 @click.option(
-    "--start", type=click.Path(exists=True, path_type=Path), default=None, help="Checkpoint to go on from."
+    "--start", type=click.Path(exists=True, path_type=Path), default=None, help="Checkpoint to resume from."
 )
 @click.option("--rate", default=2e-3, show_default=True, help="Peak learning rate.")
 @click.option("--head-only", is_flag=True, help="Leave the convolutions as they are.")

@@ -50,7 +50,7 @@ def make_pairs(
     For training, ``versions`` (the clean one included) draws that many kinds with repetition and varies the
     look of the content; a share ``graphics`` of the contents is drawn instead of photographed. For testing,
     None makes every kind once, of the content as it is. Groups that are there already are kept, so that an
-    interrupted preparation goes on where it stopped.
+    interrupted preparation resumes where it stopped.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = [p for _ in range(contents) for p in photos]

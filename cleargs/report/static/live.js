@@ -51,7 +51,7 @@
       }
       show(state);
     } catch {
-      one("figures").textContent = "cleargs watch has ended; start it again to go on.";
+      one("figures").textContent = "cleargs watch has ended; start it again to resume.";
     }
     setTimeout(look, EVERY_MS);
   };

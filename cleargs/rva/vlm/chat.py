@@ -22,16 +22,16 @@ from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_ope
 
 from cleargs.errors import InputError, StageError
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.judge import UnscoredError
+from cleargs.rva.vlm.picture_scorer import UnscoredError
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"
 DEFAULT_URL = "http://127.0.0.1:8000/v1"
 
 _BUSY = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
-_LONGEST_PAUSE = 120.0  # s; also what a server may ask for with Retry-After
-_LARGEST_REPLY = 4 << 20  # bytes
-_LONGEST_CHECK = 10.0  # s to wait for the list of models
+_MAX_PAUSE_S = 120.0  # s; also what a server may ask for with Retry-After
+_MAX_REPLY_BYTES = 4 << 20  # bytes
+_MAX_CHECK_S = 10.0  # s to wait for the list of models
 _SHOWN = 200  # characters of a server's own words
 
 
@@ -90,8 +90,8 @@ class ChatClient:
         request = Request(f"{self.base_url}/models", headers=self._headers())
         serve = f"start one (vllm serve {self._config.model}), or set rva.qwen.base_url or {URL_VARIABLE}"
         try:
-            with self._opener.open(request, timeout=min(self._config.timeout_s, _LONGEST_CHECK)) as response:
-                served = [entry["id"] for entry in json.loads(response.read(_LARGEST_REPLY))["data"]]
+            with self._opener.open(request, timeout=min(self._config.timeout_s, _MAX_CHECK_S)) as response:
+                served = [entry["id"] for entry in json.loads(response.read(_MAX_REPLY_BYTES))["data"]]
         except HTTPError as error:
             with error:
                 if error.code in (401, 403):
@@ -125,7 +125,7 @@ class ChatClient:
             try:
                 return self._once(data)
             except _TransientError as fault:
-                if left and not self._stopped.wait(min(_LONGEST_PAUSE, max(pause, fault.after or 0.0))):
+                if left and not self._stopped.wait(min(_MAX_PAUSE_S, max(pause, fault.after or 0.0))):
                     pause *= 2
                     continue
                 kind = UnreachableError if fault.unreachable else UnscoredError
@@ -157,7 +157,7 @@ class ChatClient:
     def _refusal(self, error: HTTPError) -> Exception:
         """What an HTTP status other than 2xx means for us."""
         try:
-            words = self._words(error.read(_LARGEST_REPLY))
+            words = self._words(error.read(_MAX_REPLY_BYTES))
         except (OSError, http.client.HTTPException):
             words = ""
         reason = f"the server answered {error.code}{words}"
@@ -205,7 +205,7 @@ def _read(response: http.client.HTTPResponse, deadline: float) -> bytes:
         raw += chunk
         if time.monotonic() > deadline:
             raise TimeoutError
-        if len(raw) > _LARGEST_REPLY:
+        if len(raw) > _MAX_REPLY_BYTES:
             raise _TransientError("the server's answer is far too long")
     if response.length:
         raise http.client.IncompleteRead(raw, response.length)

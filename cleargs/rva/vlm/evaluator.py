@@ -1,4 +1,4 @@
-"""Frames in, cues out: keeps what is scored, goes on after a kill, marks what could not be scored."""
+"""Frames in, cues out: keeps what is scored, resumes after a kill, marks what could not be scored."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from cleargs.errors import StageError
 from cleargs.progress import Reporter
 from cleargs.rva.evaluator import View
-from cleargs.rva.kept import KeptRows, view_digest
+from cleargs.rva.item_cache import ItemCache, view_digest
 from cleargs.rva.scores import Floats
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.vlm.judge import Judge, UnscoredError
 from cleargs.rva.vlm.picture import load_picture
+from cleargs.rva.vlm.picture_scorer import PictureScorer, UnscoredError
 from cleargs.rva.vlm.prompt import VERSION
 
 
@@ -27,15 +27,15 @@ class QwenEvaluator:
 
     version = VERSION
 
-    def __init__(self, judge: Judge, *, image_size: int, cache: Path) -> None:
-        self._judge = judge
+    def __init__(self, scorer: PictureScorer, *, image_size: int, cache: Path) -> None:
+        self._scorer = scorer
         self._image_size = image_size
-        self._kept = KeptRows(cache, CUE_COLUMNS)
+        self._cache = ItemCache(cache, CUE_COLUMNS)
 
     @property
     def name(self) -> str:
         """The evaluator, its model, and what its version counts: ``qwen3-vl:MODEL:prompt``."""
-        return f"qwen3-vl:{self._judge.model}:prompt"
+        return f"qwen3-vl:{self._scorer.model}:prompt"
 
     def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
         """See `Evaluator.evaluate`. ``threads`` is not used: the work is done elsewhere or has its own.
@@ -44,7 +44,7 @@ class QwenEvaluator:
         """
         cues = np.full((len(views), len(CUE_COLUMNS)), np.nan)
         faults: dict[int, str] = {}
-        pool = ThreadPoolExecutor(self._judge.workers)
+        pool = ThreadPoolExecutor(self._scorer.workers)
         try:
             with reporter.task("cues", total=len(views)) as task:
                 rows = {pool.submit(self._score, view): row for row, view in enumerate(views)}
@@ -55,13 +55,13 @@ class QwenEvaluator:
                         faults[rows[future]] = str(fault)
                     task.advance()
         except BaseException:
-            self._judge.stop()
+            self._scorer.stop()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         pool.shutdown()
         if faults and len(faults) == len(views):
             raise StageError(
-                f"{self._judge.model} scored no frame: {faults[0]}",
+                f"{self._scorer.model} scored no frame: {faults[0]}",
                 hint="check the server and rva.qwen, or use --set rva.evaluator=statistics",
             )
         for row in sorted(faults):
@@ -69,10 +69,10 @@ class QwenEvaluator:
         return cues
 
     def _score(self, view: View) -> Floats:
-        digest = view_digest([self._judge.identity, VERSION, self._image_size], view)
-        kept = self._kept.find(digest)
+        digest = view_digest([self._scorer.identity, VERSION, self._image_size], view)
+        kept = self._cache.find(digest)
         if kept is not None and bool(((kept >= 0.0) & (kept <= 1.0)).all()):
             return kept
-        cues = self._judge.score(load_picture(view, self._image_size))
-        self._kept.add(digest, cues)
+        cues = self._scorer.score(load_picture(view, self._image_size))
+        self._cache.add(digest, cues)
         return cues

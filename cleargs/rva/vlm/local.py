@@ -18,8 +18,8 @@ import torch
 from cleargs.errors import InputError
 from cleargs.rva.config import QwenConfig
 from cleargs.rva.scores import Floats
-from cleargs.rva.vlm.judge import UnscoredError
 from cleargs.rva.vlm.picture import Picture
+from cleargs.rva.vlm.picture_scorer import UnscoredError
 from cleargs.rva.vlm.prompt import prompt_text, reply_schema
 from cleargs.rva.vlm.reply import ReplyError, parse_reply
 
@@ -38,8 +38,8 @@ class _Loaded:
     grammar: str
 
 
-class LocalJudge:
-    """Runs a model folder of this machine; see `judge.Judge`. Loads it when the first picture comes."""
+class LocalPictureScorer:
+    """Runs a model folder of this machine; see `PictureScorer`. Loads it when the first picture comes."""
 
     workers = 1
 
@@ -58,14 +58,14 @@ class LocalJudge:
         return json.dumps(["local", self._device, self._threads, self._max_tokens, facts])
 
     def stop(self) -> None:
-        """See `Judge.stop`: the one picture under way is finished."""
+        """See `PictureScorer.stop`: the one picture under way is finished."""
 
     @cached_property
     def _loaded(self) -> _Loaded:
         return _load(self._folder, self._device)
 
     def score(self, picture: Picture) -> Floats:
-        """See `Judge.score`. Greedy decoding: the same picture gets the same scores."""
+        """See `PictureScorer.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._threads)
         try:

@@ -8,16 +8,16 @@ from typing import Any
 from cleargs.rva.config import QwenConfig
 from cleargs.rva.scores import Floats
 from cleargs.rva.vlm.chat import ChatClient, RefusedError, UnreachableError
-from cleargs.rva.vlm.judge import UnscoredError
 from cleargs.rva.vlm.picture import Picture
+from cleargs.rva.vlm.picture_scorer import UnscoredError
 from cleargs.rva.vlm.prompt import prompt_text, reply_schema
 from cleargs.rva.vlm.reply import ReplyError, parse_reply
 
 _REPEATED = 2000  # characters of a faulty reply that the model is shown again
 
 
-class ServerJudge:
-    """Asks a server for scores; see `judge.Judge`."""
+class ServerPictureScorer:
+    """Asks a server for scores; see `PictureScorer`."""
 
     def __init__(self, config: QwenConfig, *, seed: int) -> None:
         """Raises InputError when the server's address or key cannot be used."""
@@ -36,11 +36,11 @@ class ServerJudge:
         self._gone: str | None = None
 
     def stop(self) -> None:
-        """See `Judge.stop`."""
+        """See `PictureScorer.stop`."""
         self._client.stop()
 
     def score(self, picture: Picture) -> Floats:
-        """See `Judge.score`. A reply outside the schema is answered with what is wrong with it."""
+        """See `PictureScorer.score`. A reply outside the schema is answered with what is wrong with it."""
         if self._gone is not None:
             raise UnscoredError(self._gone)
         messages: list[dict[str, Any]] = [

@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.random_streams import Stream
+from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.optimiser import Moments
-from cleargs.splat.strategy.base import REFINE, Strategy
+from cleargs.splat.strategy.base import Strategy
 from cleargs.splat.strategy.mcmc import Arrays, rotation_matrices, sigmoid
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class AdaptiveDensityControl(Strategy):
         )
         if self._pull is not None:
             total, seen = self._pull.cpu().numpy()
-            rng = np.random.default_rng([*self._seed, REFINE, step])
+            rng = np.random.default_rng([*self._seed, Stream.REFINEMENT, step])
             grad, dense = config.adaptive.grad, config.adaptive.dense
             pull = total / np.maximum(seen, 1)
             arrays, running = densify(
@@ -83,7 +84,7 @@ class AdaptiveDensityControl(Strategy):
         return {} if self._pull is None else {"pull": self._pull}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""
         self._pull = state.get("pull")
 
 
@@ -135,9 +136,9 @@ def prune(
     return kept, [{name: array[keep] for name, array in moment.items()} for moment in moments]
 
 
-def lower_opacities(arrays: Arrays, moments: Sequence[Arrays], most: float) -> None:
-    """No opacity stays above ``most``; Adam forgets how they moved. In place."""
-    limit = np.float32(np.log(most) - np.log1p(-most))
+def lower_opacities(arrays: Arrays, moments: Sequence[Arrays], max_opacity: float) -> None:
+    """No opacity stays above ``max_opacity``; Adam forgets how they moved. In place."""
+    limit = np.float32(np.log(max_opacity) - np.log1p(-max_opacity))
     np.minimum(arrays["logit_opacities"], limit, out=arrays["logit_opacities"])
     for moment in moments:
         moment["logit_opacities"][:] = 0

@@ -7,21 +7,18 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from cleargs.splat.adam import Moments
     from cleargs.splat.camera import Camera
     from cleargs.splat.engine import Engine
     from cleargs.splat.gaussians import Gaussians
-    from cleargs.splat.optimiser import Moments
-
-REFINE, NOISE = 2, 3
-"""Purposes of random numbers, after the training's seed and before the step; 0 and 1 choose views."""
 
 
 class Strategy:
     """Changes the number and the places of the Gaussians. Another one overrides what it needs.
 
     Made with the settings of the training, the most Gaussians there may be, and the seed. Random numbers are
-    drawn afresh from (seed, purpose, step), and what is remembered from step to step is in `state`: a resumed
-    training is the same training. Steps count from 1.
+    drawn afresh from (seed, `Stream`, step), and what is remembered from step to step is in `state`: a
+    resumed training is the same training. Steps count from 1.
     """
 
     def observe(self, engine: Engine, camera: Camera) -> None:
@@ -30,8 +27,8 @@ class Strategy:
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
         """Called every ``refine_interval`` steps between ``refine_start`` and ``refine_stop``.
 
-        Returns the Gaussians to go on with and their moments. What is given may be changed, and must not be
-        used again.
+        Returns the Gaussians to continue with and their moments. What is given may be changed, and must not
+        be used again.
         """
         return gaussians, moments
 
@@ -44,4 +41,4 @@ class Strategy:
         return {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Resume from what `state` gave."""

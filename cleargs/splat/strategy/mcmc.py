@@ -1,7 +1,7 @@
 """Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
 As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
-the means are shaken by noise that only transparent Gaussians feel.
+noise that only transparent Gaussians feel is added to the means.
 
 The rules are pure functions on numpy arrays: one thread, so the results depend on no thread count. A GPU has
 the same rules, and draws other random numbers.
@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.random_streams import Stream
 from cleargs.splat.backend import backend_for
-from cleargs.splat.strategy.base import NOISE, REFINE, Strategy
+from cleargs.splat.strategy.base import Strategy
 
 if TYPE_CHECKING:
+    from cleargs.splat.adam import Moments
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.gaussians import Gaussians
-    from cleargs.splat.optimiser import Moments
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -51,7 +52,7 @@ class MCMC(Strategy):
             rate=self._config.growth,
             budget=self._budget,
             min_opacity=self._config.min_opacity,
-            seed=(*self._seed, REFINE, step),
+            seed=(*self._seed, Stream.REFINEMENT, step),
         )
 
     def after_step(self, gaussians: Gaussians, rate: float, step: int) -> None:
@@ -62,7 +63,7 @@ class MCMC(Strategy):
                 gaussians,
                 amount=config.noise * rate,
                 min_opacity=config.min_opacity,
-                seed=(*self._seed, NOISE, step),
+                seed=(*self._seed, Stream.POSITION_NOISE, step),
             )
 
 
@@ -95,8 +96,8 @@ def relocate(
 ) -> int:
     """Move dead Gaussians onto live ones drawn by opacity, in place; returns how many moved.
 
-    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which are
-    forgotten for every Gaussian that changed.
+    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
+    become 0 for every Gaussian that changed.
     """
     opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
     dead = np.flatnonzero(~(opacity > min_opacity))
@@ -136,17 +137,17 @@ def grow(
     sources = sample(opacity, extra, rng)
     changed = _split(arrays, sources, min_opacity)
     grown = {name: np.concatenate([array, array[sources]]) for name, array in arrays.items()}
-    forgotten = []
+    reset_moments = []
     for moment in moments:
         for array in moment.values():
             array[changed] = 0
-        forgotten.append(
+        reset_moments.append(
             {
                 name: np.concatenate([array, np.zeros((extra, *array.shape[1:]), array.dtype)])
                 for name, array in moment.items()
             }
         )
-    return grown, forgotten
+    return grown, reset_moments
 
 
 def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> NDArray[np.int64]:

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
+from cleargs.splat.adam import Moments
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.optimiser import Moments
 from cleargs.splat.strategy.base import Strategy
 
 

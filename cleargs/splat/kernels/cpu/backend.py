@@ -11,11 +11,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import adam, colour, launch, loss
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import PhotometricLoss
-from cleargs.splat.optimiser import Moments
 from cleargs.splat.strategy import mcmc
 
 ADAM_BLOCK = 4096

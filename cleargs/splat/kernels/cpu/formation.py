@@ -4,7 +4,7 @@ A pixel of the photograph sees the still image at
 
     x + offset(x) + t sweep(x) + radius(x) (u, v)
 
-for ``samples`` (t, u, v): instants t from -1/2 to 1/2 of its exposure, points (u, v) of the unit disc. Fields
+for ``samples`` (t, u, v): times t from -1/2 to 1/2 of its exposure, points (u, v) of the unit disc. Fields
 are in pixels, [2, H, W] with x before y. The image is larger than the photograph by ``margin`` pixels on
 every side; beyond its border the border pixels go on.
 

@@ -254,12 +254,6 @@ def magnitude(typing_context: Any, x: Any) -> Any:
 
 
 @_intrinsic
-def square_root(typing_context: Any, x: Any) -> Any:
-    """Correctly rounded square root."""
-    return lanes(lanes), _call(f"llvm.sqrt.v{LANES}f32", 1, ())
-
-
-@_intrinsic
 def negative_magnitude(typing_context: Any, x: Any) -> Any:
     """-|x| by setting the sign bit."""
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import adam, densify, support
 from cleargs.splat.kernels.cuda.colour import affine_backward as affine_backward
@@ -15,7 +16,6 @@ from cleargs.splat.kernels.cuda.colour import apply_affine as apply_affine
 from cleargs.splat.kernels.cuda.loss import Meter, Photometer
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.losses import PhotometricLoss
-from cleargs.splat.optimiser import Moments
 
 
 def rasteriser(device: torch.device) -> CudaRasteriser:
@@ -105,4 +105,4 @@ def relocate_and_grow(
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
-    densify.shake(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))
+    densify.add_position_noise(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))

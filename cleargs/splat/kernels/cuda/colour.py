@@ -49,7 +49,7 @@ def _on_device(affine: Tensor, image: Tensor) -> Tensor:
 
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
-    """See ``cleargs.formation.colour.apply_affine``."""
+    """See ``cleargs.formation.exposure.apply_affine``."""
     image, affine = image.detach().contiguous(), _on_device(affine, image)
     output = torch.empty_like(image)
     pixels = image.numel() // 3
@@ -58,7 +58,7 @@ def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
 
 
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``cleargs.formation.colour.affine_backward``; both gradients stay on the device."""
+    """See ``cleargs.formation.exposure.affine_backward``; both gradients stay on the device."""
     image, affine = image.detach().contiguous(), _on_device(affine, image)
     grad_image = torch.empty_like(image)
     pixels = image.numel() // 3

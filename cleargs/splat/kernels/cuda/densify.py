@@ -115,17 +115,17 @@ def grow(
     grown = Gaussians(
         **{name: torch.cat([tensor, tensor[sources]]) for name, tensor in gaussians.tensors().items()}
     )
-    forgotten = []
+    reset_moments = []
     for moment in moments:
         for tensor in moment.values():
             tensor[changed] = 0
-        forgotten.append(
+        reset_moments.append(
             {
                 name: torch.cat([tensor, tensor.new_zeros(extra, *tensor.shape[1:])])
                 for name, tensor in moment.items()
             }
         )
-    return grown, forgotten
+    return grown, reset_moments
 
 
 def _split(gaussians: Gaussians, sources: Tensor, min_opacity: float) -> Tensor:
@@ -145,7 +145,7 @@ def _split(gaussians: Gaussians, sources: Tensor, min_opacity: float) -> Tensor:
 
 
 @triton.jit(do_not_specialize=["n", "seed"])
-def shake_kernel(
+def position_noise_kernel(
     means, log_scales, rotations, logits, n, seed, amount, min_opacity, cut, BLOCK: tl.constexpr
 ):
     """Add ``amount`` covariance times a normal draw to the means, faded out around ``min_opacity``."""
@@ -172,9 +172,9 @@ def shake_kernel(
         tl.store(means + g * 3 + axis, value + offset * fade, mask=felt)
 
 
-def shake(gaussians: Gaussians, *, amount: float, min_opacity: float, seed: int) -> None:
+def add_position_noise(gaussians: Gaussians, *, amount: float, min_opacity: float, seed: int) -> None:
     """Noise on the means for one step, in place; only Gaussians below ``mcmc.NOISE_CUT`` feel it."""
-    shake_kernel[(-(-gaussians.num // BLOCK),)](
+    position_noise_kernel[(-(-gaussians.num // BLOCK),)](
         gaussians.means,
         gaussians.log_scales,
         gaussians.rotations,

@@ -15,7 +15,7 @@ from cleargs.rva.scores import Floats
 from cleargs.untrusted import read_json
 
 
-class KeptRows:
+class ItemCache:
     """Rows of numbers with named columns, a JSON file each, named by the digest of all that decides them."""
 
     def __init__(self, folder: Path, columns: Sequence[str]) -> None:

@@ -148,7 +148,7 @@ class AffineOptimiser:
         return {"affines": self.affines, "first": self.first, "second": self.second, "steps": self.steps}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Go on from what `arrays` gave."""
+        """Resume from what `arrays` gave."""
         self.affines, self.first = arrays["affines"], arrays["first"]
         self.second, self.steps = arrays["second"], arrays["steps"]
 

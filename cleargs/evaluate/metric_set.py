@@ -18,7 +18,7 @@ Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Judges:
+class MetricSet:
     """The metrics of an evaluation, ready to be asked from several threads at once."""
 
     lpips: Mapping[str, Callable[[Image, Image], float]]
@@ -49,7 +49,7 @@ class Judges:
         return values | dict.fromkeys(self.unavailable)
 
 
-def load_judges(options: EvalOptions) -> Judges:
+def load_metrics(options: EvalOptions) -> MetricSet:
     """Load what ``options`` asks for. Weights that a user installs may be absent: their metrics will be null.
 
     Raises InputError for a scorer of an unknown name or an unusable file.
@@ -72,7 +72,7 @@ def load_judges(options: EvalOptions) -> Judges:
             weights[name] = scorer.digest
         else:
             unavailable[name] = "not installed: see `cleargs models list`"
-    return Judges(lpips, scorers, weights, unavailable)
+    return MetricSet(lpips, scorers, weights, unavailable)
 
 
 def _scorer(name: str) -> Scorer | None:

@@ -12,7 +12,7 @@ class UnscoredError(Exception):
     """A frame got no valid scores, for the reason given; other frames may."""
 
 
-class Judge(Protocol):
+class PictureScorer(Protocol):
     """A vision-language model that scores one picture at a time."""
 
     @property

@@ -1,38 +1,16 @@
-"""Adam over the five parameter groups of a scene."""
+"""Learning rates of a training, by parameter and step."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from cleargs.splat.adam import adam_step
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.gaussians import Gaussians
 
 SH_REST_DIVISOR = 20.0
 """The SH terms above the constant learn this much slower (Inria)."""
-
-
-@dataclass
-class Moments:
-    """Adam's running means of the gradients and of their squares, by parameter name."""
-
-    first: dict[str, Tensor]
-    second: dict[str, Tensor]
-
-    @classmethod
-    def zeros(cls, gaussians: Gaussians) -> Moments:
-        """Fresh moments for these parameters."""
-        tensors = gaussians.tensors()
-        return cls(
-            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
-            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
-        )
-
-
 INRIA_STEPS = 30_000
 """Steps of the training that the rates of 3DGS are made for."""
 MAX_RATE_FACTOR = 6.0
@@ -73,19 +51,3 @@ class Rates:
         """Every rate before step ``step``, counted from 0."""
         left = float(self._config.lr_final ** (step / self._config.length))
         return {"means": self.means(step), **{name: rate * left for name, rate in self._first.items()}}
-
-
-def step_gaussians(
-    gaussians: Gaussians,
-    gradients: Gaussians,
-    moments: Moments,
-    rates: dict[str, float | Tensor],
-    *,
-    step: int,
-) -> None:
-    """One Adam step of every group in place; ``step`` counts from 1 (bias correction)."""
-    slopes = gradients.tensors()
-    for name, parameter in gaussians.tensors().items():
-        adam_step(
-            parameter, slopes[name], moments.first[name], moments.second[name], step=step, lr=rates[name]
-        )
