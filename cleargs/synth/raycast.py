@@ -14,9 +14,12 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from cleargs.kernel_cache import configure_numba
 from cleargs.synth.room import BOX, SPHERE, Balloon, Room
 from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
 from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
+
+configure_numba("raycast")
 
 MISS = 1e30
 AMBIENT = 0.42

@@ -18,6 +18,7 @@ from cleargs.cli.synth import PROTOCOL_HELP
 from cleargs.errors import InputError
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.progress import SilentReporter
+from cleargs.synth import raycast
 from cleargs.synth.capture import make_capture, room_setting
 from cleargs.synth.course import look_at
 from cleargs.synth.protocols import PROTOCOLS
@@ -205,3 +206,9 @@ def test_refuses_an_unknown_protocol_and_a_used_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         make(tmp_path / "x")
     assert (tmp_path / "x" / "mine.txt").read_text() == "keep"
+
+
+def test_what_is_compiled_lies_outside_the_package() -> None:
+    """The package may be read-only, and what lies in it is what was installed."""
+    package = Path(raycast.__file__).parents[1]
+    assert package not in Path(raycast._render.stats.cache_path).parents

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
+
+from cleargs import kernel_cache
 
 
 def kernel_digest() -> str:
@@ -25,56 +24,9 @@ def kernel_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def cache_folder() -> Path:
-    """A writable folder for compiled kernels, made if needed.
-
-    Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
-    or ``~/.cache``), else, when none can be written to, a fresh temporary folder. One that others own or may
-    write to is passed over: what lies there is run.
-    """
-    name = f"kernels-{kernel_digest()}"
-    candidates = []
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        candidates.append(Path(chosen))
-    if shared := os.environ.get("XDG_CACHE_HOME"):
-        candidates.append(Path(shared) / "cleargs")
-    candidates.append(Path("~/.cache/cleargs"))
-    for candidate in candidates:
-        try:
-            folder = candidate.expanduser() / name
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            folder.mkdir(mode=0o700, exist_ok=True)
-            if not _private(folder):
-                continue
-            with tempfile.TemporaryFile(dir=folder):
-                return folder
-        except (OSError, RuntimeError):  # RuntimeError: expanduser without a home
-            continue
-    return Path(tempfile.mkdtemp(prefix="cleargs-kernels-"))
-
-
-def _private(folder: Path) -> bool:
-    """Whether nobody but the user (and root) can put something into ``folder``."""
-    status = folder.lstat()
-    return (
-        stat.S_ISDIR(status.st_mode)
-        and status.st_uid == os.geteuid()
-        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
-
-
 def configure_numba() -> None:
-    """Point Numba at the cache folder and at a threading layer; to be called before a kernel is defined.
-
-    OpenMP is preferred (any Python thread may start a kernel); where it is missing Numba falls back to
-    its own work queue, for which ``launch_lock`` keeps launches apart.
-    """
-    from numba import config
-
-    # By setattr, because Numba makes these settings from the environment and declares none of them.
-    settings = {"CACHE_DIR": str(cache_folder()), "THREADING_LAYER_PRIORITY": ["omp", "tbb", "workqueue"]}
-    for name, value in settings.items():
-        setattr(config, name, value)
+    """Give the kernels a folder of the cache and a threading layer; to be called before one is defined."""
+    kernel_cache.configure_numba(f"kernels-{kernel_digest()}")
 
 
 def set_threads(n: int) -> None:
