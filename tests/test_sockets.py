@@ -70,7 +70,7 @@ def test_nothing_is_imported_before_it_is_named(parts: Path) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "wrong", "near"),
-    [("rva.evaluator", "contrst", "contrast"), ("g0.strategy", "prune_only", "prune-only")],
+    [("rva.evaluator", "kontrast", "contrast"), ("g0.strategy", "prune_only", "prune-only")],
 )
 def test_an_unknown_name_is_refused_with_the_nearest(
     setting: str, wrong: str, near: str, parts: Path

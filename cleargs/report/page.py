@@ -39,7 +39,7 @@ _SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
 
 TITLES = {
     "before": ("Before", "trained on the frames as filmed"),
-    "after": ("After", "trained on with repaired views"),
+    "after": ("After", "trained on, repairs included"),
 }
 """The two scenes, and what each is."""
 

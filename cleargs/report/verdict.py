@@ -127,8 +127,10 @@ def _harm(manifests: Mapping[str, Manifest]) -> str | None:
         return "the repairs did not pay off, so the first scene is also the last"
     change = after - before
     kind = "more" if change >= 0 else "less"
+    none = _figure(manifests, "consolidate", "repairs") == 0
+    lead = "no frame needed a repair; trained on" if none else "after the repairs"
     return (
-        "after the repairs, the scene explains training frames that were kept aside from them "
+        f"{lead}, the scene explains training frames that were kept aside from repairs "
         f"{abs(change):.1f} dB {kind} exactly ({decibel(before)} before, {decibel(after)} now)"
     )
 

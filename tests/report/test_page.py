@@ -179,13 +179,25 @@ def test_stale_results_are_shown_only_where_that_is_asked_for(
         assert "none tried" in text and "the restored frame" not in text
 
 
+def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    made = linked_manifest(run.folder, "consolidate")
+    assert made is not None
+    write_manifest(
+        run.folder / "consolidate", made.model_copy(update={"summary": {**made.summary, "repairs": 0}})
+    )
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    assert "No frame needed a repair" in text and "After the repairs" not in text
+
+
 def test_a_run_that_is_not_finished_has_a_report_too(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         for stage in ("rivr", "consolidate"):
             (run.folder / stage / "manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-        assert "no repair changed it" in text and "with repaired views" not in text
+        assert "no repair changed it" in text and "repairs included" not in text
         (run.folder / "g0/manifest.json").unlink()
         text = write_report(run.planner(Store(tmp_path, memo))).read_text()
         assert "no scene is trained yet" in text and 'id="stage"' not in text
