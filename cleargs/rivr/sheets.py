@@ -32,20 +32,27 @@ def write_before_after_sheet(
     repairs: Mapping[int, Selection],
     rivr: Path,
 ) -> None:
-    """One line a view: G0's render, the final render, the observation, and the repair that was distilled."""
+    """One line a view: G0's render, the final render, the observation, and, where any of the views has one,
+    the repair that was distilled."""
+    repaired = any(view.frame_id in repairs for view in views)
     lines = []
     for view in views:
-        row = repairs.get(view.frame_id)
-        repair = None if row is None else from_layer(read_exr(rivr / row.exr).layers[row.chosen])
-        lines.append(
-            [
-                Tile(before.render(view), f"frame {view.frame_id}: G0"),
-                Tile(after.render(view), "final"),
-                Tile(observation(view)[0], "observed"),
-                Tile(repair, "no repair" if row is None else f"repair: {row.chosen}, round {row.round}"),
-            ]
-        )
+        line = [
+            Tile(before.render(view), f"frame {view.frame_id}: G0"),
+            Tile(after.render(view), "final"),
+            Tile(observation(view)[0], "observed"),
+        ]
+        if repaired:
+            line.append(_repair(repairs.get(view.frame_id), rivr))
+        lines.append(line)
     write_rgb(path, contact_sheet(lines or [_nothing()]))
+
+
+def _repair(row: Selection | None, rivr: Path) -> Tile:
+    if row is None:
+        return Tile(None, "no repair")
+    image = from_layer(read_exr(rivr / row.exr).layers[row.chosen])
+    return Tile(image, f"repair: {row.chosen}, round {row.round}")
 
 
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:
