@@ -36,14 +36,14 @@ def preflight(config: G0Config) -> None:
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
-    buffers. A quarter more where frames are asked what their camera did."""
+    buffers."""
     from cleargs.capture.cost import capture_size, pace
     from cleargs.splat.effort import training_cost
 
     config = context.config
     count, megapixels = capture_size(context)
     seconds, memory = training_cost(config, count, megapixels)
-    seconds *= (1.3 if config.formation.enabled else 1.0) * pace(context.threads)
+    seconds *= pace(context.threads)
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
     return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
 

@@ -26,6 +26,8 @@ BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.
 
 # Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
+# And a megapixel of a frame that is asked what its camera did: the first time, and again.
+SEARCH_S, SEARCH_AGAIN_S = 4.0, 1.0
 
 Settings = TypeVar("Settings", bound="TrainConfig")
 
@@ -50,7 +52,12 @@ def training_cost(config: TrainConfig, frames: int, megapixels: float) -> tuple[
     gaussians = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
     seen = megapixels * (config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share)
     step = STEP_S + STEP_S_PER_MEGAPIXEL * seen + STEP_S_PER_GAUSSIAN * gaussians
-    return config.steps_for(frames) * step, 1.5e-6 * gaussians
+    steps, formation = config.steps_for(frames), config.formation
+    seconds = steps * step
+    if formation.enabled and frames:
+        again = max(0.0, (1.0 - formation.start) * steps / frames / formation.every - 1.0)
+        seconds += frames * megapixels * (SEARCH_S + SEARCH_AGAIN_S * again)
+    return seconds, 1.5e-6 * gaussians
 
 
 def quality_settings(quality: str) -> tuple[str, ...]:
