@@ -24,7 +24,7 @@ from cleargs.pipeline.session import (
 )
 from cleargs.progress import Reporter, SilentReporter, SilentTask, Task
 from cleargs.results import Prepared, Run, open_prepared
-from cleargs.splat.effort import Quality, quality_settings
+from cleargs.splat.effort import Quality, decided, quality_settings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -105,14 +105,15 @@ def initialise(
     """The scene that a training starts from: one Gaussian a sparse point, and more between them.
 
     ``views`` (default: all of ``capture``) give the colours of those in between; of ``config`` count
-    ``sh_degree``, ``min_points``, ``budget``, ``init_*``, ``antialias`` and ``background``.
+    ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``init_*``, ``antialias`` and ``background``.
     """
     from cleargs.capture.tables import load_observations
     from cleargs.splat.config import G0Config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.scene import Scene
 
-    views, config = capture.views() if views is None else views, config or G0Config()
+    views = capture.views() if views is None else views
+    config = decided(config or G0Config(), views)
     points, observations = capture.points, load_observations(capture.folder)
     frame_ids = [view.frame_id for view in views]
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)

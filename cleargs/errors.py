@@ -5,6 +5,15 @@ The command line turns each into its exit code and prints no traceback unless ``
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
+    """The hint for an unknown name: the nearest of ``known``, or ``otherwise`` where none is near."""
+    near = get_close_matches(name, list(known), n=1)
+    return f"did you mean {near[0]}?" if near else otherwise
+
 
 class CleargsError(Exception):
     """Base of every error that ClearGS raises on purpose: the work failed (exit code 1)."""

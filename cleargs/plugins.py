@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
 
 Socket = Literal["evaluators", "experts", "scorers", "strategies", "formats", "layouts", "backends"]
 
@@ -73,5 +72,4 @@ def require_known(socket: Socket, name: str, shipped: Iterable[str]) -> str:
     names = [*shipped, *plugins(socket)]
     if name in names:
         return name
-    near = get_close_matches(name, names, n=1)
-    raise ValueError(f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}")
+    raise ValueError(did_you_mean(name, names, f"choose {', '.join(names)}"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from pydantic import ValidationError
 
 from cleargs.batch.resources import Wanted
 from cleargs.batch.sheet import Problem, Row, SheetError, read_rows
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.config import Config, Document, check_document, merge, read_recipe
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import settings as flat
@@ -64,8 +63,7 @@ class _Checker:
         """The scene of ``row``; None where something is wrong with it, which is then among the problems."""
         before = len(self.problems)
         for name in row.values.keys() - set(FIELDS):
-            near = get_close_matches(name, FIELDS, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(FIELDS)}"
+            hint = did_you_mean(name, FIELDS, f"known: {', '.join(FIELDS)}")
             self._note(row.line_of(name), f"a scene has no field {name!r}; {hint}")
         name = self._name(row)
         source = self._source(row)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
 
@@ -83,12 +84,7 @@ def splat(
         write_json(out / "splat.json", values)
         plot_speed_error(out / "speed-error.png", benchmark)
         plot_scaling(out / "scaling.png", benchmark)
-    if as_json:
-        print_json(values)
-    elif out is None:
-        click.echo(text)
-    else:
-        click.echo(out / "splat.md")
+    _tell(text, values, out and out / "splat.md", as_json)
 
 
 def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, quiet: bool) -> None:
@@ -113,12 +109,7 @@ def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, qu
         if out is not None:  # after every case, since time on a GPU may end
             write_bytes(out / "splat-cuda.md", device_markdown(benchmark).encode())
             write_json(out / "splat-cuda.json", benchmark.as_json())
-    if as_json:
-        print_json(benchmark.as_json())
-    elif out is None:
-        click.echo(device_markdown(benchmark))
-    else:
-        click.echo(out / "splat-cuda.md")
+    _tell(device_markdown(benchmark), benchmark.as_json(), out and out / "splat-cuda.md", as_json)
 
 
 @bench.command(
@@ -201,12 +192,15 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
         write_bytes(out / "formation.md", text.encode())
         write_json(out / "formation.json", values)
         plot_formation(out / "formation.png", benchmark)
+    _tell(text, values, out and out / "formation.md", as_json)
+
+
+def _tell(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
+    """The figures on stdout, or where they were written."""
     if as_json:
         print_json(values)
-    elif out is None:
-        click.echo(text)
     else:
-        click.echo(out / "formation.md")
+        click.echo(written or text)
 
 
 def _with_unit(name: str, value: float | None) -> str:

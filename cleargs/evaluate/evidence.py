@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -29,6 +29,7 @@ from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
+from cleargs.splat.effort import training_cost
 from cleargs.synth.capture import make_capture
 from cleargs.untrusted import FAULTS, cause, read_text, shallow
 
@@ -197,35 +198,35 @@ def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> fl
     variants = []
     for variant in find_variants(section.variants):
         with suppress(ConfigError):  # its recipe is not there: it takes no time
-            config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, (), 0)
-            variants.append((variant, steps_of(config, section.frames)))
+            config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, section.settings, 0)
+            g0: Any = config.sections["g0"]
+            variants.append((variant, steps_of(config, section.frames), g0))
     seconds = 0.0
     columns = product(section.protocols or [""], section.captures or [""], section.seeds)
     for protocol, capture, seed in columns:
         sample = (protocol, capture, seed, section.frames, section.size, section.settings)
         seconds += _SAMPLE_S if first(sample) else 0.0
-        for factor, (variant, own) in product(section.factors, variants):
+        for factor, (variant, own, g0) in product(section.factors, variants):
             total = section.steps * factor
             if not first(sample, total, variant.name):
                 continue
-            steps = float(total)
+            whole = g0.model_copy(update={"steps": total})
+            training, _ = training_cost(whole, section.frames, megapixels)
             if variant.stage != "g0":
                 # Those that differ in RIVR alone share the first scene.
                 scene = (
                     variant.workflow,
-                    tuple(line for line in variant.overrides if line.startswith("rva")),
+                    tuple(line for line in variant.overrides if line.startswith(("rva", "g0"))),
                 )
-                steps *= 1.0 if first(sample, total, scene) else 1.0 - own.g0 / own.total
+                training *= 1.0 if first(sample, total, scene) else 1.0 - own.g0 / own.total
                 seconds += section.frames * own.rounds * (_REPAIR_S + _REPAIR_S_PER_MP * megapixels)
-            seconds += steps * (_STEP_S + _STEP_S_PER_MP * megapixels)
-            seconds += section.frames * (_JUDGE_S + _JUDGE_S_PER_MP * megapixels)
+            seconds += training + section.frames * (_JUDGE_S + _JUDGE_S_PER_MP * megapixels)
     return seconds
 
 
-# Wall seconds on two quiet cores: a part a unit and a part a megapixel. A step: docs/speed.md (0.027 s at
-# 0.125 MP). A judged frame, views off the path included: nearly all of it LPIPS with VGG. A repair: as RIVR
-# estimates. A sample: its capture, poses and cues.
-_STEP_S, _STEP_S_PER_MP = 0.012, 0.16
+# Wall seconds on two quiet cores: a part a unit and a part a megapixel. A judged frame, views off the path
+# included: nearly all of it LPIPS with VGG. A repair: as RIVR estimates. A sample: its capture, poses and
+# cues.
 _JUDGE_S, _JUDGE_S_PER_MP = 0.05, 10.0
 _REPAIR_S, _REPAIR_S_PER_MP = 0.3, 5.0
 _SAMPLE_S = 8.0

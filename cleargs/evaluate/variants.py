@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -100,9 +99,8 @@ def find_variants(names: Sequence[str]) -> tuple[Variant, ...]:
     known = [variant.name for variant in VARIANTS]
     for name in names:
         if name not in known:
-            near = get_close_matches(name, known, n=1)
             raise InputError(
                 f"no variant is called {name!r}",
-                hint=f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}",
+                hint=did_you_mean(name, known, f"choose among {', '.join(known)}"),
             )
     return tuple(variant for variant in VARIANTS if not names or variant.name in names)

@@ -7,14 +7,13 @@ Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embed
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from cleargs.errors import InputError, StageError
+from cleargs.errors import InputError, StageError, did_you_mean
 from cleargs.models.batches import in_batches
 from cleargs.models.installed import installable, installed_file, verify
 from cleargs.models.onnx import Device, OnnxModel
@@ -134,10 +133,9 @@ def expert_path(spec: str) -> Path | None:
         if spec in brought:
             return None
         names = [EMBEDDED, *(model.name for model in load_registry() if model.role == "expert"), *brought]
-        near = get_close_matches(spec, names, n=1)
         raise InputError(
             f"there is no restoration expert {spec!r}",
-            hint=f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}, or give an ONNX file",
+            hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
         )
     return path
 

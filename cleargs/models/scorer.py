@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
 from cleargs.models.batches import in_batches
 from cleargs.models.information import information
 from cleargs.models.installed import installable, installed_file, verify
@@ -156,9 +155,10 @@ def scorer_path(spec: str) -> Path | None:
     path = installed_file(spec, "scorer")
     if path is None and spec not in (brought := plugins("scorers")):
         known = [*(model.name for model in load_registry() if model.role == "scorer"), *brought]
-        near = get_close_matches(spec, known, n=1)
-        every = f"choose {', '.join(known)}, or give an ONNX file"
-        raise InputError(f"no scorer is called {spec!r}", hint=f"did you mean {near[0]}?" if near else every)
+        raise InputError(
+            f"no scorer is called {spec!r}",
+            hint=did_you_mean(spec, known, f"choose {', '.join(known)}, or give an ONNX file"),
+        )
     return path
 
 

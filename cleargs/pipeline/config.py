@@ -9,7 +9,6 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from cleargs.errors import ConfigError
+from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import allowed, inner_model, suggestion
 from cleargs.untrusted import FAULTS, MAX_NESTING, cause, read_text, shallow
@@ -74,10 +73,9 @@ def read_recipe(recipe: str) -> Document:
         return read_toml(Path(recipe))
     names = recipe_names()
     if recipe not in names:
-        near = get_close_matches(recipe, names, n=1)
         raise ConfigError(
             f"there is no workflow {recipe!r}",
-            hint=f"did you mean {near[0]}?" if near else f"choose {', '.join(names)}, or give a .toml file",
+            hint=did_you_mean(recipe, names, f"choose {', '.join(names)}, or give a .toml file"),
         )
     return parse_toml(files(RECIPES).joinpath(f"{recipe}.toml").read_text(encoding="utf-8"), f"{recipe}.toml")
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib import import_module
 from typing import cast
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
 
 
@@ -22,10 +21,9 @@ class Dag:
     def check(self, name: str) -> str:
         """``name``, when there is such a stage. Raises InputError with the nearest name otherwise."""
         if name not in self.names:
-            near = get_close_matches(name, self.names, n=1)
             raise InputError(
                 f"there is no stage {name!r}",
-                hint=f"did you mean {near[0]}?" if near else f"the stages are {', '.join(self.names)}",
+                hint=did_you_mean(name, self.names, f"the stages are {', '.join(self.names)}"),
             )
         return name
 
