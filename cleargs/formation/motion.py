@@ -30,7 +30,8 @@ def _still() -> Vector:
 class FrameMotion:
     """What happened while a frame was taken.
 
-    Twists [6] are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
+    Twists [6] say how the scene moved past the camera, in camera axes; the camera moved the other way.
+    They are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
     """
 
     blur: Vector = field(default_factory=_still)
@@ -60,7 +61,8 @@ def flow_basis(
     camera: Camera,
     nearness: Floats,  # [H, W] median depth over depth
 ) -> Floats:
-    """The image's flow under each component of a twist: [6, 2, H, W] pixels per unit.
+    """Where a pixel looks in the still image under each component of a twist of the scene past the camera:
+    [6, 2, H, W] pixels per unit. It is the flow that the same motion of the camera gives.
 
     The camera may be larger than ``nearness``, in proportion.
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).

@@ -16,9 +16,9 @@ from cleargs.tables import column, read_table, write_table
 
 _AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 _TWISTS = {
-    "pose": "from the pose as given to that at the middle of the exposure",
-    "blur": "of the camera from the start to the end of a row's exposure",
-    "skew": "of the camera from the first to the last row's exposure",
+    "pose": "of the scene past the camera from the pose as given to that at the middle of the exposure",
+    "blur": "of the scene past the camera from the start to the end of a row's exposure",
+    "skew": "of the scene past the camera from the first to the last row's exposure",
 }
 
 

@@ -121,7 +121,7 @@ class Warp:
         """[H, W, 4] -> [H + 2 margin, W + 2 margin, 4]."""
         height, width, channels = light.shape
         rows, columns = height + 2 * self.margin, width + 2 * self.margin
-        reach = min(math.ceil(self.fields.reach) + 2, rows)
+        reach = min(math.ceil(self.fields.reach) + 3, rows)
         count = -(-height // kernels.BAND)
         bands = np.empty((count, kernels.BAND + 2 * reach, columns, channels), np.float32)
         out = np.empty((rows, columns, channels), np.float32)

@@ -38,8 +38,20 @@ ALL = FrameMotion(
 )
 
 
+def tent(distance: torch.Tensor) -> torch.Tensor:
+    """Linear interpolation's share of a pixel at a distance."""
+    return (1 - distance.abs()).clamp(min=0)
+
+
+def keys(distance: torch.Tensor) -> torch.Tensor:
+    """The share that cubic convolution gives a pixel at a distance, as Keys (1981) writes it for a = -1/2."""
+    d = distance.abs()
+    near, far = 1.5 * d**3 - 2.5 * d**2 + 1, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2
+    return torch.where(d <= 1, near, torch.where(d < 2, far, torch.zeros_like(d)))
+
+
 def oracle(image: Doubles, fields: DisplacementFields, margin: int, points: Image) -> torch.Tensor:
-    """What `Warp.forward` should give, in float64 torch with autograd: the mean of bilinear looks-up."""
+    """What `Warp.forward` should give, in float64 torch with autograd: a mean of looks-up between pixels."""
     pixels = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     rows, columns = image.shape[:2]
     height, width = fields.radius.shape
@@ -54,11 +66,12 @@ def oracle(image: Doubles, fields: DisplacementFields, margin: int, points: Imag
             at_x.floor().clamp(max=max(columns - 2, 0)).long(),
             at_y.floor().clamp(max=max(rows - 2, 0)).long(),
         )
-        a, b = (at_x - i)[..., None], (at_y - j)[..., None]
-        i1, j1 = (i + 1).clamp(max=columns - 1), (j + 1).clamp(max=rows - 1)
-        above = (1 - a) * pixels[j, i] + a * pixels[j, i1]
-        below = (1 - a) * pixels[j1, i] + a * pixels[j1, i1]
-        total = total + (1 - b) * above + b * below
+        between = keys if len(points) == 1 else tent
+        for m in range(-1, 3):
+            for n in range(-1, 3):
+                share = between(at_y - j - m) * between(at_x - i - n)
+                pixel = pixels[(j + m).clamp(0, rows - 1), (i + n).clamp(0, columns - 1)]
+                total = total + share[..., None] * pixel
     total = total / len(points)
     total.image = pixels  # type: ignore[attr-defined]
     return total
@@ -75,11 +88,16 @@ def constant_fields(height: int, width: int, dx: float, dy: float, radius: float
     return DisplacementFields(np.zeros_like(sweep), sweep, disc, abs(dy) / 2 + radius)
 
 
+ROLLED = FrameMotion(skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
+
+
 @pytest.mark.parametrize("margin", [0, 12])
-def test_forward_and_transpose_equal_the_oracle(margin: int) -> None:
+@pytest.mark.parametrize("motion", [ALL, ROLLED], ids=["many samples", "one sample"])
+def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int) -> None:
     wide = np.pad(wall(), margin, mode="edge")
-    fields = displacement_fields(ALL, CAMERA, wide, np.ones_like(wide), margin)
+    fields = displacement_fields(motion, CAMERA, wide, np.ones_like(wide), margin)
     warp = Warp.of(fields, margin)
+    assert (len(warp.samples) == 1) == (motion is ROLLED)
     image = random_image(*wide.shape)
     expected = oracle(image[..., :3].astype(np.float64), fields, margin, warp.samples)
     made = warp.forward(image)[..., :3]
@@ -134,6 +152,17 @@ def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
     light = random_image(*wall().shape)
     back = warp.transpose(light)
     np.testing.assert_allclose(back.sum((0, 1), dtype=float), light.sum((0, 1), dtype=float), rtol=1e-5)
+
+
+def test_what_lies_between_pixels_stays_sharp() -> None:
+    """Half a pixel aside, linear interpolation leaves 87 % of waves of six pixels, cubics leave 95 %."""
+    waves = np.tile(np.cos(np.pi / 3 * np.arange(60)), (20, 1))
+    image = padded(np.repeat(waves[..., None], 3, axis=2).astype(np.float32))
+    fields = constant_fields(20, 60, 0.0, 0.0)
+    fields.offset[0] = 0.5
+    made = Warp.of(fields).forward(image)[:, 3:-3, 0]
+    expected = np.cos(np.pi / 3 * (np.arange(60) + 0.5))[3:-3]
+    assert np.abs(made - expected).max() < 0.06
 
 
 def test_a_still_frame_is_the_image_itself() -> None:

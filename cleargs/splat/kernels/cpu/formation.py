@@ -8,6 +8,9 @@ for ``samples`` (t, u, v): times t from -1/2 to 1/2 of its exposure, points (u, 
 are in pixels, [2, H, W] with x before y. The image is larger than the photograph by ``margin`` pixels on
 every side; beyond its border the border pixels go on.
 
+Between pixels the image is interpolated by lines, and by cubics where one sample is all (a rolling shutter
+without blur): lines would blur what such a frame shows sharp.
+
 A row's arithmetic does not depend on other rows, and the transpose adds up bands of rows of a fixed height in
 their order: results do not depend on the number of threads.
 """
@@ -36,6 +39,7 @@ MAX_NEARNESS = 4.0
 """Of a pixel, as a multiple of the median one: what floats before the lens would move by whole images."""
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
+_HALF = np.float32(0.5)
 
 
 @inlined
@@ -44,6 +48,24 @@ def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, 
     inside = min(max(position, _ZERO), last)
     first = np.int32(min(inside, max(last - _ONE, _ZERO)))
     return first, inside - np.float32(first)
+
+
+@inlined
+def _cubic(a: Any) -> tuple[Any, Any, Any, Any]:  # float32 -> 4 float32
+    """Shares of the four pixels about a place that lies ``a`` behind the second of them.
+
+    Source: Keys, "Cubic convolution interpolation for digital image processing" (1981), with -1/2.
+    """
+    b = _ONE - a
+    outer, inner = -_HALF * a * b, _HALF * a * b
+    return outer * b, b + inner * (b + b - a), a + inner * (a + a - b), outer * a
+
+
+@inlined
+def _neighbours(first: Any, count: Any) -> tuple[Any, Any, Any, Any]:  # int32, int64 -> 4 int64
+    """Indices of the four pixels about a place behind ``first``; beyond the border those at the border."""
+    at, last = np.int64(first), np.int64(count - 1)
+    return max(at - 1, 0), at, min(at + 1, last), min(at + 2, last)
 
 
 @inlined
@@ -137,6 +159,7 @@ def expose(
     right, bottom = np.float32(columns - 1), np.float32(rows - 1)
     beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
     share = _ONE / np.float32(len(samples))
+    cubic = len(samples) == 1
     for y in prange(height):
         for x in range(width):
             x0 = np.float32(x + margin) + offset[0, y, x]
@@ -146,6 +169,14 @@ def expose(
             for k in range(len(samples)):
                 i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
                 j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                if cubic:
+                    across, shares = _neighbours(i, columns), _cubic(a)
+                    down, parts = _neighbours(j, rows), _cubic(b)
+                    for m in range(4):
+                        for n in range(4):
+                            at = CHANNELS * (down[m] * columns + across[n])
+                            total = plus_scaled(total, load_pixel(image, at), parts[m] * shares[n])
+                    continue
                 at = CHANNELS * (np.int64(j) * columns + i)
                 total = plus_scaled(total, load_pixel(image, at), (_ONE - b) * (_ONE - a))
                 total = plus_scaled(total, load_pixel(image, at + beside), (_ONE - b) * a)
@@ -168,13 +199,14 @@ def spread(
 ) -> None:
     """The transpose of `expose`, before `gather`: what every pixel saw goes back to where it came from.
 
-    ``rows`` are those of the image; no pixel looks up or down by more than ``reach`` - 2 pixels.
+    ``rows`` are those of the image; no pixel looks up or down by more than ``reach`` - 3 pixels.
     """
     height, width, _ = light.shape
     columns = bands.shape[2]
     right, bottom = np.float32(columns - 1), np.float32(rows - 1)
     beside, below = CHANNELS * min(columns - 1, 1), CHANNELS * columns * min(rows - 1, 1)
     share = _ONE / np.float32(len(samples))
+    cubic = len(samples) == 1
     for band in prange(len(bands)):
         part = bands[band]
         part[:] = _ZERO
@@ -188,6 +220,14 @@ def spread(
                 for k in range(len(samples)):
                     i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
                     j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
+                    if cubic:
+                        across, shares = _neighbours(i, columns), _cubic(a)
+                        down, parts = _neighbours(j, rows), _cubic(b)
+                        for m in range(4):
+                            for n in range(4):
+                                at = CHANNELS * ((down[m] - first) * columns + across[n])
+                                _add(part, at, seen, parts[m] * shares[n])
+                        continue
                     at = CHANNELS * (np.int64(j - first) * columns + i)
                     _add(part, at, seen, (_ONE - b) * (_ONE - a))
                     _add(part, at + beside, seen, (_ONE - b) * a)
