@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 import cleargs
+from cleargs.bench.benchmark_plan import Case, DevicePlan
+from cleargs.bench.benchmark_results import Times
 from cleargs.bench.gsplat_cuda import GsplatRasteriser, load_gsplat
 from cleargs.bench.iteration import SSIM_LAMBDA, Iteration
 from cleargs.bench.oracle import Accuracy, accuracy, choose_pixels, oracle
-from cleargs.bench.plan import Case, DevicePlan
-from cleargs.bench.results import Times
-from cleargs.bench.scenes import random_scene
+from cleargs.bench.random_scenes import random_scene
 from cleargs.bench.timing import Clock, EventClock, Quartiles, ratio, take_turns
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cleargs.bench.probe import timed_kernels
-from cleargs.bench.scenes import random_image
+from cleargs.bench.random_scenes import random_image
 from cleargs.bench.timing import Clock
 from cleargs.splat.adam import adam_step
 from cleargs.splat.camera import Camera

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import click
 
-from cleargs.batch.engine import engine_command, is_local, only_batch, profile_folder, run_engine
 from cleargs.batch.folder import BatchFolder, Plan
-from cleargs.batch.prepare import Preparation
+from cleargs.batch.preparation import Preparation
 from cleargs.batch.scenes import Scene, read_scenes
 from cleargs.batch.sheet import SheetError
+from cleargs.batch.snakemake import engine_command, is_local, only_batch, profile_folder, run_engine
 from cleargs.batch.status import SceneState, scene_states
 from cleargs.cli.common import json_option, print_json, quality_option, quiet_option
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError, StageError
 from cleargs.pipeline.config import override
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device, usable_cores
 from cleargs.progress import Reporter, Task
-from cleargs.report.record import page_of
+from cleargs.report.report_json import page_of
 
 sheet_argument = click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
 folder_option = click.option(

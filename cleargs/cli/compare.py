@@ -18,7 +18,7 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.outcome import DONE_IN_PART
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
@@ -139,11 +139,11 @@ def compare(
     difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
     same command resumes where it stopped.
     """
-    from cleargs.evaluate.compared import compare_scenes
     from cleargs.evaluate.comparison import Recipe, Sample, existing, make_scenes
-    from cleargs.evaluate.tables import markdown, training_lines
+    from cleargs.evaluate.comparison_findings import compare_scenes
+    from cleargs.evaluate.comparison_tables import markdown, training_lines
     from cleargs.files import write_bytes, write_json
-    from cleargs.report.comparison import comparison_sheet, plot_comparison
+    from cleargs.report.comparison_pictures import comparison_sheet, plot_comparison
 
     runs = [source for source in sources if (source / RUN_FILE).is_file()]
     if runs and len(runs) != len(sources):

@@ -10,7 +10,7 @@ import click
 
 from cleargs.cli.common import quiet_option, threads_or_all, work_options
 from cleargs.cli.outcome import DONE_IN_PART
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
@@ -134,7 +134,7 @@ def _command(*, quick: bool, captures: bool, listed: bool) -> str:
 
 def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
     from cleargs.evaluate.variants import WHOLE
-    from cleargs.report.comparison import comparison_sheet, plot_comparison
+    from cleargs.report.comparison_pictures import comparison_sheet, plot_comparison
 
     if found.compared is None:
         return

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 
 ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
 """Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the

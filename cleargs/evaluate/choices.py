@@ -14,9 +14,9 @@ from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb_float
+from cleargs.parquet import read_table
 from cleargs.rivr.tables import read_selection
-from cleargs.synth.record import FRAMES
-from cleargs.tables import read_table
+from cleargs.synth.develop import FRAMES
 
 Image = NDArray[np.float32]
 Distance = Callable[[Image, Image], float]

@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.cells import Cell, ViewSet
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.results import Evaluation
+from cleargs.evaluate.equal_work import Work, decide_work, variant_config
+from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.variants import Variant
-from cleargs.evaluate.work import Work, decide_work, variant_config
 from cleargs.files import write_bytes
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag

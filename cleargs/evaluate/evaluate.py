@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StoreError
-from cleargs.evaluate.colour import apply_affine, fit_affine
+from cleargs.evaluate.colour_alignment import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, Report, mean_values, split_hash
 from cleargs.evaluate.metric_set import MetricSet, load_metrics
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.references import Reference, ReferenceView, reference_in, reference_of, require_match
 from cleargs.evaluate.refinement import refine_pose
-from cleargs.evaluate.results import Evaluation, ImageResult, Refinement, Report, mean_values, split_hash
 from cleargs.files import disk_error
 from cleargs.media.image import IMAGE_SUFFIXES, read_rgb, to_uint8, write_rgb
 from cleargs.pipeline.digest import file_digest

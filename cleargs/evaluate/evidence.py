@@ -20,17 +20,17 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cleargs.errors import CleargsError, ConfigError, InputError
-from cleargs.evaluate.compared import Compared, compare_scenes
 from cleargs.evaluate.comparison import Recipe, Sample, make_scenes
+from cleargs.evaluate.comparison_findings import Compared, compare_scenes
+from cleargs.evaluate.equal_work import steps_of, variant_config
 from cleargs.evaluate.variants import find_variants
-from cleargs.evaluate.work import steps_of, variant_config
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
 from cleargs.splat.effort import training_cost
-from cleargs.synth.capture import make_capture
+from cleargs.synth.synthetic_capture import make_capture
 from cleargs.untrusted import FAULTS, cause, read_text, shallow
 
 WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ingest.max_frames=60")

@@ -21,9 +21,9 @@ from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.capture.world import Similarity
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
+from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
-from cleargs.evaluate.results import Alignment, PosesFrom
 from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest

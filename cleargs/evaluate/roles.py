@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from cleargs.parquet import read_table
 from cleargs.rva.allocation import Role, Rule
 from cleargs.rva.tables import FRAMES
-from cleargs.tables import read_table
 
 FOR_COVERAGE = f"{Role.REACTIVATED} for {Rule.COVERAGE}"
 FOR_SHARE = f"{Role.REACTIVATED} for {Rule.ACTIVE_SHARE}"

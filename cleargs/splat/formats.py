@@ -16,11 +16,11 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.plugins import load_part, plugins
 from cleargs.splat.compressed_ply import write_compressed_ply
-from cleargs.splat.export import transform_scene
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.similarity import transform_scene
 from cleargs.splat.sog import write_sog
 from cleargs.splat.spz import spz
 from cleargs.splat.usd import write_usd

@@ -17,7 +17,8 @@ from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import layout, support
+from cleargs.splat.kernels import splat_layout
+from cleargs.splat.kernels.cuda import support
 from cleargs.splat.render import render
 
 pytestmark = pytest.mark.usefixtures("compare_on_device")
@@ -179,7 +180,7 @@ def test_depth_gradient_needs_a_forward_with_depth(device):
 
 
 def test_too_many_pairs_is_an_error(device, monkeypatch):
-    monkeypatch.setattr(layout, "MAX_PAIRS", 10)
+    monkeypatch.setattr(splat_layout, "MAX_PAIRS", 10)
     camera = make_camera(36, 27)
     with pytest.raises(StageError, match="pairs"):
         Engine(device).forward(make_gaussians(camera, 20).to(device), camera)

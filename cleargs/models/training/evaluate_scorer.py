@@ -20,7 +20,7 @@ from cleargs.models.lpips import Lpips
 from cleargs.models.scorer import CLARITY, NATURALNESS, load_scorer
 from cleargs.models.training import artefacts
 from cleargs.models.training.degrade import Degradation, Image, degrade, motion_kernel
-from cleargs.models.training.scorer import HELD_OUT
+from cleargs.models.training.train_scorer import HELD_OUT
 
 _VISIBLE = 0.02  # LPIPS from which on a fault is called visible
 _REDUCTION = 0.67

@@ -11,7 +11,7 @@ import torch
 from cleargs.splat.adam import adam_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import colour
+from cleargs.splat.kernels.cpu import affine_colour
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import photometric_loss, psnr
 
@@ -57,6 +57,9 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("PSNR", lambda: psnr(image, image)),
         ("PSNR with mask", lambda: psnr(image, image, mask)),
         ("Adam", lambda: adam_step(row, row.clone(), row.clone(), row.clone(), step=1, lr=0.0)),
-        ("exposure", lambda: colour.apply_affine(pixels, affine, pixels.copy())),
-        ("exposure backward", lambda: colour.affine_backward(pixels, affine, pixels, pixels.copy(), sums)),
+        ("exposure", lambda: affine_colour.apply_affine(pixels, affine, pixels.copy())),
+        (
+            "exposure backward",
+            lambda: affine_colour.affine_backward(pixels, affine, pixels, pixels.copy(), sums),
+        ),
     ]

@@ -11,8 +11,8 @@ from torch import Tensor
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import adam, densify, support
-from cleargs.splat.kernels.cuda.colour import affine_backward as affine_backward
-from cleargs.splat.kernels.cuda.colour import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.affine_colour import affine_backward as affine_backward
+from cleargs.splat.kernels.cuda.affine_colour import apply_affine as apply_affine
 from cleargs.splat.kernels.cuda.loss import Meter, Photometer
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.losses import PhotometricLoss

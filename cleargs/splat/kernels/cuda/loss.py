@@ -22,7 +22,7 @@ import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.support import memory_errors
 
 ROWS = 4
@@ -96,8 +96,8 @@ def window_rows(
         inside = (y < height) & (j >= 0) & (j < length)
         a = kept(image, mask, y, j, inside, length, HAS_MASK)
         b = kept(target, mask, y, j, inside, length, HAS_MASK)
-        weighted_a = a * layout.SSIM_WINDOW[tap]
-        weighted_b = b * layout.SSIM_WINDOW[tap]
+        weighted_a = a * device_layout.SSIM_WINDOW[tap]
+        weighted_b = b * device_layout.SSIM_WINDOW[tap]
         mean_x += weighted_a
         mean_y += weighted_b
         mean_xx += weighted_a * a
@@ -141,11 +141,11 @@ def measure(
         row = y + (tap - 5)
         inside = (row >= 0) & (row < height) & (i < length)
         at = sums + row * length + i
-        m += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        n += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        m += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        n += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     counts = here.to(tl.float32)
@@ -186,9 +186,9 @@ def window_maps(maps, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.cons
         j = i + 3 * (tap - 5)
         inside = (y < height) & (j >= 0) & (j < length)
         at = maps + y * length + j
-        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     at = sums + y * length + i
     here = (y < height) & (i < length)
     tl.store(at, by_mean, mask=here)
@@ -224,9 +224,9 @@ def differentiate(
         row = y + (tap - 5)
         inside = (row >= 0) & (row < height) & (i < length)
         at = sums + row * length + i
-        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     share = (1.0 / tl.maximum(tl.load(totals + 3), 1.0)).to(tl.float32)

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import disk_error, write_json
-from cleargs.tables import column, write_table
+from cleargs.parquet import column, write_table
 from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import cleargs
+from cleargs.bench.benchmark_plan import Case
 from cleargs.bench.oracle import Accuracy
 from cleargs.bench.peaks import Peaks
-from cleargs.bench.plan import Case
 from cleargs.bench.roofline import Roof
 from cleargs.bench.timing import Quartiles
 from cleargs.bench.work import Size

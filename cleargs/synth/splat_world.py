@@ -17,7 +17,7 @@ from cleargs.splat.engine import Engine
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.synth.course import CameraCourse, camera_course
-from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
@@ -32,7 +32,7 @@ class RealCamera:
 
 
 class SplatWorld:
-    """A Gaussian scene as a `cleargs.synth.world.World`; its lengths are the scene's own.
+    """A Gaussian scene as a `cleargs.synth.optics.World`; its lengths are the scene's own.
 
     The splatting core renders each pose once, with its own pixel filter; rows are taken from the pictures
     of their poses. Averages are taken of what a display would show, clipped to [0, 1], in linear light.

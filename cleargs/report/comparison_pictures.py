@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.evaluate.cells import Cell, Cells, ViewSet
-from cleargs.evaluate.results import Evaluation
-from cleargs.evaluate.tables import TITLES, metric_title
+from cleargs.evaluate.comparison_tables import TITLES, metric_title
+from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.report.contact import Tile, contact_sheet

@@ -1,7 +1,7 @@
 """Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one
 alone.
 
-    python -m cleargs.models.training.scorer --photos DIR --work DIR --out scorer.onnx
+    python -m cleargs.models.training.train_scorer --photos DIR --work DIR --out scorer.onnx
 
 The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times
 as much and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.bench.benchmark_results import Machine, describe_machine
 from cleargs.bench.iteration import WHOLE, Iteration, use_threads
-from cleargs.bench.results import Machine, describe_machine
-from cleargs.bench.scenes import surface_scene
+from cleargs.bench.random_scenes import surface_scene
 from cleargs.bench.timing import Clock, Quartiles, ratio, take_turns
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
