@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.common import json_option, output_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.session import resolve_device
 
@@ -28,9 +28,7 @@ Examples:
 How to read the tables: docs/speed.md.
 """
 )
-@click.option(
-    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
-)
+@output_option("Folder to fill.", "out", required=False)
 @click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
 @click.option("--threads", type=click.IntRange(1), help="Measured besides 1.  [default: all cores]")
 @click.option(
@@ -166,9 +164,7 @@ Examples:
   cleargs bench formation --quick --json
 """
 )
-@click.option(
-    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
-)
+@output_option("Folder to fill.", "out", required=False)
 @click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
 @click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
 @json_option

@@ -10,9 +10,11 @@ import click
 
 from cleargs.cli.common import (
     json_option,
+    output_option,
     print_json,
     quality_option,
     quiet_option,
+    report_option,
     stale_option,
     threads_or_all,
     work_options,
@@ -65,14 +67,7 @@ Examples:
 """
 )
 @click.argument("sources", metavar="CAPTURE|RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of the runs, tables, pictures and report; resumes if it exists.",
-)
+@output_option("Folder of the runs, tables, pictures and report; resumes if it exists.", "out")
 @click.option(
     "--variants",
     default="",
@@ -102,12 +97,7 @@ Examples:
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
 @quality_option
-@click.option(
-    "--report/--no-report",
-    "wants_report",
-    default=True,
-    help="Write OUT/report/index.html, the tables and pictures as a page.  [default: report]",
-)
+@report_option("Write OUT/report/index.html, the tables and pictures as a page.")
 @stale_option
 @work_options
 @json_option

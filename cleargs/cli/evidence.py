@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.cli.common import quiet_option, threads_or_all, work_options
+from cleargs.cli.common import output_option, quiet_option, threads_or_all, work_options
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
@@ -30,14 +30,7 @@ Examples:
   cleargs evidence -o evidence --quick --section mixed          one section alone
 """
 )
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of captures, runs and tables; resumes if it exists.",
-)
+@output_option("Folder of captures, runs and tables; resumes if it exists.", "out")
 @click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
 @click.option(
     "--captures",
