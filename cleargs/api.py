@@ -266,7 +266,8 @@ def evaluate_scene(
     the result maps metrics to figures. Raises InputError where nothing matches.
     """
     from cleargs.evaluate.config import EvalOptions
-    from cleargs.evaluate.evaluate import evaluate_scene, reference_in, reference_of
+    from cleargs.evaluate.evaluate import evaluate_scene
+    from cleargs.evaluate.references import reference_in, reference_of
     from cleargs.splat.scene import Scene
 
     directory, reporter = None if reference is None else Path(reference), _reporter(progress)

@@ -19,7 +19,8 @@ from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:
-    from cleargs.evaluate.evaluate import Evaluation, Reference, Report
+    from cleargs.evaluate.eval_report import Evaluation, Report
+    from cleargs.evaluate.references import Reference
 
 SCENE = "scene.ply"
 
@@ -153,9 +154,9 @@ def eval(
     warning = "" if run is None else require_fresh(dag, run, (dag.names[0], *scenes), stale=stale)
     nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
-    from cleargs.evaluate.eval_report import write_report
-    from cleargs.evaluate.evaluate import Report, evaluate_images, evaluate_scene, reference_in, reference_of
-    from cleargs.evaluate.references import views_trained_on
+    from cleargs.evaluate.eval_report import Report, write_report
+    from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
+    from cleargs.evaluate.references import reference_in, reference_of, views_trained_on
 
     reporter, count = make_reporter(quiet), threads_or_all(threads)
     reference: Reference

@@ -199,8 +199,7 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
 
 def _trained_on(made: Made, view_set: Views) -> int | None:
     """How many of the views show frames that the scene was trained on; None where that is not known."""
-    from cleargs.evaluate.evaluate import reference_of
-    from cleargs.evaluate.references import views_trained_on
+    from cleargs.evaluate.references import reference_of, views_trained_on
 
     reference = reference_of(
         made.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=SilentReporter()
@@ -248,7 +247,8 @@ def evaluated(
 
     One from an earlier call is taken where nothing changed.
     """
-    from cleargs.evaluate.evaluate import evaluate_scene, reference_of
+    from cleargs.evaluate.evaluate import evaluate_scene
+    from cleargs.evaluate.references import reference_of
 
     ingest = linked_manifest(made.run, "ingest")
     folders = (view_set.directory, view_set.align)

@@ -223,7 +223,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     if not entries:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     folder = mask_folder(directory / "images")
-    masks = {} if folder is None else _masks(folder)
+    masks = {} if folder is None else images_by_stem(folder)
     undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
@@ -236,7 +236,8 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     return _by_stem(listed)
 
 
-def _masks(folder: Path) -> dict[str, Path]:
+def images_by_stem(folder: Path) -> dict[str, Path]:
+    """The image files of a folder; of two of a stem, the later by name."""
     files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
     return {path.stem: path for path in files}
 

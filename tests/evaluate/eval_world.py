@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.capture.world import Similarity
-from cleargs.evaluate.evaluate import EvalOptions
+from cleargs.evaluate.config import EvalOptions
 from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.parquet import write_table
