@@ -108,8 +108,8 @@ def make_capture(
     (out / "images").mkdir(parents=True, exist_ok=True)
     with reporter.task(f"synth {protocol}", 2 * frames + len(novel)) as task:
         motions, depths, luminances = [], [], []
-        _make_folder(out / "truth" / "observed")
-        (out / "truth" / "observed" / "depth").mkdir()
+        for folder in ("observed/images", "observed/depth", "novel/images"):
+            (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose in zip(stems, times, poses, strict=True):
             depth = setting.world.depth(pose, setting.lens)
             write_depth(out / "truth" / "observed" / "depth" / f"{stem}.exr", depth)
@@ -136,7 +136,6 @@ def make_capture(
             shots = coded(out / "capture.mp4", shots, FPS)
         for image, shot in zip(images, shots, strict=True):
             write_image(out / image, shot, rules.jpeg)
-        _make_folder(out / "truth" / "novel")
         novel_stems = [f"{number:06d}" for number in range(len(novel))]
         for stem, pose in zip(novel_stems, novel, strict=True):
             _write_sharp(out / "truth" / "novel", stem, setting, pose, look)
@@ -232,10 +231,6 @@ def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: L
     light = setting.world.render(still(pose, setting.lens.height), setting.lens)
     write_image(folder / "images" / f"{stem}.png", develop(light, look=look))
     return light
-
-
-def _make_folder(folder: Path) -> None:
-    (folder / "images").mkdir(parents=True, exist_ok=True)
 
 
 def _novel_poses(course: Course, count: int, seed: int) -> Array:
