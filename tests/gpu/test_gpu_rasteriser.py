@@ -79,7 +79,7 @@ def test_behind_and_across_the_near_plane(device):
     engine = Engine(device)
     engine.forward(gaussians.to(device), camera)
     assert engine.visible[:7].tolist() == [False, False, False, False, True, True, True]
-    assert not engine.radii[:4].any()
+    assert not engine.visible[:4].any()
 
 
 @pytest.mark.parametrize("antialias", [False, True])

@@ -58,12 +58,6 @@ def photometric_loss(
     return PhotometricLoss(value, gradient, l1, similarity)
 
 
-def ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    with launch.exclusive():
-        _, similarity, _, _ = _measure(_pad(image, target, mask))
-    return similarity
-
-
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
     row_sums = np.empty((image.shape[0], 2), np.float64)
     with launch.exclusive():
