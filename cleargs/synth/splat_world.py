@@ -16,6 +16,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.views import view_of
 from cleargs.synth.course import CameraCourse, camera_course
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
 
@@ -130,15 +131,11 @@ def read_cameras(source: Path) -> list[RealCamera]:
 def _cameras_of_run(ingest: Path) -> list[RealCamera]:
     cameras = []
     for frame in load_frames(ingest):
-        pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-        numbers = [value for value in pose if value is not None]
-        if frame.registered and len(numbers) == 7:
+        if frame.registered:
+            camera = view_of(frame, ingest, 0.0).camera
             lens = Lens(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy)
-            camera = Camera.from_quaternion(
-                *numbers, width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
-            )
-            rotation = camera.world_to_camera[:3, :3].T
-            cameras.append(RealCamera(lens, np.column_stack([rotation, camera.centre])))
+            pose = np.column_stack([camera.world_to_camera[:3, :3].T, camera.centre])
+            cameras.append(RealCamera(lens, pose))
     return cameras
 
 
