@@ -7,7 +7,7 @@ __version__ = "0.2.0"
 # Loaded when first asked for, so that `import cleargs` costs nothing. Their types stand in __init__.pyi.
 _HOMES = {
     "run": "api",
-    **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "results"),
+    **dict.fromkeys(("open_run", "Run", "StageResults", "open_prepared", "Prepared"), "run_results"),
     **dict.fromkeys(("initialise", "train", "render_view", "save", "load"), "api"),
     **dict.fromkeys(("score_frames", "score", "restore", "deblur", "evaluate_scene"), "api"),
     "Camera": "splat.camera",

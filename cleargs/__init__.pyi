@@ -10,11 +10,11 @@ from cleargs.api import score as score
 from cleargs.api import score_frames as score_frames
 from cleargs.api import train as train
 from cleargs.errors import CleargsError as CleargsError
-from cleargs.results import Prepared as Prepared
-from cleargs.results import Run as Run
-from cleargs.results import StageResults as StageResults
-from cleargs.results import open_prepared as open_prepared
-from cleargs.results import open_run as open_run
+from cleargs.run_results import Prepared as Prepared
+from cleargs.run_results import Run as Run
+from cleargs.run_results import StageResults as StageResults
+from cleargs.run_results import open_prepared as open_prepared
+from cleargs.run_results import open_run as open_run
 from cleargs.splat.camera import Camera as Camera
 from cleargs.splat.config import G0Config as G0Config
 from cleargs.splat.config import TrainConfig as TrainConfig

@@ -23,7 +23,7 @@ from cleargs.pipeline.session import (
     usable_cores,
 )
 from cleargs.progress import Reporter, SilentReporter, SilentTask, Task
-from cleargs.results import Prepared, Run, open_prepared
+from cleargs.run_results import Prepared, Run, open_prepared
 from cleargs.splat.effort import Quality, decided, quality_settings
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cleargs.evaluate.config import EvalOptions
-    from cleargs.evaluate.results import Evaluation
+    from cleargs.evaluate.eval_report import Evaluation
     from cleargs.rivr.restoring import Deblurred
     from cleargs.splat.camera import Camera
     from cleargs.splat.config import G0Config, TrainConfig
@@ -266,7 +266,8 @@ def evaluate_scene(
     the result maps metrics to figures. Raises InputError where nothing matches.
     """
     from cleargs.evaluate.config import EvalOptions
-    from cleargs.evaluate.evaluate import evaluate_scene, reference_in, reference_of
+    from cleargs.evaluate.evaluate import evaluate_scene
+    from cleargs.evaluate.references import reference_in, reference_of
     from cleargs.splat.scene import Scene
 
     directory, reporter = None if reference is None else Path(reference), _reporter(progress)

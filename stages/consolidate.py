@@ -81,7 +81,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.harm import judge_harm
-    from cleargs.rivr.results import consolidation_summary
+    from cleargs.rivr.manifest_summary import consolidation_summary
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
     from cleargs.rivr.supervision import load_supervision

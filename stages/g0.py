@@ -55,6 +55,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.photograph import evaluate_views
     from cleargs.formation.table import write_formation
+    from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.splat.effort import decided
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
@@ -65,7 +66,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import train
     from cleargs.splat.views import real_views, require_views
-    from cleargs.tables import read_table, write_table
 
     config, ingest = context.config, context.inputs["ingest"]
     set_threads(context.threads)

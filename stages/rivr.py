@@ -105,8 +105,8 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.harm import judge_harm
+    from cleargs.rivr.manifest_summary import refused_repairs, summary
     from cleargs.rivr.restoring import Restorations
-    from cleargs.rivr.results import refused_repairs, summary
     from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.supervision import load_supervision

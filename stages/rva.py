@@ -61,11 +61,11 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     import numpy as np
 
     from cleargs.capture.tables import load_frames, load_observations
+    from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess
     from cleargs.rva.evaluator import View, label, make_evaluator
-    from cleargs.rva.results import bins_table, frames_table, poses_from, summary
     from cleargs.rva.tables import BINS, FRAMES
-    from cleargs.tables import write_table
+    from cleargs.rva.tabulate import bins_table, frames_table, poses_from, summary
 
     config, ingest = context.config, context.inputs["ingest"]
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]

@@ -11,7 +11,7 @@ from cleargs.capture.cameras import Pose, pinhole
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.tables import POINTS, load_frames
 from cleargs.formation.table import FORMATION
-from cleargs.tables import write_table
+from cleargs.parquet import write_table
 
 POINTS_XYZ = np.random.default_rng(0).uniform([-0.5, -0.3, 1.8], [0.5, 0.3, 2.2], (12, 3))
 

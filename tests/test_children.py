@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import cleargs
-from cleargs.batch.prepare import WATCHER
-from cleargs.bench.memory import peak_memory
+from cleargs.batch.preparation import WATCHER
+from cleargs.bench.peak_memory import peak_memory
 from cleargs.capture.child import run_child
 from cleargs.children import module_command
 from cleargs.errors import StageError
@@ -36,7 +36,7 @@ def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: P
         run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", 1, SilentReporter())
     assert "no.json" in (tmp_path / "log").read_text()
     subprocess.run(WATCHER, stderr=subprocess.DEVNULL, check=False)
-    subprocess.run([*module_command("cleargs.bench.memory")], stderr=subprocess.DEVNULL, check=False)
+    subprocess.run([*module_command("cleargs.bench.peak_memory")], stderr=subprocess.DEVNULL, check=False)
     assert not trap.exists()
 
 

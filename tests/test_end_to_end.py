@@ -18,7 +18,7 @@ from plyfile import PlyData
 
 from cleargs.progress import SilentReporter
 from cleargs.stages import STAGES
-from cleargs.synth.capture import make_capture
+from cleargs.synth.synthetic_capture import make_capture
 
 COMMAND = [sys.executable, "-c", "from cleargs.cli.main import main; main()"]
 SETTINGS = {

@@ -11,7 +11,7 @@ import pytest
 
 import cleargs as cg
 from cleargs.progress import SilentReporter
-from cleargs.synth.capture import make_capture
+from cleargs.synth.synthetic_capture import make_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

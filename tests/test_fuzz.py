@@ -37,18 +37,18 @@ from cleargs.media.encode import write_video
 from cleargs.media.exr import LayeredImage, read_exr, write_exr
 from cleargs.media.image import read_rgb
 from cleargs.media.video import read_timeline
+from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.config import read_toml
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.lease import living_holder
 from cleargs.pipeline.manifest import read_manifest
 from cleargs.progress import SilentReporter
-from cleargs.render.poses import read_poses
+from cleargs.render.pose_files import read_poses
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
-from cleargs.tables import read_table, write_table
 
 EXAMPLES = int(os.environ.get("CLEARGS_FUZZ", "60"))
 

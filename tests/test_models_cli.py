@@ -16,8 +16,8 @@ from cleargs.cli.models import models
 from cleargs.errors import InputError, StageError
 from cleargs.models import install as installer
 from cleargs.models.expert import expert_path, load_expert
-from cleargs.models.installed import installed_file, read_receipt, state, verify
 from cleargs.models.lpips import NETS, tensors_digest, weights_file
+from cleargs.models.model_folder import installed_file, read_receipt, state, verify
 from cleargs.models.registry import InstalledFile, Model, find_model, load_registry, model_dir
 from cleargs.models.scorer import scorer_path
 

@@ -11,13 +11,13 @@ import pytest
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
 from cleargs.evaluate.comparison import Sample
+from cleargs.evaluate.eval_report import read_report
 from cleargs.evaluate.evidence import read_evidence
-from cleargs.evaluate.results import read_report
 from cleargs.media.image import image_size
 from cleargs.models.fetch import read_checked
-from cleargs.models.installed import read_receipt
+from cleargs.models.model_folder import read_receipt
 from cleargs.models.registry import find_model
-from cleargs.report.record import noted
+from cleargs.report.report_json import noted
 from cleargs.rva.item_cache import ItemCache
 
 DEEP = "[" * 200_000

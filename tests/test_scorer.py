@@ -21,8 +21,8 @@ from cleargs.models.tile_mean import mean_over_tiles
 from cleargs.models.training import artefacts
 from cleargs.models.training.degrade import disc_kernel, motion_kernel
 from cleargs.models.training.naturalness import fit
-from cleargs.models.training.scorer import QualityNet, predict, train
 from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, load_pairs, make_pairs
+from cleargs.models.training.train_scorer import QualityNet, predict, train
 
 Image = NDArray[np.float32]
 

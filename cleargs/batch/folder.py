@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from cleargs.batch.resources import Resources
 from cleargs.errors import StoreError
 from cleargs.files import write_bytes
 from cleargs.pipeline.manifest import Manifest
+from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 
 M = TypeVar("M", bound=BaseModel)
@@ -30,19 +31,15 @@ M = TypeVar("M", bound=BaseModel)
 Doing = Literal["running", "done", "partial", "failed", "interrupted", "requeued"]
 
 
-class Handle(BaseModel):
+class Handle(Record):
     """What Snakemake sees of a finished stage. No key and no time: those would make later stages stale."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     digest: str
     status: Literal["complete", "partial"]
 
 
-class Status(BaseModel):
+class Status(Record):
     """What the job of one stage did last."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     state: Doing
     node: str
@@ -55,10 +52,8 @@ class Status(BaseModel):
     cause: str = ""
 
 
-class Plan(BaseModel):
+class Plan(Record):
     """What the Snakefile is told."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     watcher: tuple[str, ...]
     """The command that runs one job and notes what becomes of it."""

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cleargs.batch.folder import BatchFolder, Doing, Handle, Status
-from cleargs.batch.watch import SlurmJob, run_watched
+from cleargs.batch.slurm_watch import SlurmJob, run_watched
 
 PARTIAL, INTERRUPTED = 3, 130
 TOO_EARLY = -signal.SIGINT

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.stage import Estimate
+from cleargs.record import Record
 
 GPU_STAGES = ("rva", "g0", "rivr", "consolidate")
 """Stages that compute on the GPU where the run's device is one."""
@@ -18,10 +19,8 @@ MEMORY_ROOM, MIN_MEMORY_GB = 1.5, 2.0
 CPUS = 4
 
 
-class Wanted(BaseModel):
+class Wanted(Record):
     """``[resources.STAGE]`` of a sheet: each field replaces what would follow from the estimate."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cpus: int | None = Field(None, ge=1, le=1024, description="CPU cores, also the number of threads")
     memory_gb: float | None = Field(None, gt=0, le=100_000, description="memory, GB (1000 MB)")
@@ -31,10 +30,8 @@ class Wanted(BaseModel):
     gpus: int | None = Field(None, ge=0, le=64, description="GPUs")
 
 
-class Resources(BaseModel):
+class Resources(Record):
     """What one job asks for, in Snakemake's units."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     threads: int
     mem_mb: int

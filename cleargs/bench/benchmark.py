@@ -10,12 +10,8 @@ import torch
 from torch import Tensor
 
 from cleargs.bench import torch_tiles
-from cleargs.bench.iteration import Iteration, projected_frame, use_threads
-from cleargs.bench.memory import peak_memory
-from cleargs.bench.oracle import Accuracy, Truth, accuracy, choose_pixels, oracle
-from cleargs.bench.peaks import measure_peaks
-from cleargs.bench.plan import Case, Plan
-from cleargs.bench.results import (
+from cleargs.bench.benchmark_plan import Case, Plan
+from cleargs.bench.benchmark_results import (
     Benchmark,
     Rasterisers,
     Rooflines,
@@ -24,8 +20,12 @@ from cleargs.bench.results import (
     TorchTimes,
     describe_machine,
 )
+from cleargs.bench.iteration import Iteration, projected_frame, use_threads
+from cleargs.bench.oracle import Accuracy, Truth, accuracy, choose_pixels, oracle
+from cleargs.bench.peak_memory import peak_memory
+from cleargs.bench.peaks import measure_peaks
+from cleargs.bench.random_scenes import random_scene
 from cleargs.bench.roofline import roofline
-from cleargs.bench.scenes import random_scene
 from cleargs.bench.timing import Clock, Quartiles, ratio, take_turns
 from cleargs.bench.work import size_of, work_of
 from cleargs.progress import Reporter

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 import cleargs
+from cleargs.bench.benchmark_plan import Case, DevicePlan
+from cleargs.bench.benchmark_results import Times, named
 from cleargs.bench.gsplat_cuda import GsplatRasteriser, load_gsplat
 from cleargs.bench.iteration import SSIM_LAMBDA, Iteration
 from cleargs.bench.oracle import Accuracy, accuracy, choose_pixels, oracle
-from cleargs.bench.plan import Case, DevicePlan
-from cleargs.bench.results import Times
-from cleargs.bench.scenes import random_scene
+from cleargs.bench.random_scenes import random_scene
 from cleargs.bench.timing import Clock, EventClock, Quartiles, ratio, take_turns
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
@@ -61,12 +61,8 @@ class DeviceBenchmark:
 
     def as_json(self) -> dict[str, Any]:
         """Plain dictionaries and lists; a Case becomes an object with named fields."""
-        plain: dict[str, Any] = asdict(self, dict_factory=_named)
+        plain: dict[str, Any] = asdict(self, dict_factory=named)
         return plain
-
-
-def _named(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {name: value._asdict() if isinstance(value, Case) else value for name, value in items}
 
 
 class DeviceIteration(Iteration):
@@ -83,8 +79,7 @@ class DeviceIteration(Iteration):
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
         """Several iterations, then the losses are read."""
-        for _ in range(repetitions):
-            self.run(clock)
+        super().run_several(repetitions, clock)
         self._meter.take()
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cleargs.bench.formation import FORMED, PLAIN, FormationBenchmark
+from cleargs.bench.formation_cost import FORMED, PLAIN, FormationBenchmark
 from cleargs.bench.markdown import machine_line, milliseconds, table
-from cleargs.bench.pictures import COLOURS, save, show_plain_numbers
+from cleargs.bench.plots import COLOURS, save, show_plain_numbers
 
 
 def formation_markdown(benchmark: FormationBenchmark) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cleargs.bench.scenes import random_image
+from cleargs.bench.random_scenes import random_image
 from cleargs.bench.timing import Clock
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from cleargs.bench.probe import timed_kernels
-from cleargs.bench.scenes import random_image
+from cleargs.bench.random_scenes import random_image
 from cleargs.bench.timing import Clock
-from cleargs.splat.adam import adam_step
+from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
@@ -40,9 +40,8 @@ class Iteration:
         self.engine = Engine(device)
         self._target = random_image(camera.width, camera.height).to(device)
         self._slope = torch.empty_like(self._target)
-        tensors = self.gaussians.tensors()
-        self._first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
-        self._second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        self._moments = Moments.zeros(self.gaussians)
+        self._rates: dict[str, float | Tensor] = dict.fromkeys(self.gaussians.tensors(), 0.0)
         self._step = 0
 
     def run(self, clock: Clock) -> None:
@@ -54,17 +53,9 @@ class Iteration:
             with clock.time("loss"):
                 slope = self.differentiate(image)
             with clock.time("backward"):
-                gradients = self.backward(slope).tensors()
+                gradients = self.backward(slope)
             with clock.time("adam"):
-                for name, tensor in self.gaussians.tensors().items():
-                    adam_step(
-                        tensor,
-                        gradients[name],
-                        self._first[name],
-                        self._second[name],
-                        step=self._step,
-                        lr=0.0,
-                    )
+                step_gaussians(self.gaussians, gradients, self._moments, self._rates, step=self._step)
 
     def image(self) -> Tensor:
         """What is compared with the target: [H, W, 3]."""
@@ -78,12 +69,16 @@ class Iteration:
         """The gradient of the loss by the image [H, W, 3]."""
         return photometric_loss(image, self._target, ssim_lambda=SSIM_LAMBDA, gradient=self._slope).grad_image
 
+    def run_several(self, repetitions: int, clock: Clock) -> None:
+        """Several iterations."""
+        for _ in range(repetitions):
+            self.run(clock)
+
     def run_on(self, threads: int, repetitions: int, clock: Clock) -> None:
         """Several iterations on so many threads, every kernel timed as well."""
         use_threads(threads)
         with timed_kernels(clock):
-            for _ in range(repetitions):
-                self.run(clock)
+            self.run_several(repetitions, clock)
 
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
         """Copies, on the CPU, of the rendered image [H, W, 3] and of the gradients for dL/d(image)

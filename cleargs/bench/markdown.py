@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from cleargs.bench.benchmark_results import Benchmark, Machine, Rooflines, Row, ScalingPoint
 from cleargs.bench.iteration import PARTS, WHOLE
 from cleargs.bench.oracle import MARGIN, Accuracy, Error
-from cleargs.bench.results import Benchmark, Machine, Rooflines, Row, ScalingPoint
 from cleargs.bench.scaling import straight_line
 from cleargs.bench.timing import Quartiles
 from cleargs.splat.kernels.cpu.simd import LANES

@@ -20,7 +20,7 @@ from cleargs.splat.kernels.cpu.jit import Array, Floats, kernel
 from cleargs.splat.kernels.cpu.pipeline import Frame
 from cleargs.splat.kernels.cpu.rasterise import PIECES
 from cleargs.splat.kernels.cpu.simd import LANES
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.splat_layout import (
     BEND_X,
     BEND_Y,
     LOG2_OPACITY,

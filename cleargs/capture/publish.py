@@ -19,8 +19,8 @@ from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.errors import StageError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
+from cleargs.parquet import write_table
 from cleargs.progress import Reporter
-from cleargs.tables import write_table
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.tables import column, read_table
+from cleargs.parquet import column, read_table
 
 _POSE = "world to camera (COLMAP, OpenCV axes); null when unregistered"
 

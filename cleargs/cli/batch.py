@@ -9,30 +9,35 @@ from pathlib import Path
 
 import click
 
-from cleargs.batch.engine import engine_command, is_local, only_batch, profile_folder, run_engine
 from cleargs.batch.folder import BatchFolder, Plan
-from cleargs.batch.prepare import Preparation
+from cleargs.batch.preparation import Preparation
 from cleargs.batch.scenes import Scene, read_scenes
 from cleargs.batch.sheet import SheetError
+from cleargs.batch.snakemake import engine_command, is_local, only_batch, profile_folder, run_engine
 from cleargs.batch.status import SceneState, scene_states
-from cleargs.cli.common import json_option, print_json, quality_option, quiet_option
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.common import (
+    json_option,
+    output_option,
+    print_json,
+    quality_option,
+    quiet_option,
+    report_option,
+)
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError, StageError
 from cleargs.pipeline.config import override
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device, usable_cores
 from cleargs.progress import Reporter, Task
-from cleargs.report.record import page_of
+from cleargs.report.report_json import page_of
 
 sheet_argument = click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
-folder_option = click.option(
-    "-o",
-    "--output",
+folder_option = output_option(
+    "The folder of the batch, on a disk that all nodes share.  [default: SHEET with the ending .batch]",
     "folder",
     metavar="BATCH",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="The folder of the batch, on a disk that all nodes share.  [default: SHEET with the ending .batch]",
+    required=False,
 )
 
 
@@ -61,13 +66,7 @@ Examples:
     show_default=True,
     help="Where to compute. Today auto is the CPU.",
 )
-@click.option(
-    "--report/--no-report",
-    "wants_report",
-    default=True,
-    help="Write a report of every scene, and BATCH/report/index.html, which leads to them.  "
-    "[default: report]",
-)
+@report_option("Write a report of every scene, and BATCH/report/index.html, which leads to them.")
 @click.option("--cores", type=click.IntRange(min=1), help="Cores for local jobs.  [default: all]")
 @json_option
 @quiet_option

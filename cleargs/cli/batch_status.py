@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cleargs.batch.engine import engine_at_work
+from cleargs.batch.snakemake import engine_at_work
 from cleargs.batch.status import scene_states
 from cleargs.cli.batch import batch_folder, folder_option, print_states, sheet_argument
 from cleargs.cli.common import json_option

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.common import json_option, output_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.session import resolve_device
 
 
@@ -28,9 +28,7 @@ Examples:
 How to read the tables: docs/speed.md.
 """
 )
-@click.option(
-    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
-)
+@output_option("Folder to fill.", "out", required=False)
 @click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
 @click.option("--threads", type=click.IntRange(1), help="Measured besides 1.  [default: all cores]")
 @click.option(
@@ -67,9 +65,9 @@ def splat(
     import dataclasses
 
     from cleargs.bench.benchmark import run
+    from cleargs.bench.benchmark_plan import full_plan, quick_plan
     from cleargs.bench.markdown import markdown
-    from cleargs.bench.pictures import plot_scaling, plot_speed_error
-    from cleargs.bench.plan import full_plan, quick_plan
+    from cleargs.bench.plots import plot_scaling, plot_speed_error
     from cleargs.files import write_bytes, write_json
     from cleargs.splat.kernels.runtime import warm_up
 
@@ -93,7 +91,7 @@ def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, qu
     resolve_device("cuda", click.echo)
     import torch
 
-    from cleargs.bench.plan import device_plan, quick_device_plan
+    from cleargs.bench.benchmark_plan import device_plan, quick_device_plan
     from cleargs.files import write_bytes, write_json
     from cleargs.splat.kernels.cuda import support
 
@@ -141,8 +139,8 @@ def train(
 ) -> None:
     """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error."""
     from cleargs.bench.benchmark import measure
+    from cleargs.bench.benchmark_plan import Case, Plan
     from cleargs.bench.iteration import PARTS, WHOLE
-    from cleargs.bench.plan import Case, Plan
 
     count = threads_or_all(threads)
     case = Case(gaussians, width, height)
@@ -166,9 +164,7 @@ Examples:
   cleargs bench formation --quick --json
 """
 )
-@click.option(
-    "-o", "--output", "out", type=click.Path(file_okay=False, path_type=Path), help="Folder to fill."
-)
+@output_option("Folder to fill.", "out", required=False)
 @click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
 @click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
 @json_option
@@ -179,7 +175,7 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
     Blurs of 3, 10 and 30 px: a step that takes the frame for sharp, one through image formation, and the mean
     of 3 to 17 renders along the path. The truth is the mean of many renders.
     """
-    from cleargs.bench.formation import plan_of, run
+    from cleargs.bench.formation_cost import plan_of, run
     from cleargs.bench.formation_report import formation_markdown, plot_formation
     from cleargs.files import write_bytes, write_json
     from cleargs.splat.kernels.runtime import warm_up

@@ -15,11 +15,13 @@ from cleargs.splat.effort import Quality, quality_settings
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+FOLDER = click.Path(file_okay=False, path_type=Path)
+
 store_option = click.option(
     "--store",
     envvar="CLEARGS_STORE",
     show_envvar=True,
-    type=click.Path(file_okay=False, path_type=Path),
+    type=FOLDER,
     help="Where results are kept; may be shared by runs.  [default: RUN/.store]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -30,7 +32,21 @@ partial_option = click.option(
 stale_option = click.option(
     "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
 )
-run_argument = click.argument("run", type=click.Path(file_okay=False, path_type=Path))
+run_argument = click.argument("run", type=FOLDER)
+
+
+def output_option(
+    help: str, name: str, *, metavar: str | None = None, required: bool = True
+) -> Callable[[F], F]:
+    """``-o`` of a command that fills a folder."""
+    return click.option("-o", "--output", name, metavar=metavar, required=required, type=FOLDER, help=help)
+
+
+def report_option(help: str) -> Callable[[F], F]:
+    """``--report`` of a command that leaves a page at its end, unless it is told not to."""
+    return click.option(
+        "--report/--no-report", "wants_report", default=True, help=f"{help}  [default: report]"
+    )
 
 
 def parse_size(

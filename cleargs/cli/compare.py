@@ -10,15 +10,17 @@ import click
 
 from cleargs.cli.common import (
     json_option,
+    output_option,
     print_json,
     quality_option,
     quiet_option,
+    report_option,
     stale_option,
     threads_or_all,
     work_options,
 )
 from cleargs.cli.outcome import DONE_IN_PART
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.evaluate.variants import BASELINES, VARIANTS, find_variants
@@ -65,14 +67,7 @@ Examples:
 """
 )
 @click.argument("sources", metavar="CAPTURE|RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of the runs, tables, pictures and report; resumes if it exists.",
-)
+@output_option("Folder of the runs, tables, pictures and report; resumes if it exists.", "out")
 @click.option(
     "--variants",
     default="",
@@ -102,12 +97,7 @@ Examples:
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
 @quality_option
-@click.option(
-    "--report/--no-report",
-    "wants_report",
-    default=True,
-    help="Write OUT/report/index.html, the tables and pictures as a page.  [default: report]",
-)
+@report_option("Write OUT/report/index.html, the tables and pictures as a page.")
 @stale_option
 @work_options
 @json_option
@@ -139,11 +129,11 @@ def compare(
     difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
     same command resumes where it stopped.
     """
-    from cleargs.evaluate.compared import compare_scenes
     from cleargs.evaluate.comparison import Recipe, Sample, existing, make_scenes
-    from cleargs.evaluate.tables import markdown, training_lines
+    from cleargs.evaluate.comparison_findings import compare_scenes
+    from cleargs.evaluate.comparison_tables import markdown, training_lines
     from cleargs.files import write_bytes, write_json
-    from cleargs.report.comparison import comparison_sheet, plot_comparison
+    from cleargs.report.comparison_pictures import comparison_sheet, plot_comparison
 
     runs = [source for source in sources if (source / RUN_FILE).is_file()]
     if runs and len(runs) != len(sources):

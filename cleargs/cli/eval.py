@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from cleargs.cli.common import json_option, print_json, quiet_option, stale_option, threads_or_all
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
@@ -19,7 +19,8 @@ from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:
-    from cleargs.evaluate.evaluate import Evaluation, Reference, Report
+    from cleargs.evaluate.eval_report import Evaluation, Report
+    from cleargs.evaluate.references import Reference
 
 SCENE = "scene.ply"
 
@@ -153,9 +154,9 @@ def eval(
     warning = "" if run is None else require_fresh(dag, run, (dag.names[0], *scenes), stale=stale)
     nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
-    from cleargs.evaluate.evaluate import Report, evaluate_images, evaluate_scene, reference_in, reference_of
-    from cleargs.evaluate.references import views_trained_on
-    from cleargs.evaluate.results import write_report
+    from cleargs.evaluate.eval_report import Report, write_report
+    from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
+    from cleargs.evaluate.references import reference_in, reference_of, views_trained_on
 
     reporter, count = make_reporter(quiet), threads_or_all(threads)
     reference: Reference
@@ -214,7 +215,7 @@ def eval(
 
 def _older(run: Path, path: Path) -> Report:
     """The evaluations in ``path`` of scenes that are still those of ``run``."""
-    from cleargs.evaluate.results import Report, read_report
+    from cleargs.evaluate.eval_report import Report, read_report
 
     try:
         found = read_report(path).evaluations
@@ -320,7 +321,7 @@ def _provenance(evaluation: Evaluation) -> str:
 
 
 def _label(metric: str) -> str:
-    from cleargs.evaluate.results import LOWER_IS_BETTER
+    from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 
     return f"{_LABELS.get(metric, Path(metric).stem)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
 

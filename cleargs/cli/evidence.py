@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.cli.common import quiet_option, threads_or_all, work_options
+from cleargs.cli.common import output_option, quiet_option, threads_or_all, work_options
 from cleargs.cli.outcome import DONE_IN_PART
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
@@ -30,14 +30,7 @@ Examples:
   cleargs evidence -o evidence --quick --section mixed          one section alone
 """
 )
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder of captures, runs and tables; resumes if it exists.",
-)
+@output_option("Folder of captures, runs and tables; resumes if it exists.", "out")
 @click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
 @click.option(
     "--captures",
@@ -134,7 +127,7 @@ def _command(*, quick: bool, captures: bool, listed: bool) -> str:
 
 def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
     from cleargs.evaluate.variants import WHOLE
-    from cleargs.report.comparison import comparison_sheet, plot_comparison
+    from cleargs.report.comparison_pictures import comparison_sheet, plot_comparison
 
     if found.compared is None:
         return

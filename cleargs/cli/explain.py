@@ -8,7 +8,7 @@ import click
 
 from cleargs.cli.common import json_option, run_argument, store_option, threads_or_all
 from cleargs.cli.outcome import print_plans
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file

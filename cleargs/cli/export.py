@@ -96,7 +96,7 @@ def export(
 ) -> None:
     """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
     beside it."""
-    from cleargs.cli.selection import cropped, parse_crop, parse_prune, pruned
+    from cleargs.cli.export_pruning import cropped, parse_crop, parse_prune, pruned
     from cleargs.splat.formats import check_options, format_of, padded, write_scene
 
     kind, version = format_of(output), None if spz_version is None else int(spz_version)
@@ -116,8 +116,8 @@ def export(
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.splat.cameras_json import cameras_json
-    from cleargs.splat.export import transform_scene
     from cleargs.splat.ply import read_ply
+    from cleargs.splat.similarity import transform_scene
     from cleargs.splat.views import view_of
 
     ingest = run / dag.names[0]

@@ -8,7 +8,7 @@ import click
 
 from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
-from cleargs.models.installed import state
+from cleargs.models.model_folder import state
 from cleargs.models.registry import Source, find_model, load_registry, model_dir
 from cleargs.untrusted import cause, read_bytes
 
@@ -116,7 +116,7 @@ def convert(checkpoint: Path, output: Path, tile: int) -> None:
 @json_option
 def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> None:
     """Check the files of the models NAMES; without names, of all that are there."""
-    from cleargs.models.installed import verify as verify_model
+    from cleargs.models.model_folder import verify as verify_model
 
     folder = directory or model_dir()
     chosen = [find_model(name) for name in names] or [

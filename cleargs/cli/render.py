@@ -17,7 +17,7 @@ from cleargs.cli.common import (
     threads_or_all,
     work_options,
 )
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh

@@ -18,7 +18,7 @@ from cleargs.cli.common import (
     store_option,
     threads_or_all,
 )
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import require_fresh
@@ -73,7 +73,7 @@ def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
 
     A report that shows these results already stays.
     """
-    from cleargs.report.record import LastRun, is_current, linked_manifests, page_of
+    from cleargs.report.report_json import LastRun, is_current, linked_manifests, page_of
 
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
@@ -94,7 +94,7 @@ def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
 
 def older_report(run: Path, dag: Dag) -> str:
     """The line that tells of a report of ``run`` that does not show its present results; "" for none."""
-    from cleargs.report.record import is_current, linked_manifests, page_of
+    from cleargs.report.report_json import is_current, linked_manifests, page_of
 
     page = page_of(run)
     if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):

@@ -8,16 +8,18 @@ import click
 
 from cleargs.cli.common import (
     json_option,
+    output_option,
     partial_option,
     print_json,
     quality_option,
     quiet_option,
+    report_option,
     store_option,
     threads_or_all,
     work_options,
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.report import older_report, report_on
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
@@ -38,15 +40,7 @@ Examples:
 """
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    "folder",
-    metavar="RUN",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="The run folder; the run resumes if it exists.",
-)
+@output_option("The run folder; the run resumes if it exists.", "folder", metavar="RUN")
 @click.option(
     "--workflow",
     metavar="NAME|FILE.toml",
@@ -67,12 +61,7 @@ Examples:
 @click.option(
     "--force", multiple=True, metavar="STAGE", help="Make the stage again, even if its results are there."
 )
-@click.option(
-    "--report/--no-report",
-    "wants_report",
-    default=True,
-    help="Write RUN/report/index.html at the end, as `cleargs report` does.  [default: report]",
-)
+@report_option("Write RUN/report/index.html at the end, as `cleargs report` does.")
 @click.option("--dry-run", is_flag=True, help="Only say what would be done, why, and what it costs.")
 @partial_option
 @work_options

@@ -18,7 +18,7 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.outcome import DONE_IN_PART
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.rva_check import check
 from cleargs.errors import InputError
 from cleargs.pipeline.config import Config, check_document, merge, parse_override
@@ -157,9 +157,9 @@ def _own_cues(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Frame]) -
     """The cues in the run's own table, where this evaluator made them of these images; else None."""
     import numpy as np
 
+    from cleargs.parquet import read_table
     from cleargs.rva.agreement import EvaluatorCues
     from cleargs.rva.tables import CUE_COLUMNS, FRAMES
-    from cleargs.tables import read_table
 
     made, ingest = linked_manifest(run, "rva"), linked_manifest(run, "ingest")
     if made is None or ingest is None or made.missing or made.parts.version != dag.load("rva").VERSION:

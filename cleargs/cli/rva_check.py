@@ -64,11 +64,11 @@ def _check(run: Path, dag: Dag) -> Check:
     """Raises InputError where the run has no table of RVA, or its capture no truth."""
     import numpy as np
 
+    from cleargs.parquet import read_table
     from cleargs.rva.scores import Floats
     from cleargs.rva.tables import B_CUES, FRAMES
     from cleargs.rva.truth import Faults, check
-    from cleargs.synth.record import FRAMES as TRUE_FRAMES
-    from cleargs.tables import read_table
+    from cleargs.synth.develop import FRAMES as TRUE_FRAMES
 
     source = read_run_file(run, dag).source
     if linked_manifest(run, "rva") is None:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from cleargs.cli.common import json_option, print_json, run_argument, stale_option
-from cleargs.cli.frames import COLUMNS, frame_rows, short_name
+from cleargs.cli.frame_reasons import COLUMNS, frame_rows, short_name
+from cleargs.cli.manifest_words import headlines, in_words, text_of
 from cleargs.cli.summary import describe_table, sampled_rows
-from cleargs.cli.words import headlines, in_words, text_of
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.freshness import Reasons, require_fresh, stale_stages
@@ -152,7 +152,7 @@ def show(
 
 def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, stale: bool, as_json: bool) -> None:
     """Print all about one frame, and write the picture of its layers. Raises InputError, StoreError."""
-    from cleargs.cli.frame import frame_facts, frame_row, in_lines, write_layers
+    from cleargs.cli.show_frame import frame_facts, frame_row, in_lines, write_layers
 
     made = {name: found for name in dag.names if (found := linked_manifest(run, name)) is not None}
     if "ingest" not in made:
@@ -183,7 +183,7 @@ def _say(warning: str) -> None:
 
 def _plot(run: Path, picture: Path) -> Path:
     """Draw RUN/rva with the poses and images that it was made from. Raises InputError, StoreError."""
-    from cleargs.report.allocation import load_allocation, plot_allocation
+    from cleargs.report.allocation_picture import load_allocation, plot_allocation
 
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_allocation(picture, load_allocation(run / "rva", run / "ingest"), run.resolve().name)

@@ -17,7 +17,7 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.report import report_on
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from cleargs.cli.common import json_option, parse_size, print_json
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 
 PROTOCOL_HELP = (
     "One of sharp, mixed, gs2e-slight, gs2e-medium, gs2e-severe, gs2e-stretches, gsotm-mb, gsotm-rs, "
@@ -65,7 +65,7 @@ def synth(
     """
     if cameras is not None and scene is None:
         raise click.UsageError("--cameras belongs to --scene")
-    from cleargs.synth.capture import make_capture
+    from cleargs.synth.synthetic_capture import make_capture
 
     summary = make_capture(
         out,

@@ -44,8 +44,8 @@ checkpoint; it renews itself. Afterwards it shows the report.
 @click.pass_obj
 def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None:
     """Serve the report of RUN, and how far it is while it is at work, until Ctrl-C."""
-    from cleargs.report.live import Watched
     from cleargs.report.serve import Server
+    from cleargs.report.watched_run import Watched
 
     watched = Watched(dag, read_run_file(run, dag, store=store))
     with Server(watched, host, port) as server:

@@ -8,19 +8,16 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
-from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.eval_report import LOWER_IS_BETTER
+from cleargs.record import Record
 
 ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
 """Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the
 capture's are noisy), sharp truth off the path, test frames, or the user's own reference."""
 
 
-class Cell(BaseModel):
+class Cell(Record):
     """One scene judged on one set of views."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     column: str
     """What is compared across: the protocol of a synthetic capture, else the capture's name."""

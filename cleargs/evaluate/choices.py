@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb_float
+from cleargs.parquet import read_table
+from cleargs.record import Record
 from cleargs.rivr.tables import read_selection
-from cleargs.synth.record import FRAMES
-from cleargs.tables import read_table
+from cleargs.synth.develop import FRAMES
 
 Image = NDArray[np.float32]
 Distance = Callable[[Image, Image], float]
@@ -28,10 +28,8 @@ _MIN_ERROR = 1e-10
 """Equal images have a PSNR of 100 dB, not an infinite one."""
 
 
-class Choice(BaseModel):
+class Choice(Record):
     """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     round: int
     frame_id: int
@@ -55,10 +53,8 @@ class Choice(BaseModel):
         return max(self.psnr.values()) - self.psnr[self.chosen]
 
 
-class Choices(BaseModel):
+class Choices(Record):
     """All rows of one scene."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     column: str
     sample: str
@@ -66,14 +62,12 @@ class Choices(BaseModel):
     rows: tuple[Choice, ...]
 
 
-class Agreement(BaseModel):
+class Agreement(Record):
     """How well choices agree with the truth.
 
     Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept
     because its motion is known, not because it would be sharp.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kept: int
     """Rows whose frame was kept as it was filmed; they count in none of the figures below."""

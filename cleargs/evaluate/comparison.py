@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.cells import Cell, ViewSet
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.results import Evaluation
+from cleargs.evaluate.equal_work import Work, decide_work, variant_config
+from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.variants import Variant
-from cleargs.evaluate.work import Work, decide_work, variant_config
 from cleargs.files import write_bytes
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
@@ -199,8 +199,7 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
 
 def _trained_on(made: Made, view_set: Views) -> int | None:
     """How many of the views show frames that the scene was trained on; None where that is not known."""
-    from cleargs.evaluate.evaluate import reference_of
-    from cleargs.evaluate.references import views_trained_on
+    from cleargs.evaluate.references import reference_of, views_trained_on
 
     reference = reference_of(
         made.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=SilentReporter()
@@ -248,7 +247,8 @@ def evaluated(
 
     One from an earlier call is taken where nothing changed.
     """
-    from cleargs.evaluate.evaluate import evaluate_scene, reference_of
+    from cleargs.evaluate.evaluate import evaluate_scene
+    from cleargs.evaluate.references import reference_of
 
     ingest = linked_manifest(made.run, "ingest")
     folders = (view_set.directory, view_set.align)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from cleargs.record import Record
 
 LpipsNet = Literal["alex", "vgg"]
 
@@ -16,10 +18,8 @@ SCORERS = ("clarity-net", "naturalness-stats", *INSTALLABLE)
 """No-reference scorers: the two that ship with ClearGS, and the two of the paper where they are installed."""
 
 
-class EvalOptions(BaseModel):
+class EvalOptions(Record):
     """Which metrics to take besides PSNR and SSIM. Adjustments are off unless asked for, and recorded."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lpips: tuple[LpipsNet, ...] = Field(LPIPS_NETS, description="Backbones of LPIPS v0.1.")
     scorers: tuple[str, ...] = Field(

@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StoreError
-from cleargs.evaluate.colour import apply_affine, fit_affine
+from cleargs.evaluate.colour_alignment import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
 from cleargs.evaluate.metric_set import MetricSet, load_metrics
 from cleargs.evaluate.metrics import Mask, Pixels
-from cleargs.evaluate.references import Reference, ReferenceView, reference_in, reference_of, require_match
+from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, require_match
 from cleargs.evaluate.refinement import refine_pose
-from cleargs.evaluate.results import Evaluation, ImageResult, Refinement, Report, mean_values, split_hash
 from cleargs.files import disk_error
-from cleargs.media.image import IMAGE_SUFFIXES, read_rgb, to_uint8, write_rgb
+from cleargs.media.image import read_rgb, to_uint8, write_rgb
+from cleargs.models.lpips import one_thread
 from cleargs.pipeline.digest import file_digest
 from cleargs.pipeline.manifest import versions
 from cleargs.progress import Reporter
@@ -33,17 +32,6 @@ from cleargs.splat.engine import Engine
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
-
-__all__ = [
-    "EvalOptions",
-    "Evaluation",
-    "Reference",
-    "Report",
-    "evaluate_images",
-    "evaluate_scene",
-    "reference_in",
-    "reference_of",
-]
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "onnxruntime")
 
@@ -104,7 +92,7 @@ def evaluate_images(
         raise InputError("finished images have no pose to refine", hint="leave out --refine-poses")
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
-    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
+    files = images_by_stem(folder)
     matched = tuple(view for view in reference.views if view.name in files)
     require_match(
         len(matched), files, (view.name for view in reference.views), "name the images like the references"
@@ -194,7 +182,7 @@ def _evaluate(
     waiting: deque[Future[ImageResult]] = deque()
     with (
         reporter.task(f"evaluating {predictions.subject}", len(reference.views)) as task,
-        _torch_on_one_thread(),
+        one_thread(),
         ThreadPoolExecutor(threads) as pool,
     ):
         for view in reference.views:
@@ -258,14 +246,3 @@ def _digest(pixels: Pixels, mask: Mask | None = None) -> str:
     if mask is not None:
         digest.update(np.packbits(mask).tobytes())
     return digest.hexdigest()
-
-
-@contextmanager
-def _torch_on_one_thread() -> Iterator[None]:
-    """LPIPS gives one result on one thread, and its parallelism here is that of the images."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

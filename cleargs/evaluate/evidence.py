@@ -17,20 +17,21 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from cleargs.errors import CleargsError, ConfigError, InputError
-from cleargs.evaluate.compared import Compared, compare_scenes
 from cleargs.evaluate.comparison import Recipe, Sample, make_scenes
+from cleargs.evaluate.comparison_findings import Compared, compare_scenes
+from cleargs.evaluate.equal_work import steps_of, variant_config
 from cleargs.evaluate.variants import find_variants
-from cleargs.evaluate.work import steps_of, variant_config
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
+from cleargs.record import Record
 from cleargs.splat.effort import training_cost
-from cleargs.synth.capture import make_capture
+from cleargs.synth.synthetic_capture import make_capture
 from cleargs.untrusted import FAULTS, cause, read_text, shallow
 
 WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ingest.max_frames=60")
@@ -39,11 +40,7 @@ WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ing
 Seed = Annotated[int, Field(ge=0)]
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class TestSet(_Record):
+class TestSet(Record):
     """What no default may be chosen on."""
 
     __test__ = False  # no test of pytest's
@@ -54,13 +51,13 @@ class TestSet(_Record):
     videos: tuple[str, ...]
 
 
-class TuningSet(_Record):
+class TuningSet(Record):
     """What defaults may be chosen on."""
 
     rooms_below: int = Field(ge=1)
 
 
-class Section(_Record):
+class Section(Record):
     """One comparison of the page."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*$")
@@ -80,7 +77,7 @@ class Section(_Record):
     settings: tuple[str, ...] = ()
 
 
-class Evidence(_Record):
+class Evidence(Record):
     """``evidence.toml``."""
 
     test: TestSet

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from cleargs.evaluate.cells import Cells, Spread, ViewSet
-from cleargs.evaluate.results import LOWER_IS_BETTER
-from cleargs.evaluate.tables import COMPARED, NAMES, Bold, Table, difference_text
+from cleargs.evaluate.comparison_tables import COMPARED, NAMES, Bold, Table, difference_text
+from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 
 VERDICTS = ("sure", "one sample", "none")
 """Whether a difference is one: its 95 % interval does not hold 0, there is no interval, or it holds 0."""

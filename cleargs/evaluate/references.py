@@ -21,9 +21,9 @@ from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.capture.world import Similarity
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
+from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
-from cleargs.evaluate.results import Alignment, PosesFrom
 from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest
@@ -223,7 +223,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     if not entries:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
     folder = mask_folder(directory / "images")
-    masks = {} if folder is None else _masks(folder)
+    masks = {} if folder is None else images_by_stem(folder)
     undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
@@ -236,7 +236,8 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     return _by_stem(listed)
 
 
-def _masks(folder: Path) -> dict[str, Path]:
+def images_by_stem(folder: Path) -> dict[str, Path]:
+    """The image files of a folder; of two of a stem, the later by name."""
     files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
     return {path.stem: path for path in files}
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cleargs.evaluate.eval_report import Refinement
 from cleargs.evaluate.metrics import Mask, Pixels
-from cleargs.evaluate.results import Refinement
 from cleargs.splat.camera import Camera
 
 Floats = NDArray[np.float64]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
-
+from cleargs.parquet import read_table
+from cleargs.record import Record
 from cleargs.rva.allocation import Role, Rule
 from cleargs.rva.tables import FRAMES
-from cleargs.tables import read_table
 
 FOR_COVERAGE = f"{Role.REACTIVATED} for {Rule.COVERAGE}"
 FOR_SHARE = f"{Role.REACTIVATED} for {Rule.ACTIVE_SHARE}"
@@ -17,10 +16,8 @@ KINDS = (Role.STRONG, Role.GEOMETRIC, Role.AUXILIARY, FOR_COVERAGE, FOR_SHARE, R
 """What a frame can be; reactivated ones by the rule that woke them."""
 
 
-class Roles(BaseModel):
+class Roles(Record):
     """The training frames of one scene by role."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     column: str
     sample: str

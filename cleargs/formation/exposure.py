@@ -18,11 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.parquet import read_table, write_table
 from cleargs.splat.backend import backend_for
 from cleargs.splat.initialise import SparsePoints
 from cleargs.splat.tables import EXPOSURE
 from cleargs.splat.views import View
-from cleargs.tables import read_table, write_table
 
 IDENTITY = np.eye(3, 4)
 """The affine that changes nothing, [3, 4]: matrix and offset."""

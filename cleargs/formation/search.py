@@ -18,7 +18,7 @@ from cleargs.formation.motion import TWIST, Floats, FrameMotion, Model, Vector, 
 from cleargs.formation.warp import DisplacementFields, samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import formation as kernels
+from cleargs.splat.kernels.cpu import frame_warp as kernels
 from cleargs.splat.kernels.cpu import launch
 
 LEVELS = ((160, 6), (320, 5), (640, 3))

@@ -12,7 +12,7 @@ import pyarrow as pa
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.tables import column, read_table, write_table
+from cleargs.parquet import column, read_table, write_table
 
 _AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 _TWISTS = {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cleargs.formation.motion import Floats, FrameMotion
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import formation as kernels
+from cleargs.splat.kernels.cpu import frame_warp as kernels
 from cleargs.splat.kernels.cpu import launch
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
 

@@ -1,7 +1,7 @@
 """The frozen restoration expert of RIVR: an image in, a sharper image of the same size out.
 
 Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embedded default is the network of
-`cleargs.models.training.restorer`.
+`cleargs.models.training.train_restorer`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError, did_you_mean
 from cleargs.models.batches import in_batches
-from cleargs.models.installed import installable, installed_file, verify
+from cleargs.models.model_folder import installable, installed_file, verify
 from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.registry import load_registry
 from cleargs.models.tiling import Image, apply_tiled, map_tiled

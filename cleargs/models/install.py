@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cleargs.errors import InputError
 from cleargs.models.fetch import fetch, read_checked
-from cleargs.models.installed import verify, write_receipt
+from cleargs.models.model_folder import verify, write_receipt
 from cleargs.models.registry import Model
 
 

@@ -76,7 +76,7 @@ class Lpips:
                 f"LPIPS needs at least {_MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
                 hint="compare larger images",
             )
-        with torch.inference_mode(), _one_thread():
+        with torch.inference_mode(), one_thread():
             features = self.network.features(torch.stack([_planes(a), _planes(b)]))
             maps = [
                 head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)
@@ -241,7 +241,7 @@ def _member(sdist: bytes, name: str) -> bytes:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """torch's convolutions and reductions differ in the last bits between thread counts; one gives one
     result."""
     threads = torch.get_num_threads()

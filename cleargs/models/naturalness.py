@@ -17,9 +17,10 @@ from importlib.resources import files
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cleargs.models.tile_mean import Image, mean_over_tiles
+from cleargs.record import Record
 
 COEFFICIENTS = "naturalness.toml"
 
@@ -32,10 +33,8 @@ _ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
-class Quadratic(BaseModel):
+class Quadratic(Record):
     """``weights . [1, z, z_i z_j (i <= j)]`` of the standardised features z."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mean: tuple[float, ...] = Field(description="Mean of each feature over the training patches.")
     deviation: tuple[float, ...] = Field(description="Standard deviation of each feature there.")

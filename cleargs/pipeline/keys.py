@@ -12,9 +12,10 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from cleargs.plugins import Socket, plugin
+from cleargs.record import Record
 
 SCHEMA = 1
 """Raised when the way keys are made changes: every old result becomes a miss."""
@@ -28,10 +29,8 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
-class KeyParts(BaseModel):
+class KeyParts(Record):
     """What goes into the key of one stage."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage: str
     version: int

@@ -9,30 +9,25 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
-
 import cleargs
 from cleargs.files import is_partial, write_json
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.keys import KeyParts, canonical_json
+from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 
 MANIFEST = "manifest.json"
 
 
-class FileRecord(BaseModel):
+class FileRecord(Record):
     """One published file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size: int
     digest: str
 
 
-class Manifest(BaseModel):
+class Manifest(Record):
     """What a finished stage folder holds and what it was made from. Names no host and no absolute path."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage: str
     key: str

@@ -13,7 +13,7 @@ from cleargs.media import MAX_PIXELS
 from cleargs.pipeline.manifest import linked_manifest
 from cleargs.render.output import Shot
 from cleargs.render.paths import framed, smooth_path, turntable
-from cleargs.render.poses import World, read_poses
+from cleargs.render.pose_files import World, read_poses
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import view_of
 

@@ -18,10 +18,10 @@ from cleargs.errors import CleargsError
 from cleargs.evaluate.comparison import size_of
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.manifest import Manifest
-from cleargs.report.frames import last_scene
+from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
+from cleargs.report.frame_strip import last_scene
 from cleargs.report.html import new_report, write_page
-from cleargs.report.pictures import Picture, side_of, write_jpeg
-from cleargs.report.record import FOLDER, is_current, linked_manifests, page_of
+from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.verdict import training_psnr
 from cleargs.report.words import count, decibel, duration, size
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.report.frames import FrameRow
-from cleargs.report.scene import camera_of
+from cleargs.parquet import read_table
+from cleargs.report.frame_strip import FrameRow
+from cleargs.report.web_scene import camera_of
 from cleargs.splat.tables import TRAIN
-from cleargs.tables import read_table
 
 WIDTH, HEIGHT = 640, 220
 """Of a curve's drawing area, in units of its SVG."""

@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 
 from cleargs.capture.tables import load_frames
 from cleargs.evaluate.cells import Cell, Cells, ViewSet
-from cleargs.evaluate.compared import Compared
 from cleargs.evaluate.comparison import Made, view_sets
-from cleargs.evaluate.gaps import compared_with, losses_of, losses_table
-from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
-from cleargs.evaluate.results import Evaluation
-from cleargs.evaluate.tables import (
+from cleargs.evaluate.comparison_findings import Compared
+from cleargs.evaluate.comparison_tables import (
     NAMES,
     TITLES,
     Table,
@@ -31,12 +28,15 @@ from cleargs.evaluate.tables import (
     value_text,
     work_table,
 )
+from cleargs.evaluate.eval_report import Evaluation
+from cleargs.evaluate.gaps import compared_with, losses_of, losses_table
+from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.evaluate.variants import WHOLE
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
+from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
 from cleargs.report.html import new_report, write_page
-from cleargs.report.pictures import Picture, side_of, write_jpeg
-from cleargs.report.record import page_of
+from cleargs.report.report_json import page_of
 
 POSES = 3
 """Poses shown of a capture and set of views, evenly along their order."""

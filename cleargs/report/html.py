@@ -15,11 +15,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import cleargs
-from cleargs.evaluate.tables import Bold
+from cleargs.evaluate.comparison_tables import Bold
 from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.pipeline.manifest import plain_json
 from cleargs.report.charts import weight_colour
-from cleargs.report.record import FOLDER, PAGE
+from cleargs.report.report_json import FOLDER, PAGE
 
 
 def write_page(folder: Path, template: str, **values: Any) -> None:

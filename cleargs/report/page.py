@@ -14,11 +14,12 @@ from cleargs.pipeline.freshness import stale_stages
 from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
-from cleargs.report.frames import SCENES, FrameRow, formation_meanings, load_rows, scores_of
+from cleargs.report.frame_pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
+from cleargs.report.frame_strip import SCENES, FrameRow, formation_meanings, load_rows, scores_of
 from cleargs.report.html import new_report, write_page
-from cleargs.report.pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
-from cleargs.report.record import LastRun, linked_manifests, noted, page_of, write_record
-from cleargs.report.scene import (
+from cleargs.report.report_json import LastRun, linked_manifests, noted, page_of, write_record
+from cleargs.report.verdict import judge
+from cleargs.report.web_scene import (
     Renderer,
     camera_of,
     level_camera,
@@ -27,7 +28,6 @@ from cleargs.report.scene import (
     write_scene,
     write_viewer,
 )
-from cleargs.report.verdict import judge
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 from cleargs.evaluate.cells import Cells, ViewSet
-from cleargs.evaluate.evidence import Outcome, Section
-from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
-from cleargs.evaluate.tables import (
+from cleargs.evaluate.comparison_tables import (
     COMPARED,
     NAMES,
     TITLES,
@@ -23,6 +21,8 @@ from cleargs.evaluate.tables import (
     value_texts,
     work_table,
 )
+from cleargs.evaluate.evidence import Outcome, Section
+from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, WHOLE
 
 CONFIDENCE = "95 %"

@@ -24,8 +24,8 @@ from urllib.parse import unquote, urlsplit
 
 from cleargs.errors import InputError
 from cleargs.pipeline.manifest import plain_json
-from cleargs.report.live import Watched
-from cleargs.report.record import FOLDER, PAGE
+from cleargs.report.report_json import FOLDER, PAGE
+from cleargs.report.watched_run import Watched
 from cleargs.untrusted import open_regular
 
 _TYPES: Mapping[str, str] = {

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from cleargs.pipeline.config import Config
 from cleargs.pipeline.manifest import Manifest
-from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow
+from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow
 from cleargs.report.words import count, decibel
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0

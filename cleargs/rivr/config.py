@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from cleargs.record import Record
 from cleargs.splat.config import DistilConfig
 
 MAX_ROUNDS = 16
 """Most rounds of RIVR."""
 
 
-class HarmConfig(BaseModel):
+class HarmConfig(Record):
     """When a distilled scene counts as worse than G0 on the frames held back from repair.
 
     These frames stay among the raw supervision, as they were for G0. Kept from it too, G0 would be measured
     on frames it was trained on and the distilled scene on unseen ones: PSNR then falls by 2 to 3 dB while the
     scene gains 0.9 dB against the truth (16 frames, 480x270), and no margin tells harm from that.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     held_back: float = Field(
         0.125,
@@ -34,13 +33,11 @@ class HarmConfig(BaseModel):
     score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
 
 
-class GateConfig(BaseModel):
+class GateConfig(Record):
     """When a repair is refused because it disagrees with both the raw frame and the render.
 
     docs/experiments/rivr.md has the measurements behind the thresholds.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_share: float = Field(
         0.1, ge=0.0, le=1.0, description="share of the blocks that may disagree; 1: no repair is refused"
@@ -57,10 +54,8 @@ class RepairDistilConfig(DistilConfig):
     pseudo_weight: float = Field(0.5, ge=0, description="factor on the loss of a repaired view")
 
 
-class RivrConfig(BaseModel):
+class RivrConfig(Record):
     """Render-Guided In-Video Restoration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="times that every target frame is repaired")
     targets: Literal["all", "degraded"] = Field(
@@ -118,10 +113,8 @@ class RivrConfig(BaseModel):
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
 
 
-class ConsolidateConfig(BaseModel):
+class ConsolidateConfig(Record):
     """Full-Trajectory Repair Consolidation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     scorer: str = Field(
         "clarity-net",

@@ -19,6 +19,7 @@ from cleargs.formation.table import read_formation, write_formation
 from cleargs.formation.undo import undo
 from cleargs.formation.view import FormedView
 from cleargs.models.scorer import Scorer
+from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image
 from cleargs.rivr.harm import Fidelity
@@ -33,7 +34,6 @@ from cleargs.splat.state import save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import train
 from cleargs.splat.views import View
-from cleargs.tables import read_table, write_table
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
 EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"

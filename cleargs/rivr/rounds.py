@@ -22,8 +22,8 @@ from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, Image, fuse
 from cleargs.rivr.config import GateConfig
 from cleargs.rivr.gates import REFUSED, all_masked, rejection_reason
+from cleargs.rivr.manifest_summary import chosen_counts
 from cleargs.rivr.restoring import Explained, Restoration, observation
-from cleargs.rivr.results import chosen_counts
 from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
 from cleargs.rivr.tables import SELECTION, Selection
 from cleargs.splat.views import Mask, View

@@ -10,10 +10,10 @@ import pyarrow as pa
 
 from cleargs.capture.tables import load_frames
 from cleargs.errors import StageError
+from cleargs.parquet import read_table
 from cleargs.rivr.targets import Appraisal, Targets, held_back_frames, target_frames
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.views import View, view_of
-from cleargs.tables import read_table
 
 _COLUMNS = ("frame_id", "R", "B", "role", "reliable", "stand_in", "weight")
 _APPRAISED = pa.schema([FRAMES.field(name) for name in _COLUMNS])

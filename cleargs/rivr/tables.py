@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from cleargs.parquet import column, read_table, write_table
 from cleargs.rivr.candidates import Chosen, Source
-from cleargs.tables import column, read_table, write_table
 
 
 def _scores(role: str, use: str) -> list[pa.Field]:

@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
+from pydantic import Field, JsonValue, field_validator, model_validator
 
 from cleargs.plugins import require_known
+from cleargs.record import Record
 
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 """A number in [0, 1]."""
@@ -30,14 +31,12 @@ _PLACE: dict[str, JsonValue] = {
 }  # where the work is done, not what comes of it: stays out of the stage's key
 
 
-class QwenConfig(BaseModel):
+class QwenConfig(Record):
     """The evaluator ``qwen3-vl``: a vision-language model behind a server, or in a folder of this machine.
 
     The server's key is no setting: it comes from the environment (CLEARGS_VLM_API_KEY) and is written
     nowhere.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model: str = Field(
         "",
@@ -95,10 +94,8 @@ class QwenConfig(BaseModel):
     )
 
 
-class RvaConfig(BaseModel):
+class RvaConfig(Record):
     """Reliability-aware View Allocation. The defaults are the paper's but for `active_share`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = Field(
         True,

@@ -90,7 +90,7 @@ def make_evaluator(
     if config.evaluator not in EVALUATORS:
         maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
         return maker(seed=seed, device=device, cache=cache)
-    from cleargs.rva.vlm.evaluator import QwenEvaluator
+    from cleargs.rva.vlm.qwen_evaluator import QwenEvaluator
 
     if cache is None:
         raise ValueError("qwen3-vl needs a cache folder")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from cleargs.tables import column
+from cleargs.parquet import column
 
 R_CUES = ("sharpness", "structure", "texture", "cleanness", "exposure")
 """The quality cues r_i in the paper's order."""

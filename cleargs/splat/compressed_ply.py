@@ -8,13 +8,10 @@ spherical harmonics above degree 0 are 8 bits from -4 to 4. Source: the writer o
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cleargs.files import write_bytes
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
@@ -35,13 +32,8 @@ _RANGES = [
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
-def write_compressed_ply(path: Path, scene: Scene) -> None:
-    """Write ``scene`` atomically; equal scenes give equal bytes. Gaussians come out in Morton order."""
-    write_bytes(path, compressed_ply(scene))
-
-
 def compressed_ply(scene: Scene) -> bytes:
-    """The bytes of `write_compressed_ply`."""
+    """The bytes of ``scene``; equal scenes give equal bytes. Gaussians come out in Morton order."""
     gaussians = scene.gaussians.to("cpu").detach()
     order = morton_order(gaussians.means.numpy())
     gaussians = gaussians.select(torch.from_numpy(order))

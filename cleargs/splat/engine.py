@@ -49,11 +49,6 @@ class Engine:
         self._rasteriser = backend_for(device).rasteriser(torch.device(device))
 
     @property
-    def radii(self) -> Tensor:
-        """[N] half the longer side of each splat's bounding box in the last view, px; 0 = not visible."""
-        return self._rasteriser.radii
-
-    @property
     def visible(self) -> Tensor:
         """[N] bool: the Gaussians that reach alpha 1/255 at a pixel's tile in the last view."""
         return self._rasteriser.radii > 0

@@ -15,13 +15,13 @@ import torch
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.plugins import load_part, plugins
-from cleargs.splat.compressed_ply import write_compressed_ply
-from cleargs.splat.export import transform_scene
+from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.splat.sog import write_sog
+from cleargs.splat.similarity import transform_scene
+from cleargs.splat.sog import sog
 from cleargs.splat.spz import spz
 from cleargs.splat.usd import write_usd
 
@@ -42,9 +42,9 @@ class Format:
 
 
 FORMATS: Mapping[str, Format] = {
-    "compressed.ply": Format(write_compressed_ply, _AS_IS),
+    "compressed.ply": Format(lambda path, scene: write_bytes(path, compressed_ply(scene)), _AS_IS),
     "ply": Format(write_ply, _AS_IS),
-    "sog": Format(write_sog, _AS_IS),
+    "sog": Format(lambda path, scene: write_bytes(path, sog(scene)), _AS_IS),
     "spz": Format(lambda path, scene: write_bytes(path, spz(scene)), _ABOUT_X),
     "glb": Format(lambda path, scene: write_bytes(path, glb(scene)), _ABOUT_Z, y_up=True),
     "usdc": Format(write_usd, _ABOUT_Z, y_up=True),

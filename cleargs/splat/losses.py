@@ -1,4 +1,4 @@
-"""Photometric loss with its gradient, SSIM and PSNR: fixed-order sums on every device.
+"""Photometric loss with its gradient, and PSNR: fixed-order sums on every device.
 
 The device of the images chooses the kernels.
 """
@@ -34,6 +34,7 @@ def photometric_loss(
 ) -> PhotometricLoss:
     """L1 + D-SSIM of 3DGS and its gradient with respect to ``image``, without autograd.
 
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5 and zero padding, as in the Inria code.
     Means run over the pixels that ``mask`` keeps. Masked pixels are zero in both images for the
     windows of SSIM, as are pixels beyond the border, and get no gradient. With nothing kept, or with
     weight 0, the loss and the gradient are exactly 0.
@@ -47,15 +48,6 @@ def photometric_loss(
     return backend_for(image.device).photometric_loss(
         image, target, ssim_lambda=ssim_lambda, weight=weight, mask=mask, gradient=gradient
     )
-
-
-def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Mean SSIM of two images [H, W, 3] in [0, 1] over the pixels that ``mask`` keeps (1 when none is).
-
-    11 x 11 Gaussian window, sigma 1.5, zero padding, as in the Inria code.
-    """
-    _check(image, target, mask)
-    return backend_for(image.device).ssim(image, target, mask)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

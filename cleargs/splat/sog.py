@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cleargs.files import write_bytes
 from cleargs.splat.codebook import codebook, nearest, palette
 from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smaller_parts
 from cleargs.splat.scene import Scene
@@ -31,13 +29,8 @@ _LOSSLESS = 101  # OpenCV: a quality above 100
 _WHEN = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier date
 
 
-def write_sog(path: Path, scene: Scene) -> None:
-    """Write ``scene`` atomically; equal scenes give equal bytes. Gaussians come out in Morton order."""
-    write_bytes(path, sog(scene))
-
-
 def sog(scene: Scene) -> bytes:
-    """The bytes of `write_sog`."""
+    """The bytes of ``scene``; equal scenes give equal bytes. Gaussians come out in Morton order."""
     gaussians = scene.gaussians.to("cpu").detach()
     gaussians = gaussians.select(torch.from_numpy(morton_order(gaussians.means.numpy())))
     count, sh = gaussians.num, gaussians.sh.numpy()

@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 
 from cleargs.splat.scene import Scene
 
-VERSIONS = (3, 4)
-"""Those that can be written: 3 is what most programs read."""
-
 _MAGIC = 0x5053474E
 _HEADER_BYTES = 32  # of version 4; the table of sizes follows
 _ANTIALIASED = 1
@@ -37,7 +34,7 @@ _ZSTD_LEVEL = 12  # the original's
 def spz(scene: Scene, version: int = 3) -> bytes:
     """The bytes of ``scene``; equal scenes give equal bytes. The viewers of the format know no background.
 
-    ``version`` is one of `VERSIONS`.
+    ``version`` is 3, which most programs read, or 4.
     """
     gaussians = scene.gaussians.to("cpu").detach()
     count, coefficients = gaussians.num, gaussians.sh.shape[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from cleargs.tables import column
+from cleargs.parquet import column
 
 TRAIN = pa.schema(
     [

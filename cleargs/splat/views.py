@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.capture.tables import Frame
 from cleargs.errors import InputError, StageError
 from cleargs.splat.camera import Camera
 
@@ -37,48 +38,7 @@ class View:
     Called when first needed, and again when the cache could not keep the image."""
 
 
-class FrameRow(Protocol):
-    """The columns of ``ingest/frames`` that make a view (properties, since rows are immutable)."""
-
-    @property
-    def frame_id(self) -> int: ...
-    @property
-    def image(self) -> str: ...
-    @property
-    def mask(self) -> str | None: ...
-    @property
-    def registered(self) -> bool: ...
-    @property
-    def split(self) -> str: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def fx(self) -> float: ...
-    @property
-    def fy(self) -> float: ...
-    @property
-    def cx(self) -> float: ...
-    @property
-    def cy(self) -> float: ...
-    @property
-    def qw(self) -> float | None: ...
-    @property
-    def qx(self) -> float | None: ...
-    @property
-    def qy(self) -> float | None: ...
-    @property
-    def qz(self) -> float | None: ...
-    @property
-    def tx(self) -> float | None: ...
-    @property
-    def ty(self) -> float | None: ...
-    @property
-    def tz(self) -> float | None: ...
-
-
-def view_of(frame: FrameRow, folder: Path, weight: float) -> View:
+def view_of(frame: Frame, folder: Path, weight: float) -> View:
     """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
     pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     if not frame.registered or any(value is None for value in pose):
@@ -96,7 +56,7 @@ def view_of(frame: FrameRow, folder: Path, weight: float) -> View:
     return View(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
 
 
-def real_views(frames: Iterable[FrameRow], weights: Mapping[int, float], folder: Path) -> list[View]:
+def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[View]:
     """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
     active = [
         frame

@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
-from cleargs.synth.world import Array
+from cleargs.synth.optics import Array
 
 UP = np.array([0.0, 1.0, 0.0])
 DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.random_streams import Stream
 from cleargs.synth.course import Course
-from cleargs.synth.world import Array
+from cleargs.synth.optics import Array
 
 FPS = 6.0
 """Frames a second: what a walk of a few degrees a frame needs."""

@@ -19,7 +19,7 @@ from cleargs.media.colour import LUMA
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.random_streams import Stream
-from cleargs.synth.world import Array
+from cleargs.synth.optics import Array
 
 NOISE = 1.5 / 255
 """Deviation of the sensor noise at mid grey, sRGB units: a phone's small pixels, indoors."""

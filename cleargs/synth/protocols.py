@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
-from cleargs.synth.motion import FrameMotion, duration_for
+from cleargs.synth.image_motion import FrameMotion, duration_for
 from cleargs.synth.path import FPS
 from cleargs.synth.phone import auto_exposure
 

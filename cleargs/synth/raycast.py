@@ -15,9 +15,9 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
 from cleargs.synth.room import BOX, SPHERE, Balloon, Room
 from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
-from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
 
 configure_numba("raycast")
 
@@ -357,7 +357,7 @@ def _render(
 
 @dataclass(frozen=True)
 class RoomWorld:
-    """The room as a `cleargs.synth.world.World`; lengths in metres."""
+    """The room as a `cleargs.synth.optics.World`; lengths in metres."""
 
     room: Room
 

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))  # toy.py
 
 from toy_batch import ToyBatch, make_toy_batch
 
-from cleargs.batch.engine import find_snakemake
+from cleargs.batch.snakemake import find_snakemake
 from cleargs.errors import InputError
 
 

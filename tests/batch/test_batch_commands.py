@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from toy_batch import ToyBatch
 
-from cleargs.batch.engine import engine_at_work, only_batch
 from cleargs.batch.folder import BatchFolder, Plan, Status
 from cleargs.batch.resources import Wanted, resources
+from cleargs.batch.snakemake import engine_at_work, only_batch
 from cleargs.batch.status import scene_states
 from cleargs.cli.main import invoke
 from cleargs.errors import StageError
@@ -140,7 +140,7 @@ def test_an_interrupted_engine_that_lingers_is_ended_by_the_next_batch(
     batch.send_signal(signal.SIGINT)
     batch.communicate(timeout=60)
     assert batch.returncode == 130
-    monkeypatch.setattr("cleargs.batch.engine.LEAVE", 1.0)
+    monkeypatch.setattr("cleargs.batch.snakemake.LEAVE", 1.0)
     with only_batch(toy.folder):
         assert not toy.engine_lives()
 

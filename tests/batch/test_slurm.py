@@ -17,8 +17,8 @@ import pytest
 from slurm import Slurm, missing_daemon, running_slurm
 from toy_batch import ToyBatch, finish
 
-from cleargs.batch.engine import ENGINE_VARIABLE, find_snakemake, profile_folder
 from cleargs.batch.folder import BatchFolder
+from cleargs.batch.snakemake import ENGINE_VARIABLE, find_snakemake, profile_folder
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.manifest import read_manifest
 

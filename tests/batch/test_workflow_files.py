@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from cleargs.batch.resources import GPU_STAGES, Wanted, resources
-from cleargs.batch.watch import PATIENCE
+from cleargs.batch.slurm_watch import PATIENCE
 from cleargs.pipeline.dag import installed
 
 ROOT = Path(__file__).parents[2]

@@ -22,7 +22,7 @@ import toy
 from toy import toy_dag
 
 from cleargs.batch.folder import BatchFolder
-from cleargs.batch.prepare import Preparation
+from cleargs.batch.preparation import Preparation
 from cleargs.batch.status import SceneState, scene_states
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import DigestMemo

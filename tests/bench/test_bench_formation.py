@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from cleargs.bench.formation import (
+from cleargs.bench.formation_cost import (
     FORMED,
     PLAIN,
     FormationPlan,
@@ -18,7 +18,7 @@ from cleargs.bench.formation import (
     poses_along,
     run,
 )
-from cleargs.bench.scenes import surface_scene
+from cleargs.bench.random_scenes import surface_scene
 from cleargs.cli.main import main
 from cleargs.progress import SilentReporter
 from cleargs.splat.engine import Engine

@@ -17,7 +17,7 @@ from cleargs.bench.oracle import (
     pixel_centres,
     seen_at,
 )
-from cleargs.bench.scenes import random_scene
+from cleargs.bench.random_scenes import random_scene
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians

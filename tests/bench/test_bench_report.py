@@ -7,12 +7,12 @@ import json
 import cv2
 import pytest
 
-from cleargs.bench import plan as plans
+from cleargs.bench import benchmark_plan as plans
 from cleargs.bench.benchmark import run
+from cleargs.bench.benchmark_plan import Case, Plan, full_plan, quick_plan
+from cleargs.bench.benchmark_results import Benchmark
 from cleargs.bench.markdown import NOT_RUN, markdown, milliseconds
-from cleargs.bench.memory import peak_memory
-from cleargs.bench.plan import Case, Plan, full_plan, quick_plan
-from cleargs.bench.results import Benchmark
+from cleargs.bench.peak_memory import peak_memory
 from cleargs.bench.timing import Quartiles
 from cleargs.cli.main import main
 from cleargs.progress import SilentReporter

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cleargs.bench import torch_tiles
-from cleargs.bench.scenes import random_scene
+from cleargs.bench.random_scenes import random_scene
 from cleargs.bench.torch_tiles import TILE, groups, pixel_centres, rasterise, tile_lists
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera

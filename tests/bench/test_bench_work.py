@@ -10,9 +10,9 @@ import torch
 from cleargs.bench.iteration import Iteration, projected_frame
 from cleargs.bench.peaks import Peaks, measure_peaks
 from cleargs.bench.probe import KERNELS, PACKAGE
+from cleargs.bench.random_scenes import random_scene
 from cleargs.bench.roofline import roof, roofline
 from cleargs.bench.scaling import straight_line
-from cleargs.bench.scenes import random_scene
 from cleargs.bench.timing import Clock, Quartiles, ratio, take_turns
 from cleargs.bench.work import Work, size_of, work_of
 from cleargs.splat import constants

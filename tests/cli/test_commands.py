@@ -17,12 +17,12 @@ from toy import Bench
 from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.outcome import print_outcomes
-from cleargs.cli.progress import LineTask
+from cleargs.cli.progress_bars import LineTask
 from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.parquet import column
 from cleargs.pipeline.keys import KeyParts
 from cleargs.pipeline.manifest import FileRecord, Manifest
 from cleargs.pipeline.runner import Outcome
-from cleargs.tables import column
 
 
 @pytest.fixture
@@ -445,7 +445,7 @@ def test_the_time_left_counts_from_the_first_step_on(
 ) -> None:
     """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
     clock = [0.0]
-    monkeypatch.setattr("cleargs.cli.progress.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
     task = LineTask("G0", 1000)
     for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
         clock[0] = now

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.frames import COLUMNS, frame_rows, reason, short_name, worst_cue
-from cleargs.cli.words import in_words
+from cleargs.cli.frame_reasons import COLUMNS, frame_rows, reason, short_name, worst_cue
+from cleargs.cli.manifest_words import in_words
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import B_CUES, R_CUES
 

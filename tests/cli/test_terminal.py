@@ -14,7 +14,7 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import explanation, invoke
-from cleargs.cli.progress import LineReporter
+from cleargs.cli.progress_bars import LineReporter
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
 from cleargs.text import printable

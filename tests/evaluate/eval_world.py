@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.capture.world import Similarity
-from cleargs.evaluate.evaluate import EvalOptions
+from cleargs.evaluate.config import EvalOptions
 from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.image import to_uint8, write_mask, write_rgb
+from cleargs.parquet import write_table
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.digest import DigestMemo, file_digest
@@ -34,7 +35,6 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
-from cleargs.tables import write_table
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
 WORLD = Similarity(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from cleargs.evaluate.cells import Cell, Cells, ViewSet, spread, student_t
+from cleargs.evaluate.comparison_tables import Results, markdown
 from cleargs.evaluate.roles import FOR_SHARE, KINDS, Roles
-from cleargs.evaluate.tables import Results, markdown
 
 LABELS = {"all-view": "all-view G0", "full": "ClearGS"}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cleargs.evaluate.choices import Choice, agreement, exposed
-from cleargs.synth.record import develop
+from cleargs.synth.develop import develop
 
 
 def row(chosen: str, render: float, restored: float, observed: float) -> Choice:

@@ -13,14 +13,14 @@ from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
 from cleargs.evaluate.choices import judge_choices
+from cleargs.evaluate.equal_work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.evaluate.variants import VARIANTS, WHOLE, Variant
-from cleargs.evaluate.work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.progress import SilentReporter
 from cleargs.splat.effort import budget_from_pixels
 from cleargs.splat.initialise import sh_degree_from_views
-from cleargs.synth.capture import make_capture
+from cleargs.synth.synthetic_capture import make_capture
 
 SETTINGS = {
     "ingest.max_features": "512",

@@ -26,8 +26,8 @@ from eval_world import (
 from cleargs.capture.tables import FRAMES
 from cleargs.cli.main import invoke
 from cleargs.media.image import write_rgb
+from cleargs.parquet import write_table
 from cleargs.rva.tables import FRAMES as ALLOCATION
-from cleargs.tables import write_table
 
 Shell = Callable[..., tuple[int, str, str]]
 

@@ -11,8 +11,8 @@ import pytest
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
 from cleargs.evaluate.cells import Cell
-from cleargs.evaluate.compared import Compared
 from cleargs.evaluate.comparison import Recipe
+from cleargs.evaluate.comparison_findings import Compared
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.evidence import Outcome, Workshop, minutes, read_evidence
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, find_variants

@@ -22,7 +22,7 @@ from cleargs.formation.warp import (
 )
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import formation as kernels
+from cleargs.splat.kernels.cpu import frame_warp as kernels
 from cleargs.splat.kernels.cpu.pixel import CHANNELS
 from cleargs.splat.kernels.runtime import set_threads
 

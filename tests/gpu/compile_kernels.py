@@ -20,7 +20,16 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from cleargs.splat.kernels.cuda import adam, binning, colour, densify, gradients, loss, projection, rasterise
+from cleargs.splat.kernels.cuda import (
+    adam,
+    affine_colour,
+    binning,
+    densify,
+    gradients,
+    loss,
+    projection,
+    rasterise,
+)
 
 F32, F64, I16, I32, I64, U8 = "*fp32", "*fp64", "*i16", "*i32", "*i64", "*u8"
 SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
@@ -66,18 +75,18 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {},
         ),
         (
-            colour.map_pixels,
+            affine_colour.map_pixels,
             {"image": F32, "affine": F32, "output": F32, "pixels": "i32"},
-            {"BLOCK": colour.BLOCK},
+            {"BLOCK": affine_colour.BLOCK},
             {},
         ),
         (
-            colour.map_backward,
+            affine_colour.map_backward,
             {
                 **dict.fromkeys(("image", "affine", "grad_output", "grad_image"), F32),
                 **{"partials": F64, "pixels": "i32"},
             },
-            {"BLOCK": colour.BLOCK},
+            {"BLOCK": affine_colour.BLOCK},
             {},
         ),
         (

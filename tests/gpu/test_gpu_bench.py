@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from cleargs.bench.plan import Case, DevicePlan
+from cleargs.bench.benchmark_plan import Case, DevicePlan
 from cleargs.progress import SilentReporter
 
 SMALL, LARGE = Case(6, 15, 12), Case(9, 16, 14)

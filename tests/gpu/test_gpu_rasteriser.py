@@ -17,7 +17,8 @@ from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import layout, support
+from cleargs.splat.kernels import splat_layout
+from cleargs.splat.kernels.cuda import support
 from cleargs.splat.render import render
 
 pytestmark = pytest.mark.usefixtures("compare_on_device")
@@ -78,7 +79,7 @@ def test_behind_and_across_the_near_plane(device):
     engine = Engine(device)
     engine.forward(gaussians.to(device), camera)
     assert engine.visible[:7].tolist() == [False, False, False, False, True, True, True]
-    assert not engine.radii[:4].any()
+    assert not engine.visible[:4].any()
 
 
 @pytest.mark.parametrize("antialias", [False, True])
@@ -179,7 +180,7 @@ def test_depth_gradient_needs_a_forward_with_depth(device):
 
 
 def test_too_many_pairs_is_an_error(device, monkeypatch):
-    monkeypatch.setattr(layout, "MAX_PAIRS", 10)
+    monkeypatch.setattr(splat_layout, "MAX_PAIRS", 10)
     camera = make_camera(36, 27)
     with pytest.raises(StageError, match="pairs"):
         Engine(device).forward(make_gaussians(camera, 20).to(device), camera)

@@ -18,7 +18,7 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.adam import adam_step
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.losses import photometric_loss, psnr, ssim
+from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.state import load_state
 from cleargs.splat.strategy import mcmc
 from cleargs.splat.trainer import Trainer, train
@@ -77,7 +77,6 @@ def test_photometric_loss_equals_torch(size, masked, device):
     assert result.l1 == pytest.approx(l1.item(), abs=1e-7)
     assert result.ssim == pytest.approx(similarity.item(), abs=1e-6)
     assert (result.grad_image - x.grad).abs().max() < 3e-6 * x.grad.abs().max()
-    assert ssim(image, target, mask) == result.ssim
     error = ((x - y) ** 2 * kept).sum() / count
     assert psnr(image, target, mask) == pytest.approx(-10 * math.log10(error.item()), abs=1e-9)
     if mask is not None:

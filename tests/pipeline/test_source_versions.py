@@ -34,7 +34,7 @@ def test_real_stages_reach_their_rooms() -> None:
     sources = installed_sources()
     modules = sources.closure("cleargs.stages.rva")
     assert "cleargs.rva.config" in modules, "imported at the top"
-    assert "cleargs.tables" in modules, "imported inside run"
+    assert "cleargs.parquet" in modules, "imported inside run"
     assert not any(name.startswith("cleargs.cli") for name in modules)
 
 

@@ -10,8 +10,8 @@ from report_run import FinishedRun
 from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.resources import Wanted, resources
 from cleargs.batch.status import SceneState
-from cleargs.evaluate.compared import Compared, compare_scenes
 from cleargs.evaluate.comparison import Recipe, existing
+from cleargs.evaluate.comparison_findings import Compared, compare_scenes
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.store import Store

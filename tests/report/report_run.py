@@ -14,6 +14,7 @@ from cleargs.capture.tables import FRAMES
 from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.exr import LayeredImage, to_layer, write_exr
 from cleargs.media.image import write_rgb
+from cleargs.parquet import write_table
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.digest import file_digest, tree_digest
@@ -29,7 +30,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
-from cleargs.report.scene import Renderer
+from cleargs.report.web_scene import Renderer
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
@@ -38,7 +39,6 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.tables import TRAIN
-from cleargs.tables import write_table
 
 WIDTH, HEIGHT, FOCAL = 96, 54, 90.0
 COUNT = 7

@@ -12,7 +12,8 @@ import pytest
 
 from cleargs.capture import tables as ingest
 from cleargs.errors import InputError
-from cleargs.report.allocation import (
+from cleargs.parquet import write_table
+from cleargs.report.allocation_picture import (
     Allocation,
     extremes,
     load_allocation,
@@ -21,9 +22,8 @@ from cleargs.report.allocation import (
 )
 from cleargs.rva.assessment import Observations, assess
 from cleargs.rva.config import RvaConfig
-from cleargs.rva.results import bins_table, frames_table, poses_from
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.tables import write_table
+from cleargs.rva.tabulate import bins_table, frames_table, poses_from
 
 COUNT = 12
 UNREGISTERED, HELD_OUT, UNSCORED = 3, 5, 7

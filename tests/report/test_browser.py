@@ -15,7 +15,7 @@ from cleargs.capture.tables import load_frames
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
-from cleargs.report.scene import Renderer, camera_of, level_camera
+from cleargs.report.web_scene import Renderer, camera_of, level_camera
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 

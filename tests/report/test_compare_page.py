@@ -12,7 +12,7 @@ import pytest
 from made_pages import HOSTILE, compare_runs
 from pages import Page, assert_offline
 
-from cleargs.evaluate.compared import Compared
+from cleargs.evaluate.comparison_findings import Compared
 from cleargs.report.compare_page import write_comparison
 
 CAPTURE = "gone & <away>"

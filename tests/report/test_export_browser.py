@@ -15,7 +15,7 @@ from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.report.scene import Renderer, camera_of, level_camera, viewer_pose, write_viewer
+from cleargs.report.web_scene import Renderer, camera_of, level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]

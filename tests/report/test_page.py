@@ -26,8 +26,8 @@ from cleargs.report import facts
 from cleargs.report.charts import weight_colour
 from cleargs.report.html import json_in_html
 from cleargs.report.page import write_report
-from cleargs.report.record import LastRun, is_current, linked_manifests
-from cleargs.report.scene import BYTES, shown_degree, write_scene
+from cleargs.report.report_json import LastRun, is_current, linked_manifests
+from cleargs.report.web_scene import BYTES, shown_degree, write_scene
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from report_run import COUNT, HEIGHT, HOSTILE, UNPLACED, FinishedRun
 from cleargs.cli.main import invoke
 from cleargs.formation.table import FORMATION
 from cleargs.media.image import read_rgb
+from cleargs.parquet import write_table
 from cleargs.pipeline.manifest import linked_manifest, write_manifest
-from cleargs.tables import write_table
 
 FOUND = {"model": "blur", "blur_px": 3.25, "explained": 0.625, "weight_before": 0.4, "weight_after": 0.75}
 

@@ -21,9 +21,9 @@ from watched import reported, serving, working
 
 from cleargs.errors import InputError
 from cleargs.progress import PREVIEW
-from cleargs.report.live import Watched
-from cleargs.report.scene import Renderer
 from cleargs.report.serve import Server
+from cleargs.report.watched_run import Watched
+from cleargs.report.web_scene import Renderer
 from cleargs.splat.preview import write_preview
 
 

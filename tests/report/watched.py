@@ -15,9 +15,9 @@ from cleargs.pipeline.lease import lease
 from cleargs.pipeline.live import noted
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
-from cleargs.report.live import Watched
 from cleargs.report.page import write_report
 from cleargs.report.serve import Server
+from cleargs.report.watched_run import Watched
 
 
 def reported(root: Path) -> FinishedRun:

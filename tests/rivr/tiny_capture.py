@@ -18,6 +18,7 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.formation.table import write_formation
 from cleargs.media.image import write_mask, write_rgb
+from cleargs.parquet import write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rivr.config import ConsolidateConfig, RivrConfig
@@ -29,7 +30,6 @@ from cleargs.splat.ply import write_ply
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import save_state
-from cleargs.tables import write_table
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 ROLES = ("strong", "suppressed", "geometric", "strong", "auxiliary", "strong", "reactivated", "suppressed")

@@ -11,8 +11,8 @@ from rva_scenes import along_x, observations_of, poses_at, uniform_cues
 from cleargs.rva.assessment import Observations, assess
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.geometry import coverage_gain, redundancy, visibility
-from cleargs.rva.results import frames_table, summary
 from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.rva.tabulate import frames_table, summary
 from cleargs.rva.trajectory import cut_into_bins
 
 CONFIG = RvaConfig(active_share=0.0)

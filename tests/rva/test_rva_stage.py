@@ -12,11 +12,11 @@ import pytest
 from pydantic import ValidationError
 
 from cleargs.capture import tables as ingest
+from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.tables import read_table, write_table
 
 DESIGN_COLUMNS = [
     "frame_id",

@@ -11,9 +11,9 @@ import torch
 from vlm_server import FRAMES, two_stages
 
 from cleargs.cli.main import invoke
+from cleargs.parquet import read_table
 from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.rva.tables import FRAMES as TABLE
-from cleargs.tables import read_table
 
 transformers = pytest.importorskip("transformers", reason="the extra vlm (transformers) is not installed")
 pytest.importorskip("llguidance", reason="the extra vlm (llguidance) is not installed")

@@ -16,13 +16,13 @@ from vlm_server import FRAMES, KEY, Answer, Asked, make_ingest, true_cues, truth
 
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError, InputError, StageError
+from cleargs.parquet import read_table
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
 from cleargs.rivr.supervision import load_supervision
 from cleargs.rva import tables
 from cleargs.rva.config import RvaConfig
-from cleargs.tables import read_table
 
 MODEL = "Qwen/Qwen3-VL-8B-Instruct"
 

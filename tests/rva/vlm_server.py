@@ -21,10 +21,10 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict
 
 from cleargs.capture import tables as ingest
+from cleargs.parquet import write_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rva.tables import B_CUES, CUE_COLUMNS, R_CUES
-from cleargs.tables import write_table
 
 KEY = "sk-Loopback+Secret/7491"
 FRAMES = 6

@@ -34,7 +34,7 @@ def digest(threads):
         loss = photometric_loss(view.image, target, ssim_lambda=0.2, mask=mask)
         gradients = engine.backward(loss.grad_image, view.alpha, view.depth)
         _, affine = affine_backward(view.image, torch.eye(3, 4), loss.grad_image)
-        for tensor in (*view, loss.grad_image, affine, engine.radii, *gradients.tensors().values()):
+        for tensor in (*view, loss.grad_image, affine, engine.visible, *gradients.tensors().values()):
             result.update(tensor.numpy().tobytes())
         result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())
         for name, tensor in scene.tensors().items():

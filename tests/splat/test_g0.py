@@ -15,6 +15,7 @@ from splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
+from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -24,7 +25,6 @@ from cleargs.splat.ply import read_ply
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.stages import g0
-from cleargs.tables import read_table, write_table
 
 ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
 SUPPRESSED, HELD_OUT, UNREGISTERED = 3, 4, 6

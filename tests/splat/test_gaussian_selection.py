@@ -9,9 +9,9 @@ from test_export import make_scene
 
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.pruning import central_box, contributions, inside
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
-from cleargs.splat.selection import central_box, contributions, inside
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, np.eye(4))
 

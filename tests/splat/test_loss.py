@@ -11,7 +11,7 @@ import torch.nn.functional as F  # noqa: N812  # torch's own name for it
 from cleargs.errors import InputError
 from cleargs.formation.exposure import affine_backward, apply_affine
 from cleargs.splat.adam import adam_step
-from cleargs.splat.losses import photometric_loss, psnr, ssim
+from cleargs.splat.losses import photometric_loss, psnr
 
 
 def images(height: int, width: int, noise: float = 0.2, seed: int = 0):
@@ -59,7 +59,6 @@ def test_photometric_loss_equals_torch(size, masked):
     assert result.l1 == pytest.approx(l1.item(), abs=1e-7)
     assert result.ssim == pytest.approx(similarity.item(), abs=1e-6)
     assert (result.grad_image - x.grad).abs().max() < 3e-6 * x.grad.abs().max()
-    assert ssim(image, target, mask) == result.ssim
     if mask is not None:
         assert not result.grad_image[~mask].any()
 
@@ -144,7 +143,7 @@ def test_loss_refuses_what_does_not_fit():
     with pytest.raises(InputError, match="float64"):
         psnr(image.double(), target)
     with pytest.raises(InputError, match="mask"):
-        ssim(image, target, torch.ones(9, 8, dtype=torch.bool))
+        psnr(image, target, torch.ones(9, 8, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("shape", [(1000, 16, 3), (5001, 3), (9000,), (1, 4)])

@@ -12,7 +12,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
 from cleargs.splat.kernels.cpu import binning, projection
-from cleargs.splat.kernels.layout import SPLAT_COLUMNS, TILE
+from cleargs.splat.kernels.splat_layout import SPLAT_COLUMNS, TILE
 from cleargs.splat.render import render
 
 PARAMETERS = ["means", "log_scales", "rotations", "logit_opacities", "sh"]

@@ -128,7 +128,7 @@ def test_behind_and_across_the_near_plane():
     engine = Engine()
     engine.forward(gaussians, camera)
     assert engine.visible[:7].tolist() == [False, False, False, False, True, True, True]
-    assert not engine.radii[:4].any()
+    assert not engine.visible[:4].any()
 
 
 def test_splat_covering_the_image():

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from numba import config
 
+from cleargs.bench.probe import KERNELS, timed_kernels
+from cleargs.bench.timing import Clock
 from cleargs.splat.kernels import runtime
 
 
@@ -30,13 +32,11 @@ def test_digest_follows_every_kernel_source(monkeypatch):
     assert runtime.kernel_digest() == before
 
 
-def test_warm_up_reports_every_kernel():
-    seen = []
-    runtime.warm_up(lambda name, done, total: seen.append((name, done, total)))
-    total = len(seen) - 1
-    assert total > 5
-    assert [done for _, done, _ in seen] == list(range(total + 1))
-    assert {n for _, _, n in seen} == {total}
+def test_warm_up_runs_every_kernel_of_an_iteration():
+    clock = Clock()
+    with clock.repetition(), timed_kernels(clock):
+        runtime.warm_up()
+    assert set(clock.quartiles()) == set(KERNELS)
 
 
 def test_set_threads():

@@ -13,14 +13,14 @@ from cleargs.errors import InputError
 from cleargs.progress import SilentReporter
 from cleargs.rva.config import RvaConfig
 from cleargs.rva.trajectory import cumulative_motion, cut_into_bins
-from cleargs.synth.capture import make_capture, room_setting
-from cleargs.synth.motion import follow
+from cleargs.synth.image_motion import follow
+from cleargs.synth.optics import Shutter
 from cleargs.synth.path import FPS, frame_times, make_path
 from cleargs.synth.phone import LAG, METERED, Look, auto_exposure, coded, phone_look
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, plan
 from cleargs.synth.raycast import RoomWorld
 from cleargs.synth.room import make_balloon, make_room
-from cleargs.synth.world import Shutter
+from cleargs.synth.synthetic_capture import make_capture, room_setting
 
 WIDTH, HEIGHT, SEED = 96, 54, 3
 UNRELIABLE = 7.0

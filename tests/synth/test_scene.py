@@ -14,14 +14,14 @@ import torch
 from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES
 from cleargs.errors import InputError
+from cleargs.parquet import write_table
 from cleargs.progress import SilentReporter
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.synth.capture import make_capture
 from cleargs.synth.course import camera_course, look_at
-from cleargs.synth.scene import open_scene
-from cleargs.tables import write_table
+from cleargs.synth.splat_world import open_scene
+from cleargs.synth.synthetic_capture import make_capture
 
 CAMERAS = 9
 

@@ -19,12 +19,12 @@ from cleargs.errors import InputError
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.progress import SilentReporter
 from cleargs.synth import raycast
-from cleargs.synth.capture import make_capture, room_setting
 from cleargs.synth.course import look_at
+from cleargs.synth.optics import Lens
 from cleargs.synth.protocols import PROTOCOLS
 from cleargs.synth.raycast import RoomWorld
 from cleargs.synth.room import DEPTH, SPHERE, Room, make_room
-from cleargs.synth.world import Lens
+from cleargs.synth.synthetic_capture import make_capture, room_setting
 
 SIZE = {"width": 96, "height": 54}
 

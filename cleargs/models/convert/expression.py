@@ -31,7 +31,6 @@ class Expression:
     attributes: Mapping[str, Attribute]
     shape: Shape
     value: NDArray[Any] | None = field(default=None, repr=False)
-    domain: str = ""
 
     @property
     def is_constant(self) -> bool:

@@ -53,8 +53,6 @@ def _model(x: Expression, input_name: str, output_name: str, metadata: Mapping[s
     graph += _message(2, b"network") + _message(12, _value(output_name, x.shape))
     model = _integer(1, _IR_VERSION) + _message(2, b"ClearGS") + _message(7, bytes(graph))
     model += _message(8, _message(1, b"") + _integer(2, _OPSET))
-    if any(node.domain for node in in_order(x)):
-        model += _message(8, _message(1, b"com.microsoft") + _integer(2, 1))
     for key, value in metadata.items():
         model += _message(14, _message(1, key.encode()) + _message(2, value.encode()))
     return model
@@ -63,8 +61,7 @@ def _model(x: Expression, input_name: str, output_name: str, metadata: Mapping[s
 def _node(node: Expression, inputs: list[str], output: str) -> bytes:
     data = b"".join(_message(1, name.encode()) for name in inputs)
     data += _message(2, output.encode()) + _message(3, output.encode()) + _message(4, node.op.encode())
-    data += b"".join(_message(5, _attribute(name, value)) for name, value in node.attributes.items())
-    return data + (_message(7, node.domain.encode()) if node.domain else b"")
+    return data + b"".join(_message(5, _attribute(name, value)) for name, value in node.attributes.items())
 
 
 def _attribute(name: str, value: Attribute) -> bytes:

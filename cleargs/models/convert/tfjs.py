@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,8 @@ NHWC_TO_NCHW = (0, 3, 1, 2)
 NCHW_TO_NHWC = (0, 2, 3, 1)
 
 
-class Folder(Protocol):
-    """Where the files of a graph model lie."""
-
-    def __call__(self, name: str) -> bytes:
-        """The content of a file."""
-
-
-def read_model(read: Folder, name: str = "model.json") -> tuple[Nodes, Weights]:
-    """The nodes, by name, and the constants of a graph model."""
+def read_model(read: Callable[[str], bytes], name: str = "model.json") -> tuple[Nodes, Weights]:
+    """The nodes, by name, and the constants of a graph model; ``read`` gives the content of its files."""
     model = json.loads(read(name))
     nodes = {node["name"]: node for node in model["modelTopology"]["node"]}
     weights: dict[str, NDArray[Any]] = {}

@@ -35,7 +35,7 @@ from cleargs.models.training.degrade import (
     degrade,
     motion_kernel,
 )
-from cleargs.models.training.restorer import list_photos, read_photo, source_of
+from cleargs.models.training.train_restorer import list_photos, read_photo, source_of
 
 BANDS = ((7, 11), (12, 16), (17, 21))
 """Shortest and longest motion in pixels of each band."""

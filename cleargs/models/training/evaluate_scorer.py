@@ -14,13 +14,13 @@ import click
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
 from cleargs.models.lpips import Lpips
 from cleargs.models.scorer import CLARITY, NATURALNESS, load_scorer
 from cleargs.models.training import artefacts
 from cleargs.models.training.degrade import Degradation, Image, degrade, motion_kernel
-from cleargs.models.training.scorer import HELD_OUT
+from cleargs.models.training.train_restorer import list_photos, read_photo
+from cleargs.models.training.train_scorer import spearman
 
 _VISIBLE = 0.02  # LPIPS from which on a fault is called visible
 _REDUCTION = 0.67
@@ -48,9 +48,9 @@ def agreement(
 ) -> list[str]:
     """A Markdown table by artefact: rank agreement with -LPIPS, and how often the clean photo scores
     higher."""
-    within = [_spearman(s, -d) for s, d in zip(scores, distances, strict=True)]
+    within = [spearman(s, -d) for s, d in zip(scores, distances, strict=True)]
     lines = [
-        f"Spearman with -LPIPS: {_spearman(scores, -distances):.3f} over all images, "
+        f"Spearman with -LPIPS: {spearman(scores, -distances):.3f} over all images, "
         f"{np.mean(within):.3f} among the versions of one photo (mean)",
         "",
         f"| artefact | mean LPIPS | Spearman | clean preferred | where LPIPS >= {_VISIBLE} |",
@@ -60,7 +60,7 @@ def agreement(
         preferred = scores[:, 0] > scores[:, k]
         visible = distances[:, k] >= _VISIBLE
         lines.append(
-            f"| {name} | {distances[:, k].mean():.3f} | {_spearman(scores[:, k], -distances[:, k]):.2f} "
+            f"| {name} | {distances[:, k].mean():.3f} | {spearman(scores[:, k], -distances[:, k]):.2f} "
             f"| {preferred.mean():.0%} | {preferred[visible].mean():.0%} of {visible.sum()} |"
         )
     return lines
@@ -78,15 +78,9 @@ def choices(scores: NDArray[np.float64], names: list[str]) -> list[str]:
     return lines
 
 
-def _spearman(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    return float(spearmanr(a.ravel(), b.ravel()).statistic)
-
-
 def _photo(path: Path) -> Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    assert image is not None, path
-    image = cv2.resize(image, None, fx=_REDUCTION, fy=_REDUCTION, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(image[..., ::-1].astype(np.float32) / np.float32(255.0))
+    image = cv2.resize(read_photo(path), None, fx=_REDUCTION, fy=_REDUCTION, interpolation=cv2.INTER_AREA)
+    return image.astype(np.float32) / np.float32(255.0)
 
 
 @click.command()
@@ -100,7 +94,7 @@ def main(photos: Path, models: Path | None, seed: int) -> None:
     cv2.setNumThreads(1)
     lpips = Lpips("alex", models)
     scorers = [load_scorer(CLARITY), load_scorer(NATURALNESS)]
-    held = [_photo(p) for p in sorted(photos.glob("*.jpg")) if p.name.split("_")[0] in HELD_OUT]
+    held = [_photo(path) for path in list_photos(photos, held_out=True)]
     distances, scores, offered = [], [], []
     for index, photo in enumerate(held):
         rng = np.random.default_rng([seed, index])

@@ -1,4 +1,4 @@
-"""Fit the statistics scorer on the pairs that ``training.scorer`` has made.
+"""Fit the statistics scorer on the pairs that ``training.train_scorer`` has made.
 
     python -m cleargs.models.training.naturalness --work DIR --out cleargs/models/naturalness.toml
 
@@ -18,8 +18,8 @@ import tomli_w
 from numpy.typing import NDArray
 
 from cleargs.models.naturalness import Quadratic, features, terms
-from cleargs.models.training.scorer import report
 from cleargs.models.training.scorer_pairs import Pairs, load_pairs
+from cleargs.models.training.train_scorer import report
 
 _RIDGE = 100.0
 _DIFFERENCES = 1.0  # weight of the differences to the clean version

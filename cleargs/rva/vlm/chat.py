@@ -60,16 +60,15 @@ class _NoRedirect(HTTPRedirectHandler):
 class ChatClient:
     """Sends chats to ``BASE/chat/completions``. Safe to use from several threads."""
 
-    def __init__(self, config: QwenConfig, environment: Mapping[str, str] = os.environ) -> None:
+    def __init__(self, config: QwenConfig) -> None:
         """Raises InputError when the address or the key of the environment cannot be used."""
-        self.base_url = (config.base_url or environment.get(URL_VARIABLE, "").strip() or DEFAULT_URL).rstrip(
-            "/"
-        )
+        self.base_url = config.base_url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL
+        self.base_url = self.base_url.rstrip("/")
         try:
             check_base_url(self.base_url)
         except ValueError as error:
             raise InputError(str(error), hint=f"set rva.qwen.base_url or {URL_VARIABLE}") from None
-        self._key = environment.get(KEY_VARIABLE, "").strip()
+        self._key = os.environ.get(KEY_VARIABLE, "").strip()
         if not (self._key.isascii() and self._key.isprintable()):
             # http.client would repeat the whole header in its complaint.
             raise InputError(

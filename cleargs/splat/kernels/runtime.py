@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 
 from cleargs import kernel_cache
@@ -43,17 +42,8 @@ def set_threads(n: int) -> None:
     launch.set_threads(n)
 
 
-def warm_up(progress: Callable[[str, int, int], None] | None = None) -> None:
-    """Compile every CPU kernel, or load it from the cache, by running each once on a tiny scene.
-
-    ``progress(name, done, total)`` is called before each kernel and, with ``done == total``, at the end.
-    """
+def warm_up() -> None:
+    """Compile every CPU kernel, or load it from the cache, by running each once on a tiny scene."""
     from cleargs.splat.kernels.cpu import warmup
 
-    steps = warmup.steps()
-    for done, (name, run) in enumerate(steps):
-        if progress is not None:
-            progress(name, done, len(steps))
-        run()
-    if progress is not None:
-        progress("done", len(steps), len(steps))
+    warmup.run()

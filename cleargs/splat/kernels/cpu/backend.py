@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import adam, colour, launch, loss
+from cleargs.splat.kernels.cpu import adam, affine_colour, launch, loss
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import PhotometricLoss
 from cleargs.splat.strategy import mcmc
@@ -56,12 +56,6 @@ def photometric_loss(
             )
     value = weight * ((1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - similarity)) if count else 0.0
     return PhotometricLoss(value, gradient, l1, similarity)
-
-
-def ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    with launch.exclusive():
-        _, similarity, _, _ = _measure(_pad(image, target, mask))
-    return similarity
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
@@ -196,7 +190,7 @@ def add_position_noise(
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     output = torch.empty(image.shape)
     with launch.exclusive():
-        colour.apply_affine(
+        affine_colour.apply_affine(
             image.detach().contiguous().numpy(), affine.detach().float().contiguous().numpy(), output.numpy()
         )
     return output
@@ -206,7 +200,7 @@ def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple
     grad_image = torch.empty(image.shape)
     row_sums = np.empty((image.shape[0], 3, 4), np.float64)
     with launch.exclusive():
-        colour.affine_backward(
+        affine_colour.affine_backward(
             image.detach().contiguous().numpy(),
             affine.detach().float().contiguous().numpy(),
             grad_output.detach().contiguous().numpy(),

@@ -18,7 +18,7 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels.cpu.jit import Array, Floats, exact, kernel, serial_kernel
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.splat_layout import (
     BEND_X,
     BEND_Y,
     DEPTH,

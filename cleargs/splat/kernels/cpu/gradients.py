@@ -26,7 +26,7 @@ from cleargs.splat.kernels.cpu.projection import (
     scaled_axes,
     unit_quaternion,
 )
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.splat_layout import (
     BLUE,
     GREEN,
     PAIR_COLUMNS,

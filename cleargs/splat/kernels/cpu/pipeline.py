@@ -16,7 +16,8 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
 from cleargs.splat.kernels.cpu.jit import Array, Floats
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.memory import available_memory
+from cleargs.splat.kernels.splat_layout import (
     BEND_X,
     BEND_Y,
     MAX_PAIRS,
@@ -28,7 +29,6 @@ from cleargs.splat.kernels.layout import (
     SUM_VY,
     TILE,
 )
-from cleargs.splat.kernels.memory import available_memory
 
 PAIR_BUFFERS = ("pair_tiles", "pair_ids", "pair_slots", "pair_sums")
 PAIR_BYTES = 4 * (3 + SUM_DEPTH)

@@ -32,7 +32,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import sh_basis
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.splat_layout import (
     BEND_X,
     BEND_Y,
     BLUE,

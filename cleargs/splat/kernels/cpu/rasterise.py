@@ -52,7 +52,7 @@ from cleargs.splat.kernels.cpu.simd import (
     store,
     store_lane_sums,
 )
-from cleargs.splat.kernels.layout import (
+from cleargs.splat.kernels.splat_layout import (
     BEND_X,
     BEND_Y,
     BLUE,

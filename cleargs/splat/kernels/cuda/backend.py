@@ -11,9 +11,9 @@ from torch import Tensor
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import adam, densify, support
-from cleargs.splat.kernels.cuda.colour import affine_backward as affine_backward
-from cleargs.splat.kernels.cuda.colour import apply_affine as apply_affine
-from cleargs.splat.kernels.cuda.loss import Meter, Photometer
+from cleargs.splat.kernels.cuda.affine_colour import affine_backward as affine_backward
+from cleargs.splat.kernels.cuda.affine_colour import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.loss import Meter, Photometer, reading
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.losses import PhotometricLoss
 
@@ -33,7 +33,7 @@ def photometric_loss(
     mask: Tensor | None,
     gradient: Tensor,
 ) -> PhotometricLoss:
-    measured = Photometer()(
+    totals = Photometer()(
         image,
         target,
         mask,
@@ -41,13 +41,8 @@ def photometric_loss(
         ssim_weight=-weight * ssim_lambda,
         gradient=gradient,
     )
-    read = measured.read(ssim_lambda=ssim_lambda, weight=weight)
+    read = reading(totals.tolist(), ssim_lambda=ssim_lambda, weight=weight)
     return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
-
-
-def ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    measured = Photometer()(image, target, mask, l1_weight=0.0, ssim_weight=0.0, gradient=None)
-    return measured.read(ssim_lambda=0.0, weight=1.0).ssim
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:

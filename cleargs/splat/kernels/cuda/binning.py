@@ -13,7 +13,8 @@ import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels import splat_layout as layout
+from cleargs.splat.kernels.cuda import device_layout
 
 
 def key_type(tiles: int) -> torch.dtype:
@@ -77,7 +78,7 @@ def tile_columns(
     left_at = tl.minimum(tl.maximum(-at, low), high)
     a = tl.maximum(bend_x.to(tl.float64), 1e-30)
     e = bend_y.to(tl.float64)
-    t = log2_opacity.to(tl.float64) - layout.LOG2_REACH_CUT
+    t = log2_opacity.to(tl.float64) - device_layout.LOG2_REACH_CUT
     k = skew.to(tl.float64)
     right = k * right_at + tl.sqrt(tl.maximum(t - e * right_at * right_at, 0.0) / a)
     left = k * left_at - tl.sqrt(tl.maximum(t - e * left_at * left_at, 0.0) / a)
@@ -186,5 +187,5 @@ def tile_starts(sorted_tiles: Tensor, tiles: int) -> Tensor:
 
 def chunk_starts(starts: Tensor) -> Tensor:
     """First chunk of every tile and the end, [tiles + 1] int32, from the first place of every tile."""
-    chunks = (starts.diff() + (layout.CHUNK - 1)) // layout.CHUNK
+    chunks = (starts.diff() + (device_layout.CHUNK - 1)) // device_layout.CHUNK
     return torch.nn.functional.pad(chunks.cumsum(0), (1, 0)).to(torch.int32)

@@ -10,7 +10,8 @@ import triton
 import triton.language as tl
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels import splat_layout as layout
+from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.harmonics import sh_basis, sh_by_x, sh_by_y, sh_by_z
 from cleargs.splat.kernels.cuda.projection import (
     camera_position,
@@ -165,11 +166,11 @@ def backpropagate(
     # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 alike
     r0 = combine(1.0, combine(v0[0], axis0, v0[1], axis1), v0[2], axis2)
     r1 = combine(1.0, combine(v1[0], axis0, v1[1], axis1), v1[2], axis2)
-    w0 = view_triple(view, layout.VIEW_ROTATION)
-    w1 = view_triple(view, layout.VIEW_ROTATION + 3)
-    w2 = view_triple(view, layout.VIEW_ROTATION + 6)
+    w0 = view_triple(view, device_layout.VIEW_ROTATION)
+    w1 = view_triple(view, device_layout.VIEW_ROTATION + 3)
+    w2 = view_triple(view, device_layout.VIEW_ROTATION + 6)
     grad_jx, grad_jxz, grad_jy, grad_jyz = dot(r0, w0), dot(r0, w2), dot(r1, w1), dot(r1, w2)
-    fx, fy = tl.load(view + layout.VIEW_FX), tl.load(view + layout.VIEW_FY)
+    fx, fy = tl.load(view + device_layout.VIEW_FX), tl.load(view + device_layout.VIEW_FY)
     jx, jy, tangent_x, tangent_y = fx / z, fy / z, x / z, y / z
     by_tangent_x = grad_mean_x * fx - tl.where(bounded_x == tangent_x, grad_jxz * jx, 0.0)
     by_tangent_y = grad_mean_y * fy - tl.where(bounded_y == tangent_y, grad_jyz * jy, 0.0)
@@ -182,7 +183,7 @@ def backpropagate(
         by_z += sum_of(totals, layout.SUM_DEPTH, g, n, some)
     by_position = combine(1.0, combine(by_tangent_x / z, w0, by_tangent_y / z, w1), by_z, w2)
 
-    centre = view_triple(view, layout.VIEW_CENTRE)
+    centre = view_triple(view, device_layout.VIEW_CENTRE)
     offset = (mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2])
     distance = tl.where(some, tl.sqrt(dot(offset, offset)), 1.0)
     direction = scaled(1.0 / distance, offset)

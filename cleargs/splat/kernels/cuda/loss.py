@@ -22,7 +22,7 @@ import triton.language as tl
 from torch import Tensor
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.support import memory_errors
 
 ROWS = 4
@@ -39,19 +39,8 @@ class Reading(NamedTuple):
     psnr: float
 
 
-class Measured(NamedTuple):
-    """Sums over the values that count; on the device, so that reading them can wait."""
-
-    totals: Tensor  # [4] float64: |x - y|, SSIM, (x - y)², number of values
-    gradient: Tensor | None  # [H, W, 3]
-
-    def read(self, *, ssim_lambda: float, weight: float) -> Reading:
-        """The loss and its parts. Waits for the device."""
-        return reading(self.totals.tolist(), ssim_lambda=ssim_lambda, weight=weight)
-
-
 def reading(totals: Sequence[float], *, ssim_lambda: float, weight: float) -> Reading:
-    """The loss and its parts from the four sums."""
+    """The loss and its parts from the sums of a `Photometer`."""
     l1, similarity, squared, count = totals
     if not count > 0:
         return Reading(0.0, 0.0, 1.0, math.inf) if count == 0 else Reading(*(math.nan,) * 4)
@@ -96,8 +85,8 @@ def window_rows(
         inside = (y < height) & (j >= 0) & (j < length)
         a = kept(image, mask, y, j, inside, length, HAS_MASK)
         b = kept(target, mask, y, j, inside, length, HAS_MASK)
-        weighted_a = a * layout.SSIM_WINDOW[tap]
-        weighted_b = b * layout.SSIM_WINDOW[tap]
+        weighted_a = a * device_layout.SSIM_WINDOW[tap]
+        weighted_b = b * device_layout.SSIM_WINDOW[tap]
         mean_x += weighted_a
         mean_y += weighted_b
         mean_xx += weighted_a * a
@@ -141,11 +130,11 @@ def measure(
         row = y + (tap - 5)
         inside = (row >= 0) & (row < height) & (i < length)
         at = sums + row * length + i
-        m += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        n += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        m += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        n += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        p += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        q += tl.load(at + 3 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        r += tl.load(at + 4 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     counts = here.to(tl.float32)
@@ -186,9 +175,9 @@ def window_maps(maps, sums, height, length, ROWS: tl.constexpr, COLUMNS: tl.cons
         j = i + 3 * (tap - 5)
         inside = (y < height) & (j >= 0) & (j < length)
         at = maps + y * length + j
-        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     at = sums + y * length + i
     here = (y < height) & (i < length)
     tl.store(at, by_mean, mask=here)
@@ -224,9 +213,9 @@ def differentiate(
         row = y + (tap - 5)
         inside = (row >= 0) & (row < height) & (i < length)
         at = sums + row * length + i
-        by_mean += tl.load(at, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_square += tl.load(at + plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
-        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * layout.SSIM_WINDOW[tap]
+        by_mean += tl.load(at, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_square += tl.load(at + plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
+        by_product += tl.load(at + 2 * plane, mask=inside, other=0.0) * device_layout.SSIM_WINDOW[tap]
     a = kept(image, mask, y, i, here, length, HAS_MASK)
     b = kept(target, mask, y, i, here, length, HAS_MASK)
     share = (1.0 / tl.maximum(tl.load(totals + 3), 1.0)).to(tl.float32)
@@ -262,7 +251,7 @@ class Meter:
         gradient: Tensor,
     ) -> None:
         """Write the gradient of a step's loss (see ``losses.photometric_loss``) and keep its sums."""
-        measured = self._photometer(
+        totals = self._photometer(
             image,
             target,
             mask,
@@ -270,7 +259,7 @@ class Meter:
             ssim_weight=-weight * self._lambda,
             gradient=gradient,
         )
-        self._pending.append((step, weight, measured.totals))
+        self._pending.append((step, weight, totals))
 
     def take(self) -> list[tuple[int, Reading]]:
         """What waits, by step, and forget it."""
@@ -299,9 +288,13 @@ class Photometer:
         *,
         l1_weight: float,
         ssim_weight: float,
-        gradient: Tensor | None,  # [H, W, 3] to write into; None = not wanted
-    ) -> Measured:
-        """Measure, and write the gradient of l1_weight * mean |x - y| + ssim_weight * mean SSIM."""
+        gradient: Tensor,  # [H, W, 3] to write into
+    ) -> Tensor:  # [4] float64
+        """Write the gradient of l1_weight * mean |x - y| + ssim_weight * mean SSIM.
+
+        Returns the sums of |x - y|, SSIM and (x - y)² over the values that count, and their number: on the
+        device, so that reading them can wait.
+        """
         with memory_errors():
             return self._run(image.detach(), target, mask, l1_weight, ssim_weight, gradient)
 
@@ -312,8 +305,8 @@ class Photometer:
         mask: Tensor | None,
         l1_weight: float,
         ssim_weight: float,
-        gradient: Tensor | None,
-    ) -> Measured:
+        gradient: Tensor,
+    ) -> Tensor:
         height, length = image.shape[0], 3 * image.shape[1]
         size = height * length
         if self._memory is None or len(self._memory) < 8 * size or self._memory.device != image.device:
@@ -329,20 +322,19 @@ class Photometer:
         window_rows[grid](image, target, bits, sums, height, length, HAS_MASK=has_mask, **block)
         measure[grid](image, target, bits, sums, maps, partials, height, length, HAS_MASK=has_mask, **block)
         totals = partials.sum(0)
-        if gradient is not None:
-            window_maps[grid](maps, sums, height, length, **block)
-            differentiate[grid](
-                image,
-                target,
-                bits,
-                sums,
-                totals,
-                gradient,
-                l1_weight,
-                ssim_weight,
-                height,
-                length,
-                HAS_MASK=has_mask,
-                **block,
-            )
-        return Measured(totals, gradient)
+        window_maps[grid](maps, sums, height, length, **block)
+        differentiate[grid](
+            image,
+            target,
+            bits,
+            sums,
+            totals,
+            gradient,
+            l1_weight,
+            ssim_weight,
+            height,
+            length,
+            HAS_MASK=has_mask,
+            **block,
+        )
+        return totals

@@ -15,7 +15,8 @@ from torch import Tensor
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import binning, gradients, layout, projection, rasterise
+from cleargs.splat.kernels import splat_layout as layout
+from cleargs.splat.kernels.cuda import binning, device_layout, gradients, projection, rasterise
 from cleargs.splat.kernels.cuda.support import available_memory, memory_errors
 
 FORWARD_WARPS = 2
@@ -32,7 +33,9 @@ PAIR_BUFFERS = (
     *("pair_tiles", "pair_owners", "pair_ids", "pair_slots", "pair_sums"),
     *("chunk_planes", "chunk_behind"),
 )
-PAIR_BYTES = 4 * (4 + layout.PAIR_COLUMNS + layout.TILE_PIXELS * (layout.CHUNK_PLANES + 1) // layout.CHUNK)
+PAIR_BYTES = 4 * (
+    4 + layout.PAIR_COLUMNS + layout.TILE_PIXELS * (device_layout.CHUNK_PLANES + 1) // device_layout.CHUNK
+)
 """What a (tile, splat) pair takes in them, its share of a full chunk included."""
 SORT_BYTES = 24
 """What sorting it by tile takes for a while: key and number, twice."""
@@ -161,7 +164,7 @@ class CudaRasteriser:
                 f"grad_image has the shape {tuple(grad_image.shape)}, "
                 f"expected {(camera.height, camera.width, 3)}"
             )
-        if grad_depth is not None and frame.planes == layout.CHUNK_PLANES:
+        if grad_depth is not None and frame.planes == device_layout.CHUNK_PLANES:
             raise ValueError("a gradient of the depth needs a forward(depth=True) before it")
         with memory_errors():
             return self._backward(
@@ -328,9 +331,9 @@ class CudaRasteriser:
                 sorted_slots, pair_owners, pair_ids, pair_slots, pairs, BLOCK=ORDER_BLOCK, num_warps=4
             )
         tile_starts = binning.tile_starts(sorted_tiles, tiles)
-        planes = layout.CHUNK_PLANES + depth
+        planes = device_layout.CHUNK_PLANES + depth
         # The number of chunks is known on the device alone; this many there can be at most.
-        chunks = pairs // layout.CHUNK + min(tiles, pairs)
+        chunks = pairs // device_layout.CHUNK + min(tiles, pairs)
         return Frame(
             gaussians=gaussians,
             camera=camera,

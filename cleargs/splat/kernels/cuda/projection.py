@@ -14,7 +14,8 @@ from torch import Tensor
 
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels import splat_layout as layout
+from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.binning import count_tiles
 from cleargs.splat.kernels.cuda.harmonics import sh_basis
 
@@ -58,7 +59,7 @@ def combine(a, x, b, y):
 @triton.jit
 def is_finite(x):
     """Within the range of float32; false for NaN."""
-    return tl.abs(x) <= layout.FLOAT32_MAX
+    return tl.abs(x) <= device_layout.FLOAT32_MAX
 
 
 @triton.jit
@@ -80,11 +81,11 @@ def view_triple(view, at: tl.constexpr):
 @triton.jit
 def camera_position(mean, view):
     """The Gaussian's centre in camera coordinates."""
-    shift = view_triple(view, layout.VIEW_TRANSLATION)
+    shift = view_triple(view, device_layout.VIEW_TRANSLATION)
     return (
-        dot(view_triple(view, layout.VIEW_ROTATION), mean) + shift[0],
-        dot(view_triple(view, layout.VIEW_ROTATION + 3), mean) + shift[1],
-        dot(view_triple(view, layout.VIEW_ROTATION + 6), mean) + shift[2],
+        dot(view_triple(view, device_layout.VIEW_ROTATION), mean) + shift[0],
+        dot(view_triple(view, device_layout.VIEW_ROTATION + 3), mean) + shift[1],
+        dot(view_triple(view, device_layout.VIEW_ROTATION + 6), mean) + shift[2],
     )
 
 
@@ -116,14 +117,14 @@ def rotation_columns(q):
 def projection_rows(position, view):
     """The rows of J W, and the bounded x/z and y/z at which J is taken."""
     x, y, z = position[0], position[1], position[2]
-    jx, jy = tl.load(view + layout.VIEW_FX) / z, tl.load(view + layout.VIEW_FY) / z
-    left, right = tl.load(view + layout.VIEW_LEFT), tl.load(view + layout.VIEW_RIGHT)
-    top, bottom = tl.load(view + layout.VIEW_TOP), tl.load(view + layout.VIEW_BOTTOM)
+    jx, jy = tl.load(view + device_layout.VIEW_FX) / z, tl.load(view + device_layout.VIEW_FY) / z
+    left, right = tl.load(view + device_layout.VIEW_LEFT), tl.load(view + device_layout.VIEW_RIGHT)
+    top, bottom = tl.load(view + device_layout.VIEW_TOP), tl.load(view + device_layout.VIEW_BOTTOM)
     tangent_x = tl.minimum(tl.maximum(x / z, left), right)
     tangent_y = tl.minimum(tl.maximum(y / z, top), bottom)
-    forwards = view_triple(view, layout.VIEW_ROTATION + 6)
-    row0 = combine(jx, view_triple(view, layout.VIEW_ROTATION), -jx * tangent_x, forwards)
-    row1 = combine(jy, view_triple(view, layout.VIEW_ROTATION + 3), -jy * tangent_y, forwards)
+    forwards = view_triple(view, device_layout.VIEW_ROTATION + 6)
+    row0 = combine(jx, view_triple(view, device_layout.VIEW_ROTATION), -jx * tangent_x, forwards)
+    row1 = combine(jy, view_triple(view, device_layout.VIEW_ROTATION + 3), -jy * tangent_y, forwards)
     return (row0, row1, tangent_x, tangent_y)
 
 
@@ -164,7 +165,7 @@ def project(
     mean = load_triple(means + g * 3, mask)
     position = camera_position(mean, view)
     z = position[2]
-    visible = mask & (z >= constants.NEAR) & (z <= layout.FLOAT32_MAX)
+    visible = mask & (z >= constants.NEAR) & (z <= device_layout.FLOAT32_MAX)
     # Culled lanes go on with harmless numbers.
     position = (position[0], position[1], tl.where(visible, z, 1.0))
     z = position[2]
@@ -184,13 +185,13 @@ def project(
     if ANTIALIAS:
         normal = cross(w, u1)
         log2_opacity += 0.5 * tl.log2(dot(normal, normal) / (variance * yy))
-    mean_x = tl.load(view + layout.VIEW_FX) * position[0] / z + tl.load(view + layout.VIEW_CX)
-    mean_y = tl.load(view + layout.VIEW_FY) * position[1] / z + tl.load(view + layout.VIEW_CY)
-    reach = layout.TWO_LN2 * (log2_opacity - constants.LOG2_ALPHA_CUT)
+    mean_x = tl.load(view + device_layout.VIEW_FX) * position[0] / z + tl.load(view + device_layout.VIEW_CX)
+    mean_y = tl.load(view + device_layout.VIEW_FY) * position[1] / z + tl.load(view + device_layout.VIEW_CY)
+    reach = device_layout.TWO_LN2 * (log2_opacity - constants.LOG2_ALPHA_CUT)
     visible = visible & (reach >= 0.0) & is_finite(variance) & is_finite(xx) & is_finite(yy)
     visible = visible & is_finite(mean_x) & is_finite(mean_y)
 
-    centre = view_triple(view, layout.VIEW_CENTRE)
+    centre = view_triple(view, device_layout.VIEW_CENTRE)
     towards = (mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2])
     distance = tl.sqrt(dot(towards, towards))
     basis = sh_basis(
@@ -211,7 +212,10 @@ def project(
     row = splats + g * layout.SPLAT_COLUMNS
     # Rounded once, here: the tiles are counted from what is stored.
     mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
-    bend_x, bend_y = (layout.HALF_LOG2E / variance).to(tl.float32), (layout.HALF_LOG2E / yy).to(tl.float32)
+    bend_x, bend_y = (
+        (device_layout.HALF_LOG2E / variance).to(tl.float32),
+        (device_layout.HALF_LOG2E / yy).to(tl.float32),
+    )
     skew, log2_opacity = skew.to(tl.float32), log2_opacity.to(tl.float32)
     extent_x, extent_y = tl.sqrt(reach * xx).to(tl.float32), tl.sqrt(reach * yy).to(tl.float32)
     extent_x_at = (xy * tl.sqrt(reach / xx)).to(tl.float32)

@@ -1,7 +1,7 @@
 """Tile rasterisation, forward and backward; the mathematics is that of the CPU back end's ``rasterise``.
 
 Forward, a program is a tile: its 256 pixels are the vector, its pairs follow each other from near to far.
-Behind every ``layout.CHUNK`` pairs it leaves the transmittance and what the chunk added to each pixel.
+Behind every ``device_layout.CHUNK`` pairs it leaves the transmittance and what the chunk added to each pixel.
 ``behind`` sums these from the far end into S, the part of g · pixel that lies behind each chunk. With T and S
 at its far end each chunk can be differentiated on its own, so that backward a program is a chunk and long
 lists of pairs are shared out:
@@ -17,7 +17,8 @@ import triton
 import triton.language as tl
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cuda import layout
+from cleargs.splat.kernels import splat_layout as layout
+from cleargs.splat.kernels.cuda import device_layout
 
 
 @triton.jit
@@ -85,7 +86,7 @@ def forward(
     start = begin
     goes_on = begin < end
     while goes_on:
-        stop = tl.minimum(start + layout.CHUNK, end)
+        stop = tl.minimum(start + device_layout.CHUNK, end)
         chunk_red = tl.zeros_like(x)
         chunk_green = tl.zeros_like(x)
         chunk_blue = tl.zeros_like(x)
@@ -110,15 +111,15 @@ def forward(
             if WITH_DEPTH:
                 chunk_z += weight * tl.load(row + layout.DEPTH)
         planes = chunk_planes + chunk.to(tl.int64) * (PLANES * layout.TILE_PIXELS) + pixel
-        tl.store(planes + layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS, rest)
-        tl.store(planes + layout.CHUNK_RED * layout.TILE_PIXELS, chunk_red)
-        tl.store(planes + layout.CHUNK_GREEN * layout.TILE_PIXELS, chunk_green)
-        tl.store(planes + layout.CHUNK_BLUE * layout.TILE_PIXELS, chunk_blue)
+        tl.store(planes + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS, rest)
+        tl.store(planes + device_layout.CHUNK_RED * layout.TILE_PIXELS, chunk_red)
+        tl.store(planes + device_layout.CHUNK_GREEN * layout.TILE_PIXELS, chunk_green)
+        tl.store(planes + device_layout.CHUNK_BLUE * layout.TILE_PIXELS, chunk_blue)
         red += chunk_red
         green += chunk_green
         blue += chunk_blue
         if WITH_DEPTH:
-            tl.store(planes + layout.CHUNK_DEPTH * layout.TILE_PIXELS, chunk_z)
+            tl.store(planes + device_layout.CHUNK_DEPTH * layout.TILE_PIXELS, chunk_z)
             z += chunk_z
         chunk += 1
         start = stop
@@ -169,17 +170,17 @@ def behind(
         far -= tl.load(grad_alpha + at, mask=inside, other=0.0)
     far *= tl.load(transmittance + at, mask=inside, other=0.0)
     chunk = tl.load(chunk_starts + tile).to(tl.int64)
-    reached = (tl.load(deepest + tile) + (layout.CHUNK - 1)) // layout.CHUNK
+    reached = (tl.load(deepest + tile) + (device_layout.CHUNK - 1)) // device_layout.CHUNK
     for step in range(0, reached):
         number = chunk + (reached - 1 - step)
         tl.store(chunk_behind + number * layout.TILE_PIXELS + pixel, far)
         planes = chunk_planes + number * (PLANES * layout.TILE_PIXELS) + pixel
-        far += red * tl.load(planes + layout.CHUNK_RED * layout.TILE_PIXELS)
-        far += green * tl.load(planes + layout.CHUNK_GREEN * layout.TILE_PIXELS)
-        far += blue * tl.load(planes + layout.CHUNK_BLUE * layout.TILE_PIXELS)
+        far += red * tl.load(planes + device_layout.CHUNK_RED * layout.TILE_PIXELS)
+        far += green * tl.load(planes + device_layout.CHUNK_GREEN * layout.TILE_PIXELS)
+        far += blue * tl.load(planes + device_layout.CHUNK_BLUE * layout.TILE_PIXELS)
         if HAS_DEPTH:
             z = tl.load(grad_depth + at, mask=inside, other=0.0)
-            far += z * tl.load(planes + layout.CHUNK_DEPTH * layout.TILE_PIXELS)
+            far += z * tl.load(planes + device_layout.CHUNK_DEPTH * layout.TILE_PIXELS)
 
 
 @triton.jit(do_not_specialize=["tiles", "width", "height"])
@@ -212,11 +213,11 @@ def backward(
     if chunk < tl.load(chunk_starts + tiles):
         tile = tl.load(chunk_tiles + chunk)
         begin = tl.load(tile_starts + tile)
-        start = begin + (chunk - tl.load(chunk_starts + tile)) * layout.CHUNK
-        end = tl.minimum(start + layout.CHUNK, tl.load(tile_starts + tile + 1))
+        start = begin + (chunk - tl.load(chunk_starts + tile)) * device_layout.CHUNK
+        end = tl.minimum(start + device_layout.CHUNK, tl.load(tile_starts + tile + 1))
         contributing = tl.minimum(end, begin + tl.load(deepest + tile))
 
-        place = start + tl.arange(0, layout.CHUNK)
+        place = start + tl.arange(0, device_layout.CHUNK)
         unseen = (place >= contributing) & (place < end)
         slots = tl.load(pair_slots + place, mask=unseen, other=0).to(tl.int64)
         for k in tl.static_range(COLUMNS):
@@ -279,7 +280,9 @@ def backward_chunk(
     grad_green = tl.load(grad_image + at * 3 + 1, mask=inside, other=0.0)
     grad_blue = tl.load(grad_image + at * 3 + 2, mask=inside, other=0.0)
     number = chunk.to(tl.int64) * layout.TILE_PIXELS
-    t = tl.load(chunk_planes + number * PLANES + layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS + pixel)
+    t = tl.load(
+        chunk_planes + number * PLANES + device_layout.CHUNK_TRANSMITTANCE * layout.TILE_PIXELS + pixel
+    )
     far = tl.load(chunk_behind + number + pixel)
     if HAS_DEPTH:
         grad_z = tl.load(grad_depth + at, mask=inside, other=0.0)

@@ -1,6 +1,6 @@
 """The restoration expert ClearGS ships: its network, its training and its export.
 
-    python -m cleargs.models.training.restorer --photos DIR --renders DIR --out restorer.onnx
+    python -m cleargs.models.training.train_restorer --photos DIR --renders DIR --out restorer.onnx
 
 trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
 renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cleargs.progress import Pace, Reporter, SilentTask, Task
+from cleargs.progress import Pace, Reporter, SilentReporter, Task
 from cleargs.text import printable
 
 if TYPE_CHECKING:
@@ -28,14 +28,8 @@ def make_reporter(quiet: bool = False) -> Reporter:
     return BarReporter() if sys.stderr.isatty() else LineReporter()
 
 
-class QuietReporter:
+class QuietReporter(SilentReporter):
     """Warnings only."""
-
-    @contextmanager
-    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        yield SilentTask()
-
-    def info(self, text: str) -> None: ...
 
     def warn(self, text: str) -> None:
         click.echo(f"warning: {printable(text)}", err=True)

@@ -14,9 +14,9 @@ from OpenImageIO import FLOAT, ImageOutput, ImageSpec
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path, write_bytes, write_json
 from cleargs.media.colour import srgb_from_linear
+from cleargs.parquet import column
+from cleargs.synth.optics import Array, Lens
 from cleargs.synth.phone import PLAIN, Look
-from cleargs.synth.world import Array, Lens
-from cleargs.tables import column
 
 FRAMES = pa.schema(
     [

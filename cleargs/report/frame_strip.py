@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import Exposure, read_exposure
+from cleargs.parquet import read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
-from cleargs.tables import read_table
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles of frames on which RVA has nothing to say."""

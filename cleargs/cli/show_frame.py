@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from cleargs.cli.frames import reason, worst_cue
+from cleargs.cli.frame_reasons import reason, worst_cue
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import write_rgb
+from cleargs.parquet import read_table
 from cleargs.report.contact import Tile, contact_sheet
-from cleargs.report.frames import CHOICES, FrameRow, formation_meanings, last_scene, load_rows
-from cleargs.report.pictures import LAYERS, layers_of
-from cleargs.report.scene import Renderer, camera_of
+from cleargs.report.frame_pictures import LAYERS, layers_of
+from cleargs.report.frame_strip import CHOICES, FrameRow, formation_meanings, last_scene, load_rows
+from cleargs.report.web_scene import Renderer, camera_of
 from cleargs.rivr.tables import REPAIRS, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 from cleargs.splat.ply import read_ply
-from cleargs.tables import read_table
 
 MODELS = {
     "none": "nothing found",

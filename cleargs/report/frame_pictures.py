@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb, to_uint8
-from cleargs.report.frames import FrameRow
+from cleargs.report.frame_strip import FrameRow
 
 LAYERS = {
     "observed": "As filmed",

@@ -16,8 +16,9 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.views import view_of
 from cleargs.synth.course import CameraCourse, camera_course
-from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
@@ -32,7 +33,7 @@ class RealCamera:
 
 
 class SplatWorld:
-    """A Gaussian scene as a `cleargs.synth.world.World`; its lengths are the scene's own.
+    """A Gaussian scene as a `cleargs.synth.optics.World`; its lengths are the scene's own.
 
     The splatting core renders each pose once, with its own pixel filter; rows are taken from the pictures
     of their poses. Averages are taken of what a display would show, clipped to [0, 1], in linear light.
@@ -130,15 +131,11 @@ def read_cameras(source: Path) -> list[RealCamera]:
 def _cameras_of_run(ingest: Path) -> list[RealCamera]:
     cameras = []
     for frame in load_frames(ingest):
-        pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-        numbers = [value for value in pose if value is not None]
-        if frame.registered and len(numbers) == 7:
+        if frame.registered:
+            camera = view_of(frame, ingest, 0.0).camera
             lens = Lens(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy)
-            camera = Camera.from_quaternion(
-                *numbers, width=lens.width, height=lens.height, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy
-            )
-            rotation = camera.world_to_camera[:3, :3].T
-            cameras.append(RealCamera(lens, np.column_stack([rotation, camera.centre])))
+            pose = np.column_stack([camera.world_to_camera[:3, :3].T, camera.centre])
+            cameras.append(RealCamera(lens, pose))
     return cameras
 
 

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 
 from cleargs.capture.tables import load_frames
-from cleargs.cli.progress import make_reporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.formation.table import read_formation
+from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.engine import Engine
+from cleargs.splat.pruning import central_box, contributions, inside
 from cleargs.splat.scene import Scene
-from cleargs.splat.selection import central_box, contributions, inside
 from cleargs.splat.views import View, real_views
-from cleargs.tables import read_table
 
 PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P pixels"
 CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"

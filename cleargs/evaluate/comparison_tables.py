@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from cleargs.evaluate.cells import Cells, Spread, ViewSet
 from cleargs.evaluate.choices import Choices, agreement
-from cleargs.evaluate.results import LOWER_IS_BETTER
+from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 from cleargs.evaluate.roles import KINDS, Roles
 
 TITLES: Mapping[ViewSet, str] = {

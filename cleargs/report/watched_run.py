@@ -9,7 +9,7 @@ from typing import Any
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import AtWork, at_work, preview_of
 from cleargs.pipeline.run_file import Run
-from cleargs.report.record import is_current, linked_manifests, page_of
+from cleargs.report.report_json import is_current, linked_manifests, page_of
 
 
 class Watched:

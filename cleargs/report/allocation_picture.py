@@ -22,12 +22,12 @@ from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb
+from cleargs.parquet import read_table
 from cleargs.rva.allocation import Role, Roles, effective_sample_size
 from cleargs.rva.geometry import Ints, camera_centres, view_directions
-from cleargs.rva.results import poses_from
 from cleargs.rva.scores import Bools, Floats
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.tables import read_table
+from cleargs.rva.tabulate import poses_from
 
 SHOWN = 6
 """Most frames in a row of pictures."""

@@ -14,9 +14,9 @@ from cleargs.errors import InputError
 from cleargs.evaluate.cells import Cell, Cells
 from cleargs.evaluate.choices import Choice, Choices, judge_choices
 from cleargs.evaluate.comparison import EVALUATION_VERSION, Made, Recipe, judge
+from cleargs.evaluate.comparison_tables import Results
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.roles import Roles, count_roles
-from cleargs.evaluate.tables import Results
 from cleargs.files import write_bytes
 from cleargs.pipeline.keys import canonical_json
 from cleargs.pipeline.store import Store

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from cleargs.errors import InputError
+from cleargs.synth.optics import MIN_SAMPLES, Array, Lens, Shutter
 from cleargs.synth.path import HandheldPath
-from cleargs.synth.world import MIN_SAMPLES, Array, Lens, Shutter
 
 GRID = (24, 14)
 """Columns and rows of the points whose motion is followed."""

@@ -1,6 +1,6 @@
 """Peak memory of training at one size, measured in a process of its own.
 
-``python -m cleargs.bench.memory COUNT WIDTH HEIGHT SIGMA`` prints the bytes that the scene and three
+``python -m cleargs.bench.peak_memory COUNT WIDTH HEIGHT SIGMA`` prints the bytes that the scene and three
 iterations need at their peak beyond the loaded program, or ``null`` where the system does not tell.
 """
 
@@ -21,7 +21,7 @@ ITERATIONS = 3
 
 def peak_memory(count: int, width: int, height: int, sigma: float) -> int | None:
     """Bytes that parameters, moments, gradients and buffers take at their peak; None where unknown."""
-    command = module_command("cleargs.bench.memory", str(count), str(width), str(height), str(sigma))
+    command = module_command("cleargs.bench.peak_memory", str(count), str(width), str(height), str(sigma))
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     value: int | None = json.loads(done.stdout)
     return value
@@ -36,7 +36,7 @@ def _resident(field: str) -> int:
 
 def _measure(count: int, width: int, height: int, sigma: float) -> int | None:
     from cleargs.bench.iteration import Iteration
-    from cleargs.bench.scenes import random_scene
+    from cleargs.bench.random_scenes import random_scene
     from cleargs.bench.timing import Clock
     from cleargs.splat.kernels.runtime import warm_up
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
+from cleargs.capture.tables import Frame
 from cleargs.rva.allocation import Role, Rule, effective_sample_size
 from cleargs.rva.assessment import Assessment, Poses
 from cleargs.rva.scores import Floats
@@ -19,29 +20,8 @@ from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
 _WEIGHT_STEPS = 10
 
 
-class PosedFrame(Protocol):
-    """What RVA needs to know of a frame's camera (COLMAP: world to camera, quaternion w x y z)."""
-
-    @property
-    def registered(self) -> bool: ...
-    @property
-    def qw(self) -> float | None: ...
-    @property
-    def qx(self) -> float | None: ...
-    @property
-    def qy(self) -> float | None: ...
-    @property
-    def qz(self) -> float | None: ...
-    @property
-    def tx(self) -> float | None: ...
-    @property
-    def ty(self) -> float | None: ...
-    @property
-    def tz(self) -> float | None: ...
-
-
-def poses_from(frames: Sequence[PosedFrame]) -> Poses:
-    """Rotation matrices and translations; identity where a frame has no pose."""
+def poses_from(frames: Sequence[Frame]) -> Poses:
+    """Rotation matrices and translations, world to camera; identity where a frame has no pose."""
     rotations = np.tile(np.eye(3), (len(frames), 1, 1))
     translations = np.zeros((len(frames), 3))
     registered = np.array([frame.registered for frame in frames], dtype=bool)

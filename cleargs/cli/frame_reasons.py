@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cleargs.cli.words import AS_FILMED, text_of
+from cleargs.cli.manifest_words import AS_FILMED, text_of
 
 COLUMNS = ("frame", "name", "role", "weight", "R", "B", "worst cue", "reason", "repair")
 

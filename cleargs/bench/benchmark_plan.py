@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from cleargs.bench.scenes import MEDIAN_SIGMA
+from cleargs.bench.random_scenes import MEDIAN_SIGMA
 
 
 class Case(NamedTuple):

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import disk_error, write_json
-from cleargs.tables import column, write_table
+from cleargs.parquet import column, write_table
+from cleargs.record import Record
 from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
@@ -25,9 +26,9 @@ LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """All other metrics are better the higher they are."""
 
 
-class _Record(BaseModel):
+class _Record(Record):
     # A perfect image has an infinite PSNR, which JSON has no number for: it is written as "Infinity".
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+    model_config = ConfigDict(ser_json_inf_nan="strings")
 
 
 class Alignment(_Record):

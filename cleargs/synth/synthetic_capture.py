@@ -15,16 +15,16 @@ import pyarrow as pa
 from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.encode import require_even, write_video
+from cleargs.parquet import write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.course import Course, orbit
-from cleargs.synth.motion import FrameMotion, follow
+from cleargs.synth.develop import FRAMES, develop, write_depth, write_image, write_transforms
+from cleargs.synth.image_motion import FrameMotion, follow
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, World, disc, phone_lens, still
 from cleargs.synth.path import FPS, frame_times, make_path
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, Protocol, find_protocol, noisy_poses, plan
-from cleargs.synth.record import FRAMES, develop, write_depth, write_image, write_transforms
-from cleargs.synth.world import PINHOLE, Aperture, Array, Lens, Shutter, World, disc, phone_lens, still
-from cleargs.tables import write_table
 
 Film: TypeAlias = Callable[[Shutter, Lens, Aperture], tuple[Array, Array]]
 
@@ -57,7 +57,7 @@ def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
 
 def scene_setting(scene: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
     """A trained scene, in its own units, and a walk along its real cameras. Raises InputError."""
-    from cleargs.synth.scene import open_scene
+    from cleargs.synth.splat_world import open_scene
 
     world, course, lens, name = open_scene(scene, cameras, frames, width, height)
     return Setting(name, world, course, lens)
@@ -79,7 +79,7 @@ def make_capture(
     """Write the capture ``protocol`` into the new folder ``out``; returns what ``truth/capture.json`` says.
 
     The world is the room of ``seed``, or the Gaussian scene in ``scene``, walked along its real cameras (see
-    `cleargs.synth.scene.open_scene`). ``out/images`` and ``out/transforms.json`` (and with ``video``
+    `cleargs.synth.splat_world.open_scene`). ``out/images`` and ``out/transforms.json`` (and with ``video``
     ``out/capture.mp4``) are what a user would have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
     views in the same form, 8-bit sRGB PNGs, with exact poses: at the middle of the frames' exposures, with
     ``depth/``, and off the path. ``out/truth/frames.parquet`` (`record.FRAMES`) has each frame's faults.
@@ -108,8 +108,8 @@ def make_capture(
     (out / "images").mkdir(parents=True, exist_ok=True)
     with reporter.task(f"synth {protocol}", 2 * frames + len(novel)) as task:
         motions, depths, luminances = [], [], []
-        _make_folder(out / "truth" / "observed")
-        (out / "truth" / "observed" / "depth").mkdir()
+        for folder in ("observed/images", "observed/depth", "novel/images"):
+            (out / "truth" / folder).mkdir(parents=True)
         for stem, time, pose in zip(stems, times, poses, strict=True):
             depth = setting.world.depth(pose, setting.lens)
             write_depth(out / "truth" / "observed" / "depth" / f"{stem}.exr", depth)
@@ -136,7 +136,6 @@ def make_capture(
             shots = coded(out / "capture.mp4", shots, FPS)
         for image, shot in zip(images, shots, strict=True):
             write_image(out / image, shot, rules.jpeg)
-        _make_folder(out / "truth" / "novel")
         novel_stems = [f"{number:06d}" for number in range(len(novel))]
         for stem, pose in zip(novel_stems, novel, strict=True):
             _write_sharp(out / "truth" / "novel", stem, setting, pose, look)
@@ -232,10 +231,6 @@ def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: L
     light = setting.world.render(still(pose, setting.lens.height), setting.lens)
     write_image(folder / "images" / f"{stem}.png", develop(light, look=look))
     return light
-
-
-def _make_folder(folder: Path) -> None:
-    (folder / "images").mkdir(parents=True, exist_ok=True)
 
 
 def _novel_poses(course: Course, count: int, seed: int) -> Array:

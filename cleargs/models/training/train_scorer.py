@@ -1,7 +1,7 @@
 """Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one
 alone.
 
-    python -m cleargs.models.training.scorer --photos DIR --work DIR --out scorer.onnx
+    python -m cleargs.models.training.train_scorer --photos DIR --work DIR --out scorer.onnx
 
 The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times
 as much and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models
@@ -28,8 +28,8 @@ from torch.nn import functional
 from cleargs.models.lpips import load_network, weights_file
 from cleargs.models.registry import model_dir
 from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
+from cleargs.models.training.train_restorer import HELD_OUT, source_of
 
-HELD_OUT = ("budgie", "elementary", "mate")
 _GROUPS_PER_BATCH = 8
 _SHOWN = 4  # versions of a group in one batch
 _HARD = {"oversharp": 2.0, "ringing": 2.0}  # shown more often: they look sharper than the clean version
@@ -253,9 +253,9 @@ def report(predicted: NDArray[np.float32], pairs: Pairs) -> list[str]:
     ``predicted`` [G, V] is lower for better versions.
     """
     lines = [
-        f"Spearman over all patches {_spearman(predicted, pairs.targets):.3f}",
+        f"Spearman over all patches {spearman(predicted, pairs.targets):.3f}",
         "Spearman within one content (mean) "
-        + f"{np.mean([_spearman(p, t) for p, t in zip(predicted, pairs.targets, strict=True)]):.3f}",
+        + f"{np.mean([spearman(p, t) for p, t in zip(predicted, pairs.targets, strict=True)]):.3f}",
         "",
         "| degradation | patches | mean LPIPS | Spearman | clean ranked first |",
         "|---|---|---|---|---|",
@@ -266,12 +266,13 @@ def report(predicted: NDArray[np.float32], pairs: Pairs) -> list[str]:
         wins = float((predicted[chosen] > clean[chosen]).mean())
         lines.append(
             f"| {name} | {chosen.sum()} | {pairs.targets[chosen].mean():.3f} "
-            f"| {_spearman(predicted[chosen], pairs.targets[chosen]):.3f} | {wins:.1%} |"
+            f"| {spearman(predicted[chosen], pairs.targets[chosen]):.3f} | {wins:.1%} |"
         )
     return lines
 
 
-def _spearman(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+def spearman(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    """Rank correlation of all elements."""
     return float(spearmanr(a.ravel(), b.ravel()).statistic)
 
 
@@ -349,7 +350,7 @@ def main(
     cv2.setNumThreads(1)
     lpips = load_network("alex", (models or model_dir()) / weights_file("alex"))
     files = sorted(photos.glob("*.jpg"))
-    unseen = [p for p in files if p.name.split("_")[0] in hold_out]
+    unseen = [p for p in files if source_of(p) in hold_out]
     seen = [p for p in files if p not in unseen]
     test = make_pairs(unseen, lpips, work / "held", contents=5, versions=None, seed=seed + 1000)
     pairs = make_pairs(

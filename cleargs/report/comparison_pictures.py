@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.evaluate.cells import Cell, Cells, ViewSet
-from cleargs.evaluate.results import Evaluation
-from cleargs.evaluate.tables import TITLES, metric_title
+from cleargs.evaluate.comparison_tables import TITLES, metric_title
+from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import atomic_path
-from cleargs.media.image import read_rgb, write_rgb
+from cleargs.media.image import read_rgb_float, write_rgb
 from cleargs.report.contact import Tile, contact_sheet
 
 if TYPE_CHECKING:
@@ -135,4 +135,4 @@ def _telling(out: Path, cell: Cell, capture: Path) -> str:
 def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
     """The image of that stem as sRGB in [0, 1]; None without one."""
     files = sorted(folder.glob(f"{stem}.*"))
-    return read_rgb(files[0]).astype(np.float32) / np.float32(255) if files else None
+    return read_rgb_float(files[0]) if files else None

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import cleargs
+from cleargs.bench.benchmark_plan import Case
 from cleargs.bench.oracle import Accuracy
 from cleargs.bench.peaks import Peaks
-from cleargs.bench.plan import Case
 from cleargs.bench.roofline import Roof
 from cleargs.bench.timing import Quartiles
 from cleargs.bench.work import Size
@@ -94,11 +94,12 @@ class Benchmark:
 
     def as_json(self) -> dict[str, Any]:
         """Plain dictionaries and lists; a Case or a Size becomes an object with named fields."""
-        plain: dict[str, Any] = asdict(self, dict_factory=_named)
+        plain: dict[str, Any] = asdict(self, dict_factory=named)
         return plain
 
 
-def _named(items: list[tuple[str, Any]]) -> dict[str, Any]:
+def named(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The fields of a dataclass; a Case or a Size becomes an object with named fields too."""
     return {name: value._asdict() if isinstance(value, Case | Size) else value for name, value in items}
 
 

@@ -1,4 +1,4 @@
-"""What a capture looks at: any world that a camera can be exposed in.
+"""Lens, shutter and aperture of a camera, and what it looks at: any world that it can be exposed in.
 
 Protocols and degradations know a world only through `World`. Poses are camera to world [3, 4], OpenCV axes.
 """

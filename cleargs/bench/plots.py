@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cleargs.bench.benchmark_results import Benchmark, Row
 from cleargs.bench.iteration import WHOLE
-from cleargs.bench.results import Benchmark, Row
 from cleargs.bench.scaling import straight_line
 from cleargs.files import atomic_path
 

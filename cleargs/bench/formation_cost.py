@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.bench.benchmark_results import Machine, describe_machine
 from cleargs.bench.iteration import WHOLE, Iteration, use_threads
-from cleargs.bench.results import Machine, describe_machine
-from cleargs.bench.scenes import surface_scene
-from cleargs.bench.timing import Clock, Quartiles, ratio, take_turns
+from cleargs.bench.random_scenes import surface_scene
+from cleargs.bench.timing import Quartiles, ratio, take_turns
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.view import FormedView
@@ -128,7 +128,7 @@ def _row(length: float, plan: FormationPlan, gaussians: Gaussians, camera: Camer
     ways = _ways(length, plan.renders, gaussians, camera)
     truth = _truth(length, gaussians, camera)
     clocks = take_turns(
-        {name: partial(_repeat, way, plan.repetitions) for name, way in ways.items()}, plan.rounds
+        {name: partial(way.run_several, plan.repetitions) for name, way in ways.items()}, plan.rounds
     )
     taken = {name: clock.by_round(WHOLE) for name, clock in clocks.items()}
     return FormationRow(
@@ -148,11 +148,6 @@ def _ways(
         FORMED: _FormedStep(gaussians, camera, motion),
         **{f"{n} renders": _MeanOfRenders(gaussians, camera, motion, n) for n in counts},
     }
-
-
-def _repeat(way: Iteration, repetitions: int, clock: Clock) -> None:
-    for _ in range(repetitions):
-        way.run(clock)
 
 
 def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
