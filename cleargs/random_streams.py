@@ -16,6 +16,7 @@ class Stream(IntEnum):
     CONSOLIDATION = 6
     ADDED_POINTS = 100
     LEFT_OUT_POINTS = 101
+    UNSEEN_PIXELS = 102
 
     # Of synthetic captures.
     ROOM = 11

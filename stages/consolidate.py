@@ -9,7 +9,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 9
+VERSION = 11
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -67,7 +67,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     from cleargs.capture.cost import capture_size, pace
     from cleargs.splat.effort import training_cost
 
-    seconds, memory = training_cost(context.config.distil, *capture_size(context))
+    seconds, memory = training_cost(context.config.distil, *capture_size(context), formations_known=True)
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + context.config.distil.cache_mb / 1024.0,
@@ -143,4 +143,5 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         {row.frame_id: row for row in repairs},
         rivr,
     )
-    return StageResult(summary=consolidation_summary(repairs, len(kept), scorer.name, verdict))
+    figures = consolidation_summary(repairs, len(kept), scorer.name, verdict)
+    return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})

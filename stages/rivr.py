@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 11
+VERSION = 13
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -85,7 +85,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-    distilling, memory = training_cost(config.distil, frames, megapixels)
+    distilling, memory = training_cost(config.distil, frames, megapixels, formations_known=True)
     seconds += config.rounds * distilling
     scene = context.inputs.get("g0", Path()) / "scene.ply"
     groups = 1 if config.group is None else -(-frames // config.group)
@@ -158,17 +158,14 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     )
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
-    publish(
-        current if verdict.harm is None else g0,
-        trainings,
-        context.out,
-        rejected=None if verdict.harm is None else current,
-    )
+    final, rejected = (current, None) if verdict.harm is None else (g0, current)
+    publish(final, trainings, context.out, rejected)
     worst = supervision.worst([view.frame_id for view in targets], SHEET_FRAMES)
     last = {row.frame_id: row for row in rows}
     shown = [last[view.frame_id] for view in worst]
     write_candidates_sheet(context.out / "candidates.png", shown, context.out)
-    return StageResult(summary=summary(rows, expert.name, verdict))
+    figures = summary(rows, expert.name, verdict)
+    return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})
 
 
 def _repair_and_distil(

@@ -90,7 +90,8 @@ def _psnr(scene: Scene, views: Sequence[View], folder: Path, seen: Callable[[], 
     formations, _ = read_formation(folder / "formation.parquet")
     engine, values = Engine(), []
     for view in views:
-        values += evaluate_views(scene, [view], exposure, formations, engine=engine)
+        (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)
+        values.append(fit.psnr)
         seen()
     return fmean(values)
 

@@ -9,7 +9,7 @@ MAX_LISTED = 16
 """Most items of a list that are spelt out."""
 
 HEADLINES = frozenset(
-    {"frames", "registered", "test", "points", "roles", "gaussians", "psnr_active", "repairs", "published"}
+    {"frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs", "published"}
 )
 """What is worth a place in the overview of a run."""
 
@@ -46,6 +46,7 @@ WORDS: Mapping[str, str] = {
     "exposure_spread": "spread of the frames' brightness",
     "psnr_strong": "training PSNR of the strong frames, dB",
     "psnr_active": "training PSNR, dB",
+    "psnr_unseen": "PSNR of pixels that no training saw, dB",
     "expert": "restorer",
     "repairs": "repairs",
     "scorer": "scorer",

@@ -70,20 +70,21 @@ def _extent(summaries: Summaries) -> str:
 
 
 def _quality(summaries: Summaries) -> str:
-    """What is known of how good the last scene is, and of which frames; "" for nothing."""
-    held_back = next(
-        (summary["held_back"] for summary in reversed([*summaries.values()]) if "held_back" in summary), None
+    """What is known of how good the last scene is; "" for nothing."""
+    scenes = {
+        stage: figures for stage, figures in summaries.items() if figures.get("psnr_unseen") is not None
+    }
+    if not scenes:
+        return ""
+    last, figures = list(scenes.items())[-1]
+    first = summaries["g0"].get("psnr_unseen")
+    beside = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
+    text = (
+        f"PSNR {figures['psnr_unseen']:.1f} dB{beside} on pixels that no training saw; "
+        "views off the path are worse"
     )
-    if held_back is not None:
-        before, after, count = held_back["psnr_before"], held_back["psnr_after"], len(held_back["frames"])
-        frames = "a good frame" if count == 1 else f"{count} good frames"
-        text = (
-            f"PSNR {after:.1f} dB (first scene {before:.1f}) on {frames} left unrepaired; trained on, "
-            "so unseen views are worse"
-        )
-        return f"{text}. Rejected: {held_back['harm']}" if held_back["harm"] else text
-    trained = summaries.get("g0", {}).get("psnr_active")
-    return f"training PSNR {trained:.1f} dB over {summaries['g0']['views']} frames" if trained else ""
+    harm = figures.get("held_back", {}).get("harm")
+    return f"{text}. Rejected: {harm}" if harm else text
 
 
 def _times(outcomes: Sequence[Outcome]) -> str:

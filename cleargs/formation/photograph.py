@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from cleargs.formation.view import FormedView
 from cleargs.splat.engine import Engine
 from cleargs.splat.losses import psnr
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import ImageCache, View
+from cleargs.splat.views import ImageCache, View, unseen_pixels
 
 
 def photograph(
@@ -44,6 +45,20 @@ def photograph(
     return formed.forward(render).clamp(0.0, 1.0)
 
 
+class Fit(NamedTuple):
+    """How well a scene shows one view, PSNR in dB over the pixels that count."""
+
+    psnr: float
+    unseen: float | None
+    """Over those of the `unseen_pixels`; None where there are none."""
+
+
+def mean_unseen(fits: Iterable[Fit]) -> float | None:
+    """Mean PSNR of the pixels that no training saw, dB; None where there are none."""
+    values = [fit.unseen for fit in fits if fit.unseen is not None]
+    return sum(values) / len(values) if values else None
+
+
 def evaluate_views(
     scene: Scene,
     views: Sequence[View],
@@ -52,14 +67,18 @@ def evaluate_views(
     *,
     engine: Engine | None = None,
     cache: ImageCache | None = None,
-) -> list[float]:
-    """PSNR in dB of every view as photographed, in their order, over unmasked pixels, at full size."""
+) -> list[Fit]:
+    """How well the scene shows every view as photographed, in their order, at full size."""
     engine = engine or Engine(str(scene.gaussians.device))
     cache = cache or ImageCache(0, scene.gaussians.device)
     formations = formations or {}
-    values = []
+    fits = []
     for view in views:
         target, mask = cache.get(view)
         image = photograph(scene, view, exposure, formations.get(view.frame_id), engine=engine)
-        values.append(psnr(image, target, mask))
-    return values
+        unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
+        unseen = unseen if mask is None else unseen & mask
+        fits.append(
+            Fit(psnr(image, target, mask), psnr(image, target, unseen) if bool(unseen.any()) else None)
+        )
+    return fits

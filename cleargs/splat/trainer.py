@@ -156,7 +156,7 @@ class Trainer:
         assert config.budget is not None  # decided above
         self._strategy = make_strategy(config, config.budget, seed)
         self._formation = formation
-        self._cache = ImageCache(config.cache_mb * 2**20, self._device)
+        self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
         self._meter = backend_for(self._device).meter(config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}

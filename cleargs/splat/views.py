@@ -16,11 +16,15 @@ from torch import Tensor
 
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError, StageError
+from cleargs.random_streams import Stream
 from cleargs.splat.camera import Camera
 
 Pixels = NDArray[Any]
 """An image [H, W, 3]: uint8, or float32 sRGB in [0, 1]."""
 Mask = NDArray[np.bool_]
+
+UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
+"""Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +81,31 @@ def require_views(views: Sequence[View]) -> None:
         )
 
 
+def unseen_pixels(frame_id: int, height: int, width: int) -> Mask:
+    """The pixels [H, W] of a frame, and of its repairs, that no training sees; they follow from ``frame_id``.
+
+    How well a scene shows them says how good it is without a frame held out. They lie in blocks, since a
+    pixel alone is known from its neighbours. An image of less than two blocks a side has none.
+    """
+    unseen = np.zeros((height, width), np.bool_)
+    if min(height, width) < 2 * UNSEEN_BLOCK:
+        return unseen
+    rng = np.random.default_rng([Stream.UNSEEN_PIXELS, frame_id])
+    rows, columns = (max(1, round(side / UNSEEN_CELL)) for side in (height, width))
+    free_rows, free_columns = height / rows - UNSEEN_BLOCK, width / columns - UNSEEN_BLOCK
+    for row in range(rows):
+        for column in range(columns):
+            down, right = rng.random(2)
+            y = int(row * height / rows + down * free_rows)
+            x = int(column * width / columns + right * free_columns)
+            unseen[y : y + UNSEEN_BLOCK, x : x + UNSEEN_BLOCK] = True
+    return unseen
+
+
 class ImageCache:
     """Decoded images within a limit of bytes, at one scale at a time.
+
+    For a training (``training``) the masks leave out the `unseen_pixels`.
 
     An image is held as it was loaded (uint8), or as half floats where it was float32, and always passes
     through that form, so that results do not depend on what fitted. What fits first stays: under the
@@ -86,8 +113,11 @@ class ImageCache:
     ``device``.
     """
 
-    def __init__(self, limit_bytes: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, limit_bytes: int, device: torch.device | str = "cpu", *, training: bool = False
+    ) -> None:
         self._limit = limit_bytes
+        self._training = training
         self._device = torch.device(device)
         # A tensor, since a GPU multiplies by the reciprocal of a number, which is not the same.
         self._white = torch.tensor(255.0, device=self._device)
@@ -106,7 +136,7 @@ class ImageCache:
             self._used, self._factor = 0, factor
         entry = self._held.get(view)
         if entry is None:
-            pixels, counts = _prepare(view, factor)
+            pixels, counts = _prepare(view, factor, self._training)
             entry = (
                 torch.from_numpy(pixels).to(self._device),
                 None if counts is None else torch.from_numpy(counts).to(self._device),
@@ -125,7 +155,7 @@ class ImageCache:
         return image, mask
 
 
-def _prepare(view: View, factor: float) -> tuple[NDArray[np.generic], Mask | None]:
+def _prepare(view: View, factor: float, training: bool) -> tuple[NDArray[np.generic], Mask | None]:
     """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
     image, mask = view.load()
     camera = view.camera.scaled(factor)
@@ -136,6 +166,8 @@ def _prepare(view: View, factor: float) -> tuple[NDArray[np.generic], Mask | Non
             f"its camera {expected[1]}x{expected[0]}",
             hint="run ingest again with --force ingest",
         )
+    if training and (unseen := unseen_pixels(view.frame_id, *expected)).any():
+        mask = ~unseen if mask is None else mask & ~unseen
     if factor != 1.0:
         size = (camera.width, camera.height)
         if mask is not None:

@@ -420,16 +420,23 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
     outcomes = [
         outcome("ingest", "found", [], frames=24, registered=22, test=0),
         outcome("rva", "found", [], roles={"strong": 7}),
-        outcome("g0", "made", ["scene.ply"], psnr_active=24.0, views=22),
-        outcome("rivr", "made", ["scene.ply", "candidates.png"], held_back=held_back),
-        outcome("consolidate", "made", ["scene.ply", "before_after.png"], repairs=11, held_back=held_back),
+        outcome("g0", "made", ["scene.ply"], psnr_unseen=22.58, views=22),
+        outcome("rivr", "made", ["scene.ply", "candidates.png"], held_back=held_back, psnr_unseen=23.4),
+        outcome(
+            "consolidate",
+            "made",
+            ["scene.ply", "before_after.png"],
+            repairs=11,
+            held_back=held_back,
+            psnr_unseen=23.61,
+        ),
     ]
     run = tmp_path / "my room"
     print_outcomes(outcomes, run)
     assert capsys.readouterr().out.splitlines() == [
         f"scene: {run}/consolidate/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
-        "quality: PSNR 23.6 dB (first scene 22.6) on 2 good frames left unrepaired; trained on, "
-        "so unseen views are worse",
+        "quality: PSNR 23.6 dB (first scene 22.6) on pixels that no training saw; "
+        "views off the path are worse",
         "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); already there: ingest, rva",
         f"look at: {run}/consolidate/before_after.png",
         f"next: cleargs export '{run}' -o 'my room.ply'",

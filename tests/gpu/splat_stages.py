@@ -80,8 +80,8 @@ def held_out(ingest: Path, scene_folder: Path, device: Any) -> float | None:
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "test"]
     views = [view_of(frame, ingest, 1.0) for frame in frames]
     scene = read_ply(scene_folder / "scene.ply").to(device)
-    values = evaluate_views(scene, views, read_exposure(scene_folder / "exposure.parquet"))
-    return fmean(values) if values else None
+    fits = evaluate_views(scene, views, read_exposure(scene_folder / "exposure.parquet"))
+    return fmean(fit.psnr for fit in fits) if fits else None
 
 
 def main() -> None:

@@ -300,12 +300,12 @@ def test_training_follows_the_cpu(toy, device, tmp_path, monkeypatch):
 
 def test_evaluation_on_the_device(toy, device):
     scene = splat_toy.start(8)
-    values = evaluate_views(scene.to(device), toy)
+    fits = evaluate_views(scene.to(device), toy)
     cache = ImageCache(0, device)
     target, _ = cache.get(toy[1])
     assert target.device.type == device.type
     assert torch.equal(target.cpu(), torch.from_numpy(toy[1].load()[0] / np.float32(255.0)))
-    assert all(5.0 < value < 20.0 for value in values)
+    assert all(5.0 < fit.psnr < 20.0 for fit in fits)
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(toy, device):

@@ -16,7 +16,7 @@ from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, vie
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.photograph import evaluate_views, photograph
+from cleargs.formation.photograph import evaluate_views, mean_unseen, photograph
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer
@@ -29,7 +29,7 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer, train
-from cleargs.splat.views import ImageCache, View
+from cleargs.splat.views import ImageCache, View, unseen_pixels
 
 CONFIG = TrainConfig(
     steps=40,
@@ -88,7 +88,8 @@ def test_it_learns_the_pictures(pictures: list[np.ndarray], tmp_path: Path) -> N
     after = evaluate_views(trained.scene, views(pictures))
     # Random blobs start near 12 dB; 200 steps gain far more than 5 dB, an optimiser that ignores one of its
     # groups still gains some, one with a wrong sign loses.
-    assert np.mean(after) > np.mean(before) + 5.0
+    gain = np.mean([fit.psnr for fit in after]) - np.mean([fit.psnr for fit in before])
+    assert gain > 5.0
     assert trained.scene.gaussians.num == 80
     rows = trained.rows
     assert rows.schema.equals(TRAIN)
@@ -217,6 +218,34 @@ def test_the_cache_changes_no_bit(pictures: list[np.ndarray], tmp_path: Path) ->
         for _ in range(3):
             assert np.array_equal(cache.get(view)[0].numpy(), pictures[0] / np.float32(255))
         assert len(calls) == expected
+
+
+def test_some_pixels_of_every_frame_teach_nothing_and_tell_how_good_the_scene_is(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    """Whatever they show, the scene is the same; only the figure that is taken of them is not."""
+    painted = []
+    for frame_id, picture in enumerate(pictures):
+        changed = picture.copy()
+        changed[unseen_pixels(frame_id, HEIGHT, WIDTH)] = 255 - frame_id
+        painted.append(changed)
+    config = CONFIG.model_copy(update={"coarse_share": 0.5})  # reduced images too
+    trained = run(pictures, tmp_path / "a", config)
+    assert_same(trained, run(painted, tmp_path / "b", config))
+    seen, other = (evaluate_views(trained.scene, views(which)) for which in (pictures, painted))
+    assert all(a.unseen > b.unseen + 1.0 for a, b in zip(seen, other, strict=True))
+    assert mean_unseen(seen) == pytest.approx(np.mean([fit.unseen for fit in seen]))
+
+
+def test_a_hundredth_of_every_frame_is_not_seen() -> None:
+    masks = [unseen_pixels(frame_id, 540, 960) for frame_id in range(20)]
+    assert {int(mask.sum()) for mask in masks} == {12 * 7 * 64}
+    assert np.mean(masks) == pytest.approx(0.01, rel=0.05)
+    # Frames leave out different places: of 20 masks few have a pixel in common, and each is the same again.
+    assert np.sum(masks, axis=0).max() <= 6
+    assert np.array_equal(masks[3], unseen_pixels(3, 540, 960))
+    assert not unseen_pixels(0, 15, 400).any()
+    assert unseen_pixels(0, 16, 16).sum() == 64
 
 
 def test_pseudo_views_get_their_share_and_weight(pictures: list[np.ndarray], tmp_path: Path) -> None:
