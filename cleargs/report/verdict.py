@@ -146,6 +146,14 @@ def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Ite
     if psnr is not None:
         rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
         yield Figure(decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}")
+    scenes = [stage for stage in ("consolidate", "rivr", "g0") if stage in manifests]
+    unseen = _figure(manifests, scenes[0], "psnr_unseen") if scenes else None
+    if unseen is not None:
+        yield Figure(
+            decibel(unseen),
+            "on pixels that no training saw",
+            "PSNR of the last scene on a hundredth of every frame; views off the path are worse",
+        )
     repairs = _figure(manifests, "consolidate", "repairs")
     if repairs is not None:
         yield Figure(

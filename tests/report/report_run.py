@@ -98,7 +98,8 @@ class FinishedRun:
         self._trained("g0", g0)
         self._rivr()
         held = {"frames": [0], "harm": None, "psnr_before": 24.0, "psnr_after": 25.5}
-        self._trained("consolidate", {"repairs": 5, "published": "consolidated scene", "held_back": held})
+        consolidated = {"repairs": 5, "published": "consolidated scene", "held_back": held}
+        self._trained("consolidate", consolidated | {"psnr_unseen": 24.6})
 
     def planner(self, store: Store) -> Planner:
         """A planner of this run on one thread."""
