@@ -9,7 +9,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 11
+VERSION = 12
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -67,7 +67,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     from cleargs.capture.cost import capture_size, pace
     from cleargs.splat.effort import training_cost
 
-    seconds, memory = training_cost(context.config.distil, *capture_size(context), formations_known=True)
+    seconds, memory = training_cost(context.config.distil, *capture_size(context))
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + context.config.distil.cache_mb / 1024.0,

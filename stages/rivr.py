@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 13
+VERSION = 14
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -85,7 +85,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-    distilling, memory = training_cost(config.distil, frames, megapixels, formations_known=True)
+    distilling, memory = training_cost(config.distil, frames, megapixels)
     seconds += config.rounds * distilling
     scene = context.inputs.get("g0", Path()) / "scene.ply"
     groups = 1 if config.group is None else -(-frames // config.group)

@@ -64,9 +64,11 @@ class CaptureFormation:
         self._config = config
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
-        # What an earlier training found is refined first: its own first fit was the search from scratch.
-        known = {frame_id: replace(frame, draws=config.every) for frame_id, frame in (known or {}).items()}
-        self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
+        known = known or {}
+        # Counted anew: every training begins with a search, which pays (docs/experiments/formation.md).
+        self._frames = {
+            frame_id: replace(known.get(frame_id, FrameFormation(frame_id)), draws=0) for frame_id in real
+        }
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 

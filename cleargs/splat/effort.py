@@ -46,13 +46,8 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
     return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), max_budget)
 
 
-def training_cost(
-    config: TrainConfig, frames: int, megapixels: float, *, formations_known: bool = False
-) -> tuple[float, float]:
-    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames.
-
-    ``formations_known``: an earlier training found how they were taken.
-    """
+def training_cost(config: TrainConfig, frames: int, megapixels: float) -> tuple[float, float]:
+    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames."""
     pixels = round(frames * megapixels * 1e6)
     gaussians = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
     seen = megapixels * (config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share)
@@ -60,9 +55,8 @@ def training_cost(
     steps, formation = config.steps_for(frames), config.formation
     seconds = steps * step
     if formation.enabled and frames:
-        asked = (1.0 - formation.start) * steps / frames / formation.every
-        searched = 0.0 if formations_known else 1.0
-        seconds += frames * megapixels * (SEARCH_S * searched + SEARCH_AGAIN_S * max(0.0, asked - searched))
+        again = max(0.0, (1.0 - formation.start) * steps / frames / formation.every - 1.0)
+        seconds += frames * megapixels * (SEARCH_S + SEARCH_AGAIN_S * again)
     return seconds, 1.5e-6 * gaussians
 
 

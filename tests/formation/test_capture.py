@@ -152,21 +152,6 @@ def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.Monk
         assert torch.equal(tensor, resumed.state[name]), name
 
 
-def test_what_an_earlier_training_found_is_refined_not_searched_for_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each distillation searched every frame from scratch: most of its time."""
-    first = CaptureFormation(views(), LOOK)
-    run(tmp_path / "first", views(), first)
-    monkeypatch.setattr("cleargs.formation.frame.search", lambda *_, **__: pytest.fail("searched again"))
-    second = CaptureFormation(views(), LOOK, known=first.frames)
-    run(tmp_path / "second", views(), second)
-    assert {k: frame.model for k, frame in second.frames.items()} == {
-        k: "blur" if k == BLURRED else "none" for k in range(FRAMES)
-    }
-    assert second.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
-
-
 def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
     first = Trainer(scene(), views(), CONFIG, seed=(3,), formation=CaptureFormation(views(), LOOK))
     other = FormationConfig(start=0.0, every=5)
