@@ -214,7 +214,11 @@ class Runner:
             work.note_seconds(earlier + time.monotonic() - clock)
             raise
         seconds = earlier + time.monotonic() - clock
-        cost = {"seconds": seconds, "cpu_seconds": usage.cpu_seconds, "peak_memory_gb": usage.peak_memory_gb}
+        cost = {
+            "seconds": round(seconds, 3),
+            "cpu_seconds": round(usage.cpu_seconds, 3),
+            "peak_memory_gb": round(usage.peak_memory_gb, 3),
+        }
         if any(
             recipe.origins[role] != digests for role, digests in self.planner.external_digests(name).items()
         ):
@@ -236,7 +240,8 @@ class Runner:
                 self.reporter.info(f"{name}: made again, with the same digests")
             else:
                 self.reporter.warn(f"{name}: made again, with other digests than before")
-        return published
+        # An equal result that was there already keeps its own times; this outcome tells those of today.
+        return published.model_copy(update=dict(cost))
 
     def _manifest(
         self,
@@ -262,9 +267,9 @@ class Runner:
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            seconds=round(cost["seconds"], 3),
-            cpu_seconds=round(cost["cpu_seconds"], 3),
-            peak_memory_gb=round(cost["peak_memory_gb"], 3),
+            seconds=cost["seconds"],
+            cpu_seconds=cost["cpu_seconds"],
+            peak_memory_gb=cost["peak_memory_gb"],
             device=self.run.device,
             summary=plain_json(result.summary),
         )

@@ -12,7 +12,7 @@ from toy import Bench
 
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import read_manifest
+from cleargs.pipeline.manifest import read_manifest, write_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.stage import Estimate
@@ -147,6 +147,16 @@ def test_until_and_force(bench: Bench) -> None:
     with pytest.raises(InputError, match="no stage 'sqare'") as error:
         bench.run(until="sqare")
     assert error.value.hint == "did you mean square?"
+
+
+def test_a_stage_that_is_forced_tells_how_long_it_took_this_time(bench: Bench) -> None:
+    """An equal result stays as it was, times and all: they were told for today's."""
+    square = bench.run()[1]
+    write_manifest(square.folder, square.manifest.model_copy(update={"seconds": 1000.0}))
+    again = bench.run(force=["square"])[1]
+    assert again.how == "made"
+    assert again.manifest.digest == square.manifest.digest
+    assert again.manifest.seconds < 500.0
 
 
 def test_explain_names_what_changed(bench: Bench) -> None:
