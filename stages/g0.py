@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 11
+VERSION = 12
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
@@ -53,7 +53,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
-    from cleargs.formation.photograph import evaluate_views, mean_unseen
+    from cleargs.formation.photograph import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
@@ -117,7 +117,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
             "exposure_spread": spread,
             "psnr_strong": _mean([psnr[frame_id] for frame_id in strong if frame_id in psnr]),
             "psnr_active": _mean(list(psnr.values())),
-            "psnr_unseen": mean_unseen(fits),
+            "psnr_unseen": pooled_unseen(fits),
         }
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -53,10 +54,14 @@ class Fit(NamedTuple):
     """Over those of the `unseen_pixels`; None where there are none."""
 
 
-def mean_unseen(fits: Iterable[Fit]) -> float | None:
-    """Mean PSNR of the pixels that no training saw, dB; None where there are none."""
-    values = [fit.unseen for fit in fits if fit.unseen is not None]
-    return sum(values) / len(values) if values else None
+def pooled_unseen(fits: Iterable[Fit]) -> float | None:
+    """PSNR in dB of the pixels that no training saw, of all views together; None where there are none.
+
+    Their errors are averaged, not their PSNRs: a view has so few that some blocks show next to nothing.
+    """
+    errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
+    error = math.fsum(errors) / len(errors) if errors else 0.0
+    return -10.0 * math.log10(error) if error > 0.0 else None
 
 
 def evaluate_views(

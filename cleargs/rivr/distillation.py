@@ -14,7 +14,7 @@ from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
-from cleargs.formation.photograph import evaluate_views, mean_unseen, photograph
+from cleargs.formation.photograph import evaluate_views, photograph, pooled_unseen
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.formation.undo import undo
 from cleargs.formation.view import FormedView
@@ -72,7 +72,7 @@ class Snapshot:
 
     def psnr_unseen(self, views: Sequence[View]) -> float | None:
         """PSNR in dB of the pixels of ``views`` that no training saw; None where there are none."""
-        return mean_unseen(
+        return pooled_unseen(
             evaluate_views(self.scene, views, self.exposure, self.formations, engine=self._engine)
         )
 

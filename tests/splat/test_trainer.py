@@ -16,7 +16,7 @@ from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, vie
 from cleargs.errors import InputError, StageError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.photograph import evaluate_views, mean_unseen, photograph
+from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer
@@ -234,7 +234,10 @@ def test_some_pixels_of_every_frame_teach_nothing_and_tell_how_good_the_scene_is
     assert_same(trained, run(painted, tmp_path / "b", config))
     seen, other = (evaluate_views(trained.scene, views(which)) for which in (pictures, painted))
     assert all(a.unseen > b.unseen + 1.0 for a, b in zip(seen, other, strict=True))
-    assert mean_unseen(seen) == pytest.approx(np.mean([fit.unseen for fit in seen]))
+    assert pooled_unseen(seen) == pytest.approx(
+        -10 * np.log10(np.mean([0.1 ** (fit.unseen / 10) for fit in seen]))
+    )
+    assert pooled_unseen([Fit(20.0, None)]) is None
 
 
 def test_a_hundredth_of_every_frame_is_not_seen() -> None:
