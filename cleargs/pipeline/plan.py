@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,9 @@ from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, External, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
+
+MIN_ADDRESS_SPACE_GB = 2.0
+"""What the libraries reserve before any work is done."""
 
 NOT_MADE = "not made yet"
 """Why the results of a stage are not there that the run never had."""
@@ -261,6 +265,18 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
         raise StoreError(
             f"the run needs about {_size(needed)} of disk, {_size(free)} are free at {place}",
             hint="free some space (cleargs gc), choose another --store, or lower ingest.max_frames",
+        )
+
+
+def check_address_space() -> None:
+    """Raise InputError where a limit on addresses (``ulimit -v``) does not even let the libraries in: some of
+    them wait for ever then."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_GB * 1e9:
+        raise InputError(
+            f"this shell allows a process {_size(limit / 1e9)} of addresses; the libraries alone need "
+            f"{MIN_ADDRESS_SPACE_GB:.0f} GB",
+            hint="raise the limit: ulimit -v unlimited",
         )
 
 

@@ -25,7 +25,15 @@ from cleargs.pipeline.manifest import (
     versions,
     write_manifest,
 )
-from cleargs.pipeline.plan import Planner, Recipe, StagePlan, check_disk, cost_line, redo_lines
+from cleargs.pipeline.plan import (
+    Planner,
+    Recipe,
+    StagePlan,
+    check_address_space,
+    check_disk,
+    cost_line,
+    redo_lines,
+)
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_place
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
@@ -62,6 +70,7 @@ class Runner:
         what is missing. Raises InputError before any work where a model that one of them needs is not
         there, CleargsError where a stage fails; what was finished before it stays.
         """
+        check_address_space()
         forced = tuple(self.dag.check(name) for name in force)
         plans = self.planner.plan(until, forced)
         for plan in plans:
@@ -107,6 +116,7 @@ class Runner:
 
         Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
         """
+        check_address_space()
         done: dict[str, Manifest] = {}
         with file_lock(self.run.folder / LOCK, shared=True), self.store.in_use():
             self.store.add_root(self.run.folder)

@@ -159,6 +159,16 @@ def test_a_stage_that_is_forced_tells_how_long_it_took_this_time(bench: Bench) -
     assert again.manifest.seconds < 500.0
 
 
+def test_a_limit_that_keeps_the_libraries_out_is_told_before_any_work(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under ``ulimit -v 700000`` OpenBLAS asked for memory for ever."""
+    monkeypatch.setattr("cleargs.pipeline.plan.resource.getrlimit", lambda _: (716_800_000, -1))
+    with pytest.raises(InputError, match="717 MB of addresses"):
+        bench.run()
+    assert stages_run(bench) == []
+
+
 def test_explain_names_what_changed(bench: Bench) -> None:
     plans = bench.plan()
     assert [plan.state for plan in plans.values()] == ["miss", "waits", "waits"]
