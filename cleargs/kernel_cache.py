@@ -36,12 +36,20 @@ def cache_folder(name: str) -> Path:
 
 
 def _private(folder: Path) -> bool:
-    """Whether nobody but the user (and root) can put something into ``folder``."""
+    """Whether nobody but the user (and root) can put something into ``folder``, or another in its place."""
     status = folder.lstat()
     return (
         stat.S_ISDIR(status.st_mode)
         and status.st_uid == os.geteuid()
         and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        and all(_keeps_names(parent.stat()) for parent in folder.resolve().parents)
+    )
+
+
+def _keeps_names(status: os.stat_result) -> bool:
+    """Whether nobody else can rename what lies in a folder: as in /tmp, where only owners may."""
+    return status.st_uid in (0, os.geteuid()) and (
+        not status.st_mode & stat.S_IWOTH or bool(status.st_mode & stat.S_ISVTX)
     )
 
 

@@ -32,6 +32,17 @@ def test_a_cache_that_others_may_write_to_is_passed_over(monkeypatch, tmp_path, 
     assert cache_folder("kernels").parent == tmp_path / "own" / "cleargs"
 
 
+def test_a_cache_in_a_folder_where_others_may_rename_is_passed_over(monkeypatch, tmp_path):
+    """They could put one of their own in its place after it was looked at."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shared"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared").chmod(0o777)
+    assert cache_folder("kernels").parent == tmp_path / "own" / "cleargs"
+    (tmp_path / "shared").chmod(0o1777)
+    assert cache_folder("kernels").parent == tmp_path / "shared"
+
+
 def test_a_cache_of_somebody_else_is_passed_over(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shared"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))

@@ -24,6 +24,9 @@ SINGLE_FOCAL = frozenset(
 TWO_FOCALS = frozenset({"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE", "FOV"})
 """Models with two: fx, fy, cx, cy, ..."""
 
+MAX_PARAMETER, MIN_FOCAL = 1e9, 1e-3
+"""Largest size of a camera's numbers, and shortest focal length, px: beyond them pixels and rays overflow."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -40,16 +43,19 @@ class Camera:
                 f"camera model {self.model} is not supported",
                 hint="undistort the images first, or use a perspective or OpenCV fisheye model",
             )
-        if not np.isfinite(self.params).all() or min(self.width, self.height) < 1:
+        if not np.isfinite(self.params).all() or np.abs(self.params).max(initial=0.0) > MAX_PARAMETER:
             raise InputError(
-                "a camera has parameters that are not finite", hint="correct the camera in the input"
+                "a camera has parameters that are not finite, or that no lens has",
+                hint="correct the camera in the input",
             )
+        if min(self.width, self.height) < 1:
+            raise InputError("a camera has images without pixels", hint="correct the camera in the input")
         if self.width * self.height > MAX_PIXELS:
             raise InputError(
                 f"a camera has more than {MAX_PIXELS} pixels",
                 hint="correct the camera in the input, or reduce its images",
             )
-        if not self.colmap().verify_params() or min(self.focal) <= 0:
+        if not self.colmap().verify_params() or min(self.focal) < MIN_FOCAL:
             raise InputError(
                 f"a {self.model} camera has a wrong number of parameters or a focal length of 0 or less",
                 hint="correct the camera in the input",

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.poses import within_reach
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.untrusted import FAULTS, cause, read_bytes, read_text
@@ -242,8 +243,8 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[str]:
 
 def _pose(name: str, values: list[int | float] | list[float]) -> Pose:
     numbers = np.array(values, np.float64)
-    if not np.isfinite(numbers).all() or not 1e-6 < np.abs(numbers[:4]).max() < 1e6:
-        raise ValueError(f"the pose of {name} is not finite")
+    if not within_reach(numbers) or not 1e-6 < np.abs(numbers[:4]).max() < 1e6:
+        raise ValueError(f"the pose of {name} is not finite, or out of reach")
     return Pose.from_quaternion(numbers[:4], numbers[4:])
 
 

@@ -12,9 +12,9 @@ from importlib import import_module
 import click
 
 import cleargs
-from cleargs.errors import CleargsError
+from cleargs.errors import CleargsError, InputError
 from cleargs.pipeline.dag import Dag, installed
-from cleargs.text import printable
+from cleargs.text import is_utf8, printable
 
 INTERRUPTED = 130
 
@@ -121,6 +121,7 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
+        _check_names(arguments)
         code = cli.main(arguments, prog_name="cleargs", standalone_mode=False, obj=dag or installed())
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
@@ -138,6 +139,13 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
         click.echo(f"error: {cause}", err=True)
         click.echo(f"hint: {remedy}", err=True)
         return code
+
+
+def _check_names(arguments: Sequence[str]) -> None:
+    """Raise InputError for an argument that is not UTF-8: no table, manifest or report could hold it."""
+    for argument in arguments:
+        if not is_utf8(argument):
+            raise InputError(f"the name of {argument} is not UTF-8", hint="rename it")
 
 
 def explanation(error: Exception) -> tuple[int, str, str]:

@@ -41,6 +41,10 @@ def edit_transforms(folder: Path, change: Any) -> None:
             lambda d: d["frames"][3]["transform_matrix"][0].__setitem__(3, float("nan")),
             "pose of images/003.png",
         ),
+        (
+            lambda d: d["frames"][3]["transform_matrix"][0].__setitem__(3, 1e308),
+            "pose of images/003.png is not finite, or out of reach",
+        ),
         (lambda d: d["frames"][3].pop("transform_matrix"), "images/003.png has no pose"),
         (lambda d: d["frames"][3].__setitem__("transform_matrix", [[1, 2], [3, 4]]), "4x4"),
         (lambda d: d["frames"][3].__setitem__("transform_matrix", "none"), "matrix of numbers"),
@@ -52,6 +56,8 @@ def edit_transforms(folder: Path, change: Any) -> None:
         (lambda d: d.__setitem__("fl_x", "long"), "camera"),
         (lambda d: d.__setitem__("fl_x", -5), "focal length"),
         (lambda d: d.__setitem__("k1", float("inf")), "not finite"),
+        (lambda d: d.__setitem__("fl_x", 1e300), "that no lens has"),
+        (lambda d: d.__setitem__("fl_x", 1e-300), "focal length"),
         (lambda d: d.__setitem__("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
         (lambda d: d.__setitem__("w", 999), "proportions"),
         (lambda d: d.__setitem__("frames", d["frames"][:2]), "at least 3"),
@@ -113,11 +119,12 @@ def test_damaged_colmap_model(posed: Path, ingest: Ingest) -> None:
             open_capture(project, IngestConfig())
         assert refused(caught)
         path.write_bytes(data)
-    images = bytearray(whole[sparse / "images.bin"])
-    struct.pack_into("<d", images, 12, float("nan"))
-    (sparse / "images.bin").write_bytes(images)
-    with pytest.raises(InputError, match="not finite"):
-        open_capture(project, IngestConfig())
+    for offset, number in ((12, float("nan")), (44, 1e300)):  # of the first quaternion and translation
+        images = bytearray(whole[sparse / "images.bin"])
+        struct.pack_into("<d", images, offset, number)
+        (sparse / "images.bin").write_bytes(images)
+        with pytest.raises(InputError, match="not finite"):
+            open_capture(project, IngestConfig())
     (sparse / "images.bin").write_bytes(whole[sparse / "images.bin"])
     (project / "images" / "000005.png").unlink()
     with pytest.raises(InputError, match=r"000005\.png"):

@@ -119,6 +119,24 @@ def test_a_name_that_is_not_utf8(bench: Bench, capsys: pytest.CaptureFixture[str
         assert not bench.folder.exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["eval", "RUN", "--reference", "{}"],
+        ["run", "CAP", "-o", "R", "--set", "rivr.expert={}"],
+        ["synth", "{}"],
+    ],
+)
+def test_no_argument_is_taken_that_is_not_utf8(
+    arguments: list[str], bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They ended as "unexpected" errors, one of them after all the work."""
+    given = [argument.format(os.fsdecode(b"caf\xe9")) for argument in arguments]
+    assert invoke(given, bench.dag) == 2
+    told = capsys.readouterr().err
+    assert "caf\\udce9" in told and "is not UTF-8" in told and "rename it" in told
+
+
 def test_an_early_interrupt_is_silent() -> None:
     """The console script imports `entry` first."""
     program = (
