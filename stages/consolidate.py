@@ -71,7 +71,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + context.config.distil.cache_mb / 1024.0,
-        disk_gb=0.2,
+        disk_gb=0.7 * memory,  # scene and state: 1 kB a Gaussian
     )
 
 

@@ -44,8 +44,9 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     count, megapixels = capture_size(context)
     seconds, memory = training_cost(config, count, megapixels)
     seconds *= pace(context.threads)
+    disk = 0.7 * memory  # scene and state: 1 kB a Gaussian
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)
-    return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=0.1)
+    return Estimate(minutes=seconds / 60, memory_gb=memory, disk_gb=disk)
 
 
 def run(context: StageContext[G0Config]) -> StageResult:

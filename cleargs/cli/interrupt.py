@@ -13,6 +13,8 @@ GRACE = 1.0
 
 MESSAGE = b"interrupted; finished work is kept, and the same command resumes from there\n"
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
 
 def answer_signals() -> None:
     """Turn SIGINT and SIGTERM into KeyboardInterrupt, with a way out for when Python cannot raise it.
@@ -30,6 +32,8 @@ def answer_signals() -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
+    # Until all is in place a signal waits: it is raised at the end, where the caller expects it.
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     os.register_at_fork(after_in_child=restore)
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
@@ -37,6 +41,13 @@ def answer_signals() -> None:
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     threading.Thread(target=_end_after_signal, args=(reader,), name="interrupt", daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def ignore_signals() -> None:
+    """The work is done: there is nothing left to interrupt."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _end_after_signal(reader: int) -> None:

@@ -98,13 +98,17 @@ def cli(debug: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
     """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
-    from cleargs.cli.interrupt import answer_signals
+    from cleargs.cli.interrupt import answer_signals, ignore_signals
     from cleargs.cli.terminal import protect_streams
 
     protect_streams()
     given = list(sys.argv[1:] if arguments is None else arguments)
-    answer_signals()
-    code = invoke(given, dag)
+    try:
+        answer_signals()
+        code = invoke(given, dag)
+    except KeyboardInterrupt:  # before the command began, or after it ended
+        code = _interrupted()
+    ignore_signals()
     if code == INTERRUPTED:
         # Taking torch and Numba down in order may take seconds, and nothing waits for it.
         sys.stdout.flush()
@@ -125,8 +129,7 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
         code = cli.main(arguments, prog_name="cleargs", standalone_mode=False, obj=dag or installed())
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
-        click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
-        return INTERRUPTED
+        return _interrupted()
     except click.exceptions.NoArgsIsHelpError as error:  # a group alone: what it offers
         error.show()
         return error.exit_code
@@ -139,6 +142,11 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
         click.echo(f"error: {cause}", err=True)
         click.echo(f"hint: {remedy}", err=True)
         return code
+
+
+def _interrupted() -> int:
+    click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
+    return INTERRUPTED
 
 
 def _check_names(arguments: Sequence[str]) -> None:

@@ -16,6 +16,9 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.reference import sh_basis
 from cleargs.splat.scene import Scene
 
+MAX_REACH = 1e18
+"""Farthest that a scene may reach, and the inverse of the least: their squares are single precision's."""
+
 _DIRECTIONS = 64
 """Directions in which two SH functions are compared; 16 coefficients need at least 16."""
 
@@ -53,7 +56,9 @@ def transform_scene(
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
     )
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in moved.tensors().values()):
+    reach, before = (float(which.means.abs().max()) if which.num else 1.0 for which in (moved, gaussians))
+    finite = all(bool(torch.isfinite(tensor).all()) for tensor in moved.tensors().values())
+    if not finite or reach > MAX_REACH or (before > 0.0 and reach < 1.0 / MAX_REACH):
         raise InputError(
             "in that world the scene leaves the range of the file's single precision",
             hint="export it in the normalised world (without --world input)",

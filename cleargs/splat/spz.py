@@ -17,6 +17,7 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
+from cleargs.errors import InputError
 from cleargs.splat.scene import Scene
 
 _MAGIC = 0x5053474E
@@ -40,6 +41,11 @@ def spz(scene: Scene, version: int = 3) -> bytes:
     count, coefficients = gaussians.num, gaussians.sh.shape[1]
     means = gaussians.means.numpy().astype(np.float64)
     reach = float(np.abs(means).max(initial=1e-9))
+    if reach >= 2.0**23:
+        raise InputError(
+            f"a scene that reaches {reach:.1e} units is too large for .spz, which counts to 8 million",
+            hint="export it in the normalised world (without --world input), or in another format",
+        )
     # As fine as 24 bits with a sign reach, and at most what the original takes by default.
     fraction = int(np.clip(np.floor(23 - np.log2(max(reach, 1e-9)) - 1e-9), 0, _POSITION_BITS_MAX))
     flags = _ANTIALIASED if scene.antialias else 0

@@ -146,6 +146,22 @@ def test_an_early_interrupt_is_silent() -> None:
     assert done.returncode == -2 and done.stderr == ""
 
 
+def test_an_interrupt_while_signals_are_set_up_is_answered() -> None:
+    """It fell into the start of the thread that waits for signals, and ended as a traceback."""
+    program = (
+        "import os, signal, threading\n"
+        "start = threading.Thread.start\n"
+        "def interrupted(thread):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    start(thread)\n"
+        "threading.Thread.start = interrupted\n"
+        "from cleargs.cli.main import main; main(['--help'])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130 and done.stdout == ""
+    assert done.stderr.startswith("interrupted") and done.stderr.count("\n") == 1
+
+
 def test_the_installed_script_escapes(bench: Bench) -> None:
     """Through a real process, as a shell starts it; on a pipe the rule is the same as on a terminal."""
     program = "import sys; from cleargs.cli.main import main; main(sys.argv[1:])"

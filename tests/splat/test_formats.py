@@ -183,6 +183,14 @@ def test_usd_read_by_openusd(tmp_path: Path) -> None:
     assert_turned(found, made.gaussians, ABOUT_Z, sh_within=1e-5)
 
 
+def test_a_scene_beyond_the_numbers_of_spz_is_refused() -> None:
+    """Its positions were cut off, and nobody was told."""
+    made = scene(0)
+    made.gaussians.means[3, 1] = 9e6
+    with pytest.raises(InputError, match=r"too large for \.spz"):
+        spz(made)
+
+
 def test_spz_keeps_positions_far_away(tmp_path: Path) -> None:
     """24 bits are shared between whole units and their fractions."""
     made = scene(0)
