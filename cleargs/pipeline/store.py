@@ -258,7 +258,7 @@ class Store:
             there = self.find(manifest.stage, manifest.key)
             if there is not None:
                 if there.whole is not None and there.whole.digest == manifest.digest:
-                    shutil.rmtree(work.folder)
+                    self.discard(work.folder)
                     return there.whole
                 self.discard(final)
             try:
@@ -268,7 +268,7 @@ class Store:
                 winner = self.find(manifest.stage, manifest.key)
                 if winner is None or winner.usable is None:
                     raise
-                shutil.rmtree(work.folder)
+                self.discard(work.folder)
                 return winner.usable
             sync(final.parent)
         except OSError as error:
@@ -276,7 +276,8 @@ class Store:
         for name, record in manifest.files.items():
             self.memo.remember(final / name, record.digest)
         if not manifest.missing:
-            shutil.rmtree(work.folder, ignore_errors=True)
+            with suppress(StoreError):  # the result is there, whatever becomes of what is left
+                self.discard(work.folder)
         return manifest
 
     def discard(self, folder: Path) -> None:

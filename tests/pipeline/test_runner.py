@@ -159,6 +159,21 @@ def test_a_stage_that_is_forced_tells_how_long_it_took_this_time(bench: Bench) -
     assert again.manifest.seconds < 500.0
 
 
+def test_killed_while_it_tidies_up_a_stage_leaves_no_half_of_its_checkpoints(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its result was gone later, and the half that was left of the work could not be gone on with."""
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("cleargs.pipeline.store.shutil.rmtree", killed)
+        bench.run(until="square")
+    work = bench.folder / ".store" / "work"
+    assert [path.name for path in work.iterdir() if not path.name.startswith(".rubbish")] == []
+
+
 def test_a_limit_that_keeps_the_libraries_out_is_told_before_any_work(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
