@@ -248,7 +248,9 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
         camera = model.cameras[image.camera_id] if image is not None else None
         pose = image.pose if image is not None else None
         frames.append(SourceFrame(name, root / name, mask=_mask_of(masks, name), camera=camera, pose=pose))
-    return Capture("colmap", tuple(frames), len(names), model if len(model.point_ids) else None)
+    return Capture(
+        "colmap", tuple(frames), len(names), model if len(model.point_ids) or model.dropped else None
+    )
 
 
 def _image_files(folder: Path) -> list[Path]:

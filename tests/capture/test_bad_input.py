@@ -227,6 +227,14 @@ def test_points_that_are_not_finite_are_left_out(posed: Path, ingest: Ingest) ->
         assert any("1 points of the input's sparse model" in line for line in again.warnings)
         table = load_points(again.out)
         assert len(table.xyz) and np.isfinite(table.xyz).all() and np.abs(table.xyz).max() < 1e9
+    at, count = 8, struct.unpack_from("<Q", points)[0]
+    for _ in range(count):  # id, x, y, z, colour, error, length of the track, track
+        struct.pack_into("<d", points, at + 8, float("nan"))
+        at += 51 + 8 * struct.unpack_from("<Q", points, at + 43)[0]
+    (model / "points3D.bin").write_bytes(points)
+    again = ingest(project, "none")
+    assert any(f"{count} points of the input's sparse model" in line for line in again.warnings)
+    assert len(load_points(again.out).xyz)
 
 
 def test_a_mask_of_one_pixel(posed: Path, ingest: Ingest) -> None:
