@@ -19,4 +19,8 @@ def main() -> None:
         sys.exit(2)
     from cleargs.cli.main import main as run
 
-    run()
+    try:
+        run()
+    finally:  # the work is done: there is nothing left to interrupt
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -44,12 +44,6 @@ def answer_signals() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
 
 
-def ignore_signals() -> None:
-    """The work is done: there is nothing left to interrupt."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-
-
 def _end_after_signal(reader: int) -> None:
     while True:
         numbers = os.read(reader, 16)

@@ -98,7 +98,7 @@ def cli(debug: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
     """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
-    from cleargs.cli.interrupt import answer_signals, ignore_signals
+    from cleargs.cli.interrupt import answer_signals
     from cleargs.cli.terminal import protect_streams
 
     protect_streams()
@@ -108,7 +108,6 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None
         code = invoke(given, dag)
     except KeyboardInterrupt:  # before the command began, or after it ended
         code = _interrupted()
-    ignore_signals()
     if code == INTERRUPTED:
         # Taking torch and Numba down in order may take seconds, and nothing waits for it.
         sys.stdout.flush()

@@ -77,7 +77,7 @@ def _quality(summaries: Summaries) -> str:
     if not scenes:
         return ""
     last, figures = list(scenes.items())[-1]
-    first = summaries["g0"].get("psnr_unseen")
+    first = summaries.get("g0", {}).get("psnr_unseen")  # `cleargs stage` tells of one stage alone
     beside = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
     text = (
         f"PSNR {figures['psnr_unseen']:.1f} dB{beside} on pixels that no training saw; "

@@ -441,6 +441,8 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
         f"look at: {run}/consolidate/before_after.png",
         f"next: cleargs export '{run}' -o 'my room.ply'",
     ]
+    print_outcomes(outcomes[-1:], run)  # as `cleargs stage` does
+    assert "quality: PSNR 23.6 dB on pixels" in capsys.readouterr().out
     print_outcomes(outcomes, run, run / "report/index.html")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5
