@@ -32,8 +32,9 @@ def answer_signals() -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
-    # Until all is in place a signal waits: it is raised at the end, where the caller expects it.
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    # Until all is in place a signal waits: it is raised at the end, where the caller expects it. What was
+    # blocked before stays blocked: whoever started us sees to that signal (`cleargs.batch.slurm_watch`).
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     os.register_at_fork(after_in_child=restore)
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
@@ -41,7 +42,7 @@ def answer_signals() -> None:
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     threading.Thread(target=_end_after_signal, args=(reader,), name="interrupt", daemon=True).start()
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_after_signal(reader: int) -> None:

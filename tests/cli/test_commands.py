@@ -393,6 +393,17 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
 
 
+def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
+    """Slurm's SIGTERM before a time limit is not for the stage: its watcher ends it behind a checkpoint."""
+    program = (
+        "import os, signal; from cleargs.cli.interrupt import answer_signals\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); answer_signals()\n"
+        "os.kill(os.getpid(), signal.SIGTERM); print('alive')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
+
+
 def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def outcome(stage: str, how: Literal["found", "made"], files: list[str], **summary: object) -> Outcome:
         parts = KeyParts(
