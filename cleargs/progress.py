@@ -17,8 +17,9 @@ class Task(Protocol):
     def advance(self, steps: int = 1) -> None:
         """``steps`` more are done."""
 
-    def update(self, *, done: int | None = None, note: str | None = None) -> None:
-        """``done`` in all are done; ``note`` (a few figures, say) is shown beside the bar."""
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
+        """``done`` in all are done; ``note`` (a few figures, say) is shown beside the bar. ``share`` of the
+        work is behind us, where steps differ so much that their number does not say."""
 
 
 class Reporter(Protocol):
@@ -42,17 +43,18 @@ class Pace:
 
     def __init__(self, total: int | None) -> None:
         self._total = total
-        self._first: tuple[float, int] | None = None
+        self._first: tuple[float, float] | None = None
 
-    def seconds_left(self, done: int) -> float | None:
-        """To be asked whenever ``done`` grows; None while there is nothing to go by."""
+    def seconds_left(self, done: int, share: float | None = None) -> float | None:
+        """To be asked whenever ``done`` grows; None while there is nothing to go by. ``share``: of the work,
+        where it is not that of the steps."""
         now = time.monotonic()
-        if self._first is None and done:
-            self._first = now, done
-        begin, first = self._first or (now, done)
-        if not self._total or done <= first:
+        if not self._total or not done:
             return None
-        return (now - begin) * (self._total - done) / (done - first)
+        if share is None:
+            share = done / self._total
+        begin, first = self._first = self._first or (now, share)
+        return (now - begin) * (1.0 - share) / (share - first) if share > first else None
 
 
 class SilentTask:
@@ -60,7 +62,9 @@ class SilentTask:
 
     def advance(self, steps: int = 1) -> None: ...
 
-    def update(self, *, done: int | None = None, note: str | None = None) -> None: ...
+    def update(
+        self, *, done: int | None = None, note: str | None = None, share: float | None = None
+    ) -> None: ...
 
 
 class SilentReporter:

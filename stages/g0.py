@@ -37,12 +37,13 @@ def preflight(config: G0Config) -> None:
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
     buffers."""
-    from cleargs.capture.cost import capture_size, pace
+    from cleargs.capture.cost import capture_size, pace, sparse_points
     from cleargs.splat.effort import training_cost
 
     config = context.config
     count, megapixels = capture_size(context)
-    seconds, memory = training_cost(config, count, megapixels)
+    start = max(config.min_points, sparse_points(context))
+    seconds, memory = training_cost(config, count, megapixels, start)
     seconds *= pace(context.threads)
     disk = 0.7 * memory  # scene and state: 1 kB a Gaussian
     memory += 1.0 + min(config.cache_mb / 1024, 0.003 * megapixels * count)

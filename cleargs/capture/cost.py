@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from cleargs.capture.tables import load_frames
+from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
 
 if TYPE_CHECKING:
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _UNKNOWN = (60, 0.5)
 """Frames and megapixels assumed where nothing is known of the capture."""
+_UNKNOWN_POINTS = 20_000
+"""Sparse points assumed there."""
 _SERIAL = 0.1
 """Share of the work that more threads do not speed up (a guess)."""
 
@@ -27,6 +29,16 @@ def capture_size(context: StageContext[Any]) -> tuple[int, float]:
     except StoreError:
         return _UNKNOWN
     return len(frames), max((f.width * f.height for f in frames), default=0) / 1e6
+
+
+def sparse_points(context: StageContext[Any]) -> int:
+    """Sparse points of a capture; before ingest, and where they cannot be read, `_UNKNOWN_POINTS`."""
+    if "ingest" not in context.inputs:
+        return _UNKNOWN_POINTS
+    try:
+        return len(load_points(context.inputs["ingest"]).point_id)
+    except StoreError:
+        return _UNKNOWN_POINTS
 
 
 def pace(threads: int) -> float:

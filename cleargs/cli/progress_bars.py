@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -65,10 +66,10 @@ class LineTask:
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
 
-    def update(self, *, done: int | None = None, note: str | None = None) -> None:
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         self.done = self.done if done is None else done
         self.note = self.note if note is None else printable(note)
-        now, left = time.monotonic(), self._pace.seconds_left(self.done)
+        now, left = time.monotonic(), self._pace.seconds_left(self.done, share)
         if now - self._said >= LINE_EVERY:
             self._said = now
             click.echo(self._text(left), err=True)
@@ -96,14 +97,14 @@ class BarReporter:
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         label = printable(label)
         if self._progress is not None:
-            bar = self._progress.add_task(label, total=total, note="")
+            bar = self._progress.add_task(label, total=total, left="", note="")
             yield BarTask(self._progress, bar)
             self._progress.stop_task(bar)
             return
         self._progress = _bars(self._console)
         try:
             with self._progress:
-                bar = self._progress.add_task(label, total=total, note="")
+                bar = self._progress.add_task(label, total=total, left="", note="")
                 yield BarTask(self._progress, bar)
         finally:
             self._progress = None
@@ -121,27 +122,37 @@ class BarTask:
     def __init__(self, progress: Progress, bar: TaskID) -> None:
         self._progress = progress
         self._bar = bar
+        self._task = next(task for task in progress.tasks if task.id == bar)
+        self._pace = Pace(None if self._task.total is None else int(self._task.total))
 
     def advance(self, steps: int = 1) -> None:
-        self._progress.advance(self._bar, steps)
+        self.update(done=int(self._task.completed) + steps)
 
-    def update(self, *, done: int | None = None, note: str | None = None) -> None:
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         changes: dict[str, Any] = {}
         if done is not None:
+            left = self._pace.seconds_left(done, share)
             changes["completed"] = done
+            changes["left"] = f"{_clock(left)} left" if left else ""
         if note is not None:
             changes["note"] = printable(note)
         self._progress.update(self._bar, **changes)
 
 
+def _clock(seconds: float) -> str:
+    """``h:mm:ss``."""
+    return str(timedelta(seconds=round(seconds)))
+
+
 def _bars(console: Console) -> Progress:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
         TextColumn("{task.fields[note]}", markup=False),
         console=console,
     )

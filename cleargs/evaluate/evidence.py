@@ -208,7 +208,7 @@ def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> fl
             if not first(sample, total, variant.name):
                 continue
             whole = g0.model_copy(update={"steps": total})
-            training, _ = training_cost(whole, section.frames, megapixels)
+            training, _ = training_cost(whole, section.frames, megapixels, g0.min_points)
             if variant.stage != "g0":
                 # Those that differ in RIVR alone share the first scene.
                 scene = (

@@ -127,12 +127,13 @@ class _NotingTask:
 
     def advance(self, steps: int = 1) -> None:
         self._task.advance(steps)
-        self._tell(self._done + steps, self._note)
+        self._tell(self._done + steps, self._note, None)
 
-    def update(self, *, done: int | None = None, note: str | None = None) -> None:
-        self._task.update(done=done, note=note)
-        self._tell(self._done if done is None else done, self._note if note is None else note)
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
+        self._task.update(done=done, note=note, share=share)
+        self._tell(self._done if done is None else done, self._note if note is None else note, share)
 
-    def _tell(self, done: int, note: str) -> None:
+    def _tell(self, done: int, note: str, share: float | None) -> None:
         self._done, self._note = done, note
-        self._reporter.tell(self._label, done, self._total, note, self._pace.seconds_left(done))
+        left = self._pace.seconds_left(done, share)
+        self._reporter.tell(self._label, done, self._total, note, left)

@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 if TYPE_CHECKING:
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.views import View
@@ -46,18 +49,46 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
     return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), max_budget)
 
 
-def training_cost(config: TrainConfig, frames: int, megapixels: float) -> tuple[float, float]:
-    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames."""
+def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
+    """How many Gaussians each step has, [length], where they grow from ``start`` as fast as they may."""
+    counts = np.full(config.length, float(start))
+    if not config.densify or config.budget is None or start >= config.budget:
+        return counts
+    refined = np.arange(config.refine_interval, config.length, config.refine_interval)
+    between = (refined >= config.refine_start * config.length) & (
+        refined <= config.refine_stop * config.length
+    )
+    for step in refined[between]:
+        counts[step:] = min(config.budget, int((1.0 + config.growth) * counts[step]))
+    return counts
+
+
+def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: int) -> NDArray[np.float64]:
+    """Rough wall seconds of each step on two quiet cores, [length]: steps late in a training take longer.
+
+    ``config`` is decided; ``frames`` of ``megapixels`` each are trained on, from ``start`` Gaussians.
+    """
+    step = np.arange(config.length)
+    reduced = np.where(step < config.coarse_share * config.length, config.coarse_factor**2, 1.0)
+    seconds = STEP_S + STEP_S_PER_MEGAPIXEL * megapixels * reduced
+    seconds += STEP_S_PER_GAUSSIAN * gaussians_by_step(config, start)
+    if config.formation.enabled:
+        since = step - config.formation.start * config.length
+        again = SEARCH_AGAIN_S / config.formation.every
+        seconds += megapixels * np.where(since < 0, 0.0, np.where(since < frames, SEARCH_S, again))
+    return seconds
+
+
+def training_cost(
+    config: TrainConfig, frames: int, megapixels: float, start: int | None = None
+) -> tuple[float, float]:
+    """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames from
+    ``start`` Gaussians (None: from as many as it may have)."""
     pixels = round(frames * megapixels * 1e6)
-    gaussians = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
-    seen = megapixels * (config.coarse_share * config.coarse_factor**2 + 1.0 - config.coarse_share)
-    step = STEP_S + STEP_S_PER_MEGAPIXEL * seen + STEP_S_PER_GAUSSIAN * gaussians
-    steps, formation = config.steps_for(frames), config.formation
-    seconds = steps * step
-    if formation.enabled and frames:
-        again = max(0.0, (1.0 - formation.start) * steps / frames / formation.every - 1.0)
-        seconds += frames * megapixels * (SEARCH_S + SEARCH_AGAIN_S * again)
-    return seconds, 1.5e-6 * gaussians
+    budget = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
+    whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})
+    seconds = seconds_by_step(whole, frames, megapixels, budget if start is None else min(start, budget))
+    return float(seconds.sum()), 1.5e-6 * budget
 
 
 def quality_settings(quality: str) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.effort import decided
+from cleargs.splat.effort import decided, seconds_by_step
 from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
@@ -215,6 +215,14 @@ class Trainer:
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
         return self._render(preview_camera(view.camera), depth=False).image
 
+    def shares_of_work(self) -> list[float]:
+        """For 0 to ``length`` steps done, the share of the work that is behind us: growth makes later steps
+        longer."""
+        views = self._real or self._pseudo
+        megapixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / 1e6
+        seconds = seconds_by_step(self._config, len(views), megapixels, self._scene.gaussians.num)
+        return [0.0, *(np.cumsum(seconds) / seconds.sum()).tolist()]
+
     def check_finite(self) -> None:
         """Raise StageError, naming the step and the group, when a parameter is NaN or infinite."""
         if fault := _fault(self._gaussians):
@@ -376,6 +384,7 @@ class _Progress:
 
     def __init__(self, task: Task, trainer: Trainer) -> None:
         self._task, self._trainer = task, trainer
+        self._share = trainer.shares_of_work()
         self._begin: tuple[float, int] | None = None
 
     def show(self) -> None:
@@ -386,7 +395,7 @@ class _Progress:
         else:
             start, first = self._begin
             words.insert(0, f"{(trainer.done - first) / max(now - start, 1e-9):.1f} it/s")
-        self._task.update(done=trainer.done, note=", ".join(words))
+        self._task.update(done=trainer.done, note=", ".join(words), share=self._share[trainer.done])
 
 
 def _fingerprint(

@@ -474,6 +474,19 @@ def test_the_time_left_counts_from_the_first_step_on(
     assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left"]
 
 
+def test_the_time_left_follows_the_work_where_steps_differ(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the steps may be a quarter of the work: a training's last steps have the most Gaussians."""
+    clock = [0.0]
+    monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
+    task = LineTask("G0", 1000)
+    for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
+        clock[0] = now
+        task.update(done=done, share=share)
+    assert capsys.readouterr().err.splitlines()[-1] == "G0: 500/1000, 30 s left"
+
+
 def test_a_gpu_that_is_not_used_is_told_of(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

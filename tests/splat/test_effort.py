@@ -11,7 +11,15 @@ from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config, override
 from cleargs.pipeline.dag import installed
 from cleargs.splat.config import DistilConfig, G0Config, TrainConfig
-from cleargs.splat.effort import Quality, budget_from_pixels, decided, quality_settings, steps_from_frames
+from cleargs.splat.effort import (
+    Quality,
+    budget_from_pixels,
+    decided,
+    gaussians_by_step,
+    quality_settings,
+    steps_from_frames,
+    training_cost,
+)
 from cleargs.splat.trainer import Trainer
 
 
@@ -52,3 +60,24 @@ def test_quality_reaches_every_training() -> None:
     found = (config.sections["g0"], config.sections["rivr"].distil, config.sections["consolidate"].distil)
     assert {training.quality for training in found} == {"high"}
     assert invoke(["run", "nowhere.mp4", "-o", "nowhere", "--quality", "best"]) == 2
+
+
+def test_the_growth_of_a_training_is_foreseen() -> None:
+    config = TrainConfig(steps=120, budget=90, growth=0.1)
+    trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
+    while trainer.done < trainer.length:
+        trainer.step()
+    logged = trainer.rows(0).column("n_gaussians").to_pylist()
+    assert gaussians_by_step(config, 60).tolist() == logged
+    assert logged[0] == 60 and logged[-1] == 90 and len(set(logged)) > 3
+
+
+def test_later_steps_are_known_to_take_longer() -> None:
+    config = TrainConfig(steps=1000, budget=300_000, growth=0.1)
+    trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
+    shares = trainer.shares_of_work()
+    assert shares[0] == 0.0 and len(shares) == 1001 and shares[-1] == pytest.approx(1.0)
+    assert shares[500] < 0.5, "growth and full-size images lie in the second half"
+    few, _ = training_cost(config, 100, 0.4, 20_000)
+    many, _ = training_cost(config, 100, 0.4)
+    assert few < many
