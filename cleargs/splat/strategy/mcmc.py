@@ -3,8 +3,8 @@
 As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
 noise that only transparent Gaussians feel is added to the means.
 
-The rules are pure functions on numpy arrays: one thread, so the results depend on no thread count. A GPU has
-the same rules, and draws other random numbers.
+Relocation and growth are pure functions on numpy arrays: one thread, so the results depend on no thread
+count. The noise, of every step, is a kernel. A GPU has the same rules, and draws other random numbers.
 """
 
 from __future__ import annotations
@@ -164,32 +164,6 @@ def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> ND
     return unique
 
 
-def mean_noise(
-    log_scales: F32,
-    rotations: F32,
-    logit_opacities: F32,
-    *,
-    amount: float,
-    min_opacity: float,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.int64], F32]:
-    """Noise for one step: (indices [U] of the Gaussians that feel it, offsets of their means [U, 3]).
-
-    ``amount`` times the covariance times a normal draw, faded out by a sigmoid around ``min_opacity``
-    (gsplat, inject_noise_to_position). Gaussians whose factor is under 1e-6 are left out.
-    """
-    limit = np.float32(math.log(NOISE_CUT / (1.0 - NOISE_CUT)))
-    felt = np.flatnonzero(logit_opacities < limit)
-    opacity = sigmoid(logit_opacities[felt])
-    fade = sigmoid(np.float32(100.0) * (np.float32(min_opacity) - opacity))
-    draw = rng.standard_normal((len(felt), 3), dtype=np.float32)
-    rotation = rotation_matrices(rotations[felt])
-    variance = np.exp(np.float32(2.0) * log_scales[felt])
-    local = np.stack([_dot3(rotation[:, :, axis], draw) for axis in range(3)], axis=1) * variance  # S^2 R^T n
-    world = np.stack([_dot3(rotation[:, axis, :], local) for axis in range(3)], axis=1)
-    return felt, world * (fade * np.float32(amount))[:, None]
-
-
 def rotation_matrices(quaternions: F32) -> F32:
     """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w x y z) of any length; zero: no rotation."""
     norm = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
@@ -205,9 +179,4 @@ def rotation_matrices(quaternions: F32) -> F32:
 def sigmoid(x: NDArray[Any]) -> NDArray[Any]:
     """1 / (1 + exp(-x)), in the type of ``x``; the input is kept within +-80, where exp stays finite."""
     result: NDArray[Any] = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
-    return result
-
-
-def _dot3(a: F32, b: F32) -> F32:
-    result: F32 = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
     return result

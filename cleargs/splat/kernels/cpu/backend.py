@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import adam, affine_colour, launch, loss
+from cleargs.splat.kernels.cpu import adam, affine_colour, launch, loss, position_noise
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import PhotometricLoss
 from cleargs.splat.strategy import mcmc
@@ -173,15 +173,18 @@ def relocate_and_grow(
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
-    felt, offsets = mcmc.mean_noise(
-        gaussians.log_scales.numpy(),
-        gaussians.rotations.numpy(),
-        gaussians.logit_opacities.numpy(),
-        amount=amount,
-        min_opacity=min_opacity,
-        rng=np.random.default_rng([*seed]),
-    )
-    gaussians.means.numpy()[felt] += offsets
+    key = np.random.SeedSequence([*seed]).generate_state(1, np.uint64)[0]
+    with launch.exclusive():
+        position_noise.add_noise(
+            gaussians.means.numpy(),
+            gaussians.log_scales.numpy(),
+            gaussians.rotations.numpy(),
+            gaussians.logit_opacities.numpy(),
+            amount,
+            min_opacity,
+            mcmc.NOISE_CUT,
+            key,
+        )
 
 
 # -- colour ------------------------------------------------------------------------------------------------

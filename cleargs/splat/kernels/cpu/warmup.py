@@ -9,6 +9,7 @@ from cleargs.splat.adam import adam_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import affine_colour
+from cleargs.splat.kernels.cpu.backend import add_position_noise
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.losses import photometric_loss, psnr
 
@@ -48,5 +49,6 @@ def run() -> None:
         photometric_loss(image, image, ssim_lambda=0.2, mask=counted)
         psnr(image, image, counted)
     adam_step(row, row.clone(), row.clone(), row.clone(), step=1, lr=0.0)
+    add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     affine_colour.apply_affine(pixels, affine, pixels.copy())
     affine_colour.affine_backward(pixels, affine, pixels, pixels.copy(), sums)
