@@ -41,6 +41,8 @@ from cleargs.splat.losses import psnr
 PLAIN, FORMED = "sharp render", "formation"
 """A step that takes the frame for sharp, and one through `cleargs.formation`."""
 
+CPU = torch.device("cpu")
+
 TRUTH_PER_PIXEL = 4
 """Renders a pixel of blur whose mean is the truth."""
 
@@ -156,8 +158,8 @@ def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
     engine, total = Engine(), np.zeros((camera.height, camera.width, 3))
     poses = poses_along(camera, motion, max(9, round(TRUTH_PER_PIXEL * length)))
     for pose in poses:
-        total += through_curve(engine.forward(gaussians, pose).image.numpy(), linear_curve())[0]
-    return torch.from_numpy(through_curve((total / len(poses)).astype(np.float32), srgb_curve())[0])
+        total += through_curve(engine.forward(gaussians, pose).image, linear_curve(CPU))[0].numpy()
+    return through_curve(torch.from_numpy((total / len(poses)).astype(np.float32)), srgb_curve(CPU))[0]
 
 
 def _median_depth(gaussians: Gaussians, camera: Camera) -> float:
@@ -176,8 +178,8 @@ class _FormedStep(Iteration):
 
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion) -> None:
         super().__init__(gaussians, camera)
-        depth = _depth(self.engine, gaussians, camera)
-        fields = displacement_fields(motion, camera, depth, np.ones_like(depth))
+        depth = torch.from_numpy(_depth(self.engine, gaussians, camera))
+        fields = displacement_fields(motion, camera, depth, torch.ones_like(depth))
         frame = FrameFormation(0, motion, "blur", reach_px=reach_of(fields))
         self._formed = FormedView(camera, 1.0, formation=frame)
 
@@ -198,20 +200,19 @@ class _MeanOfRenders(Iteration):
         self._engines = [Engine() for _ in self._poses]
 
     def image(self) -> Tensor:
-        total = np.zeros((self.camera.height, self.camera.width, 3), np.float32)
+        total = torch.zeros(self.camera.height, self.camera.width, 3)
         self._slopes = []
         for engine, pose in zip(self._engines, self._poses, strict=True):
-            light, slope = through_curve(engine.forward(self.gaussians, pose).image.numpy(), linear_curve())
+            light, slope = through_curve(engine.forward(self.gaussians, pose).image, linear_curve(CPU))
             total += light
             self._slopes.append(slope)
-        mean, self._slope_of_mean = through_curve(total / np.float32(len(self._poses)), srgb_curve())
-        return torch.from_numpy(mean)
+        mean, self._slope_of_mean = through_curve(total / len(self._poses), srgb_curve(CPU))
+        return mean
 
     def backward(self, slope: Tensor) -> Gaussians:
-        share = np.float32(1.0 / len(self._poses))
-        light = times_slope(slope.numpy(), self._slope_of_mean) * share
+        light = times_slope(slope, self._slope_of_mean) / len(self._poses)
         found = [
-            engine.backward(torch.from_numpy(times_slope(light, of_render)))
+            engine.backward(times_slope(light, of_render))
             for engine, of_render in zip(self._engines, self._slopes, strict=True)
         ]
         for name, total in found[0].tensors().items():

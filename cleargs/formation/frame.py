@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import apply_affine
-from cleargs.formation.motion import MODELS, TWIST, Floats, FrameMotion, Model
+from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model
 from cleargs.formation.search import (
     Explanation,
     Sight,
@@ -20,11 +20,12 @@ from cleargs.formation.search import (
     refine,
     search,
 )
-from cleargs.formation.warp import DisplacementFields, displacement_fields
+from cleargs.formation.warp import displacement_fields
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
+from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 MARGIN_STEP = 4
 """Margins are multiples of this, px."""
@@ -169,8 +170,8 @@ def _described(
 ) -> FrameFormation:
     """The frame with a new explanation; lengths in pixels of the full image."""
     motion = _scaled(best.motion, 1.0 / factor)
-    assert rendered.depth is not None
-    depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
+    depth, alpha = rendered.depth, rendered.alpha
+    assert depth is not None
 
     def fields(of: FrameMotion) -> DisplacementFields:
         return displacement_fields(of, camera, depth, alpha, margin, factor)
@@ -184,19 +185,19 @@ def _described(
         misfit_still=best.misfit_still,
         blur_px=_mean_length(whole.sweep) / factor,
         skew_px=_mean_length(turned.sweep) / factor,
-        defocus_px=float(whole.radius.mean(dtype=np.float64)) / factor,
+        defocus_px=float(whole.radius.cpu().numpy().mean(dtype=np.float64)) / factor,
         reach_px=reach_of(whole) / factor,
     )
 
 
 def reach_of(fields: DisplacementFields) -> float:
     """See `FrameFormation.reach_px`."""
-    displacements = np.abs(fields.offset) + 0.5 * np.abs(fields.sweep) + fields.radius
-    return float(np.quantile(displacements.max(axis=0)[::4, ::4], 0.95))
+    displacements = fields.offset.abs() + 0.5 * fields.sweep.abs() + fields.radius
+    return float(np.quantile(displacements.amax(dim=0)[::4, ::4].cpu().numpy(), 0.95))
 
 
-def _mean_length(field: Floats) -> float:
-    return float(np.hypot(*field).mean(dtype=np.float64))
+def _mean_length(field: Tensor) -> float:
+    return float(np.hypot(*field.cpu().numpy()).mean(dtype=np.float64))
 
 
 def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:

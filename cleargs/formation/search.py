@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.formation.motion import TWIST, Floats, FrameMotion, Model, Vector, flow_basis
-from cleargs.formation.warp import DisplacementFields, samples
+from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import frame_warp as kernels
 from cleargs.splat.kernels.cpu import launch
+from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
@@ -278,27 +279,19 @@ class _Level:
     def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
         fields = self._fields(motion)
         with launch.exclusive():
-            kernels.misfits(
-                self._image,
-                self._observed,
-                weight,
-                fields.offset,
-                fields.sweep,
-                fields.radius,
-                times,
-                LIMIT,
-                self._rows,
-            )
+            kernels.misfits(self._image, self._observed, weight, *fields, times, LIMIT, self._rows)
         return math.fsum(self._rows)
 
-    def _fields(self, motion: FrameMotion) -> DisplacementFields:
+    def _fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
+        """Offset, sweep and radius: see `DisplacementFields`."""
+
         def flow(twist: Vector) -> Floats:
             # einsum, for its fixed order of summation.
             return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
 
         offset = flow(motion.pose) + flow(motion.skew) * self._down[:, None]
         radius = np.abs(self._nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self._scale)
-        return DisplacementFields(offset, flow(motion.blur), radius, 0.0)
+        return offset, flow(motion.blur), radius
 
     def _descend(self, motion: FrameMotion, active: Vector, steps: int) -> FrameMotion:
         """Levenberg-Marquardt over the ``active`` numbers from ``motion``."""
@@ -325,7 +318,7 @@ class _Level:
         return motion
 
     def _normal_equations(self, motion: FrameMotion, active: Vector) -> tuple[Vector, Vector]:
-        fields, height = self._fields(motion), len(self._observed)
+        (offset, sweep, _), height = self._fields(motion), len(self._observed)
         count = len(active)
         matrices, sides = np.empty((height, count, count)), np.empty((height, count))
         with launch.exclusive():
@@ -335,8 +328,8 @@ class _Level:
                 self._fitting,
                 self._basis,
                 self._down,
-                fields.offset,
-                fields.sweep,
+                offset,
+                sweep,
                 FINE[:, 0].copy(),
                 OUTLIER,
                 active,
@@ -359,15 +352,15 @@ def _judging(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 def _median_depth(sight: Sight) -> float:
     depth, alpha = sight.depth[::4, ::4], sight.alpha[::4, ::4]
-    seen = (alpha > kernels.MIN_COVERED) & (depth > 0.0)
+    seen = (alpha > MIN_COVERED) & (depth > 0.0)
     return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
 
 
 def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
     """As in the kernel `displacements`."""
-    seen = (alpha > kernels.MIN_COVERED) & (depth > 0.0)
+    seen = (alpha > MIN_COVERED) & (depth > 0.0)
     near = np.ones_like(depth)
-    near[seen] = np.minimum(np.float32(median) * alpha[seen] / depth[seen], kernels.MAX_NEARNESS)
+    near[seen] = np.minimum(np.float32(median) * alpha[seen] / depth[seen], MAX_NEARNESS)
     return near
 
 

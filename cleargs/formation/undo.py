@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from cleargs.formation.motion import Floats
 from cleargs.formation.warp import Warp, padded
@@ -41,7 +43,8 @@ def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats
     Returns [H, W, 3] sRGB in [0, 1], of the frame's size.
     """
     start, target = padded(linear_from_srgb(render)), padded(linear_from_srgb(observed))
-    exposed = warp.forward(start)
+    forward, transpose = _on_arrays(warp.forward, warp), _on_arrays(warp.transpose, warp)
+    exposed = forward(start)
     left = target - exposed
     data = _slope(exposed) ** 2 * weight[..., None]
     differences = np.abs(observed - srgb_from_linear(np.clip(exposed[..., :3], 0.0, 1.0))).max(
@@ -52,12 +55,21 @@ def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats
 
     def normal(change: Floats) -> Floats:
         """The normal equations of the change in sRGB: dark and bright parts then converge alike."""
-        return warp.transpose(data * warp.forward(change / seen)) / seen + np.float32(PRIOR) * change
+        return transpose(data * forward(change / seen)) / seen + np.float32(PRIOR) * change
 
-    change = _conjugate_gradients(normal, warp.transpose(data * left) / seen)
+    change = _conjugate_gradients(normal, transpose(data * left) / seen)
     m, (height, width, _) = warp.margin, observed.shape
     whole = srgb_from_linear(np.clip(start + change / seen, 0.0, 1.0))
     return np.ascontiguousarray(whole[m : m + height, m : m + width, :3])
+
+
+def _on_arrays(operator: Callable[[Tensor], Tensor], warp: Warp) -> Callable[[Floats], Floats]:
+    """Half of a warp, wherever its fields lie, as the solver on the CPU calls it."""
+
+    def called(image: Floats) -> Floats:
+        return np.asarray(operator(torch.from_numpy(image).to(warp.samples.device)).cpu())
+
+    return called
 
 
 def _conjugate_gradients(matrix: Callable[[Floats], Floats], side: Floats) -> Floats:

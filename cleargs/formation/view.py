@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, affine_backward, apply_affine
@@ -19,7 +18,7 @@ from cleargs.formation.warp import (
 )
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Render
-from cleargs.splat.kernels.cpu.pixel import CHANNELS
+from cleargs.splat.kernels.warp_layout import CHANNELS
 
 
 @dataclass(eq=False)
@@ -50,28 +49,22 @@ class FormedView:
         if self.formation is None:
             return image
         self._warp = self.warp(render)
-        linear, self._to_linear = through_curve(image.cpu().numpy(), linear_curve(), CHANNELS)
-        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve())
-        return torch.from_numpy(photograph).to(image.device)
+        linear, self._to_linear = through_curve(image, linear_curve(image.device), CHANNELS)
+        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(image.device))
+        return photograph
 
     def warp(self, render: Render) -> Warp:
         """B of the frame, from a render at ``camera`` with depth."""
         assert self.formation is not None and render.depth is not None
         fields = displacement_fields(
-            self.formation.motion,
-            self._photo,
-            render.depth.cpu().numpy(),
-            render.alpha.cpu().numpy(),
-            self._margin,
-            self.factor,
+            self.formation.motion, self._photo, render.depth, render.alpha, self._margin, self.factor
         )
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
         if self.formation is not None:
-            light = times_slope(gradient.cpu().numpy(), self._to_srgb, CHANNELS)
-            light = times_slope(self._warp.transpose(light), self._to_linear)
-            gradient = torch.from_numpy(light).to(gradient.device)
+            light = times_slope(gradient, self._to_srgb, CHANNELS)
+            gradient = times_slope(self._warp.transpose(light), self._to_linear)
         if self.affine is not None:
             gradient, self._affine_gradient = affine_backward(self._rendered, self.affine, gradient)
         return gradient

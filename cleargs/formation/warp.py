@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cleargs.formation.motion import Floats, FrameMotion
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import frame_warp as kernels
-from cleargs.splat.kernels.cpu import launch
-from cleargs.splat.kernels.cpu.pixel import CHANNELS
+from cleargs.splat.kernels import warp_layout as layout
+from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 SAMPLES_PER_PIXEL = 1.0
 """Samples per pixel of a blur's length."""
@@ -30,26 +32,16 @@ _PLASTIC = 0.7548776662466927
 """The step of a sequence that fills the unit interval evenly: the inverse of the plastic number."""
 
 
-@dataclass(frozen=True, eq=False)
-class DisplacementFields:
-    """Where the pixels of a photograph look while they are exposed, in pixels: see the kernels."""
-
-    offset: Floats  # [2, H, W]
-    sweep: Floats  # [2, H, W]
-    radius: Floats  # [H, W]
-    reach: float
-    """Farthest that a pixel looks up or down."""
-
-    def samples(self) -> Floats:
-        """Enough sample times and disc points that neighbouring ones lie about a pixel apart: [K, 3]."""
-        sweeps = np.hypot(*self.sweep[:, ::STRIDE, ::STRIDE])
-        longest = float(np.quantile(sweeps, 0.95))
-        widest = float(np.quantile(self.radius[::STRIDE, ::STRIDE], 0.95))
-        times = math.ceil(SAMPLES_PER_PIXEL * longest) if longest > 0.05 else 1
-        points = math.ceil(SAMPLES_PER_DISC_PIXEL * math.pi * widest**2) if widest > 0.05 else 1
-        if (count := max(times, points)) > 1:
-            count = min(max(MIN_SAMPLES, count), MAX_SAMPLES)
-        return samples(count)
+def enough_samples(fields: DisplacementFields) -> Floats:
+    """Sample times and disc points such that neighbouring ones lie about a pixel apart: [K, 3]."""
+    sweeps = np.hypot(*fields.sweep[:, ::STRIDE, ::STRIDE].cpu().numpy())
+    longest = float(np.quantile(sweeps, 0.95))
+    widest = float(np.quantile(fields.radius[::STRIDE, ::STRIDE].cpu().numpy(), 0.95))
+    times = math.ceil(SAMPLES_PER_PIXEL * longest) if longest > 0.05 else 1
+    points = math.ceil(SAMPLES_PER_DISC_PIXEL * math.pi * widest**2) if widest > 0.05 else 1
+    if (count := max(times, points)) > 1:
+        count = min(max(MIN_SAMPLES, count), MAX_SAMPLES)
+    return samples(count)
 
 
 @cache
@@ -70,7 +62,7 @@ def samples(count: int) -> Floats:
 
 
 def displacement_fields(
-    motion: FrameMotion, camera: Camera, depth: Floats, alpha: Floats, margin: int = 0, scale: float = 1.0
+    motion: FrameMotion, camera: Camera, depth: Tensor, alpha: Tensor, margin: int = 0, scale: float = 1.0
 ) -> DisplacementFields:
     """The displacement fields of a frame.
 
@@ -78,23 +70,12 @@ def displacement_fields(
     by ``margin`` pixels on every side. scale: size of this photograph over that in whose pixels ``motion``
     is.
     """
-    shape = (camera.height, camera.width)
-    offset, sweep = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
-    radius, reach = np.empty(shape, np.float32), np.empty(camera.height)
-    kernels.displacements(
-        depth,
-        alpha,
-        margin,
-        motion.median_depth,
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
-        (scale * np.stack([motion.pose, motion.blur, motion.skew])).astype(np.float32),
-        np.array([scale * motion.disc_px, motion.focus], np.float32),
-        offset,
-        sweep,
-        radius,
-        reach,
-    )
-    return DisplacementFields(offset, sweep, radius, float(reach.max()))
+    numbers = np.empty(layout.MOTION_COLUMNS, np.float32)
+    numbers[[layout.FX, layout.FY, layout.CX, layout.CY]] = camera.fx, camera.fy, camera.cx, camera.cy
+    numbers[layout.MEDIAN] = motion.median_depth
+    numbers[[layout.DISC, layout.FOCUS]] = scale * motion.disc_px, motion.focus
+    numbers[layout.TWISTS :] = scale * motion.vector
+    return backend_for(depth.device).displacements(depth, alpha, torch.from_numpy(numbers), margin=margin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,33 +84,19 @@ class Warp:
 
     fields: DisplacementFields
     margin: int
-    samples: Floats
+    samples: Tensor  # [K, 3]
 
     @classmethod
     def of(cls, fields: DisplacementFields, margin: int = 0) -> Warp:
-        return cls(fields, margin, fields.samples())
+        return cls(fields, margin, torch.from_numpy(enough_samples(fields)).to(fields.radius.device))
 
-    def forward(self, image: Floats) -> Floats:
+    def forward(self, image: Tensor) -> Tensor:
         """[H + 2 margin, W + 2 margin, 4] -> [H, W, 4], both in linear light with a channel of padding."""
-        out = np.empty((*self.fields.radius.shape, CHANNELS), np.float32)
-        f = self.fields
-        with launch.exclusive():
-            kernels.expose(image, self.margin, f.offset, f.sweep, f.radius, self.samples, out)
-        return out
+        return backend_for(image.device).expose(image, self.fields, self.samples, margin=self.margin)
 
-    def transpose(self, light: Floats) -> Floats:
+    def transpose(self, light: Tensor) -> Tensor:
         """[H, W, 4] -> [H + 2 margin, W + 2 margin, 4]."""
-        height, width, channels = light.shape
-        rows, columns = height + 2 * self.margin, width + 2 * self.margin
-        reach = min(math.ceil(self.fields.reach) + 3, rows)
-        count = -(-height // kernels.BAND)
-        bands = np.empty((count, kernels.BAND + 2 * reach, columns, channels), np.float32)
-        out = np.empty((rows, columns, channels), np.float32)
-        f = self.fields
-        with launch.exclusive():
-            kernels.spread(light, self.margin, reach, f.offset, f.sweep, f.radius, self.samples, bands, rows)
-            kernels.gather(bands, self.margin, reach, out)
-        return out
+        return backend_for(light.device).expose_backward(light, self.fields, self.samples, margin=self.margin)
 
 
 def padded(image: Floats) -> Floats:
@@ -137,35 +104,28 @@ def padded(image: Floats) -> Floats:
     return np.concatenate([image, np.zeros_like(image[..., :1])], axis=2)
 
 
-def through_curve(image: Floats, curve: Floats, channels: int = 3) -> tuple[Floats, Floats]:
+def through_curve(image: Tensor, curve: Tensor, channels: int = 3) -> tuple[Tensor, Tensor]:
     """The colours of ``image`` [H, W, 3 or 4] through `linear_curve` or `srgb_curve`, as an image of
     ``channels``, and the slopes there [H, W, 3]."""
-    shape = image.shape[:2]
-    out, slope = np.empty((*shape, channels), np.float32), np.empty((*shape, 3), np.float32)
-    with launch.exclusive():
-        kernels.apply_curve(image, curve, out, slope)
-    return out, slope
+    return backend_for(image.device).through_curve(image, curve, channels)
 
 
-def times_slope(light: Floats, slope: Floats, channels: int = 3) -> Floats:
+def times_slope(light: Tensor, slope: Tensor, channels: int = 3) -> Tensor:
     """``light`` [H, W, 3 or 4] times ``slope`` [H, W, 3], as an image of ``channels``."""
-    out = np.empty((*slope.shape[:2], channels), np.float32)
-    with launch.exclusive():
-        kernels.multiply(light, slope, out)
-    return out
+    return backend_for(light.device).times_slope(light, slope, channels)
 
 
 @cache
-def linear_curve() -> Floats:
+def linear_curve(device: torch.device) -> Tensor:
     """From sRGB to linear light, [CURVE_STEPS + 1]."""
-    return linear_from_srgb(_places()).astype(np.float32)
+    return torch.from_numpy(linear_from_srgb(_places()).astype(np.float32)).to(device)
 
 
 @cache
-def srgb_curve() -> Floats:
+def srgb_curve(device: torch.device) -> Tensor:
     """From linear light to sRGB, [CURVE_STEPS + 1]."""
-    return srgb_from_linear(_places()).astype(np.float32)
+    return torch.from_numpy(srgb_from_linear(_places()).astype(np.float32)).to(device)
 
 
 def _places() -> NDArray[np.float64]:
-    return np.linspace(0.0, kernels.CURVE_LAST, kernels.CURVE_STEPS + 1)
+    return np.linspace(0.0, layout.CURVE_LAST, layout.CURVE_STEPS + 1)

@@ -13,6 +13,7 @@ from cleargs.plugins import plugin
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
+from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 if TYPE_CHECKING:
     from cleargs.splat.adam import Moments
@@ -48,8 +49,9 @@ class Rasteriser(Protocol):
 class Backend(Protocol):
     """The kernels of one kind of device; `cleargs.splat.kernels.cpu.backend` and ``cuda.backend`` are two.
 
-    What is called like a function of `cleargs.splat.losses`, ``adam`` or `cleargs.formation.exposure` does
-    what that function says. All sums run in a fixed order. Tensors lie on the device.
+    What is called like a function of `cleargs.splat.losses`, ``adam``, `cleargs.formation.exposure` or
+    ``warp`` does what that function says. No sum depends on an order that may change. Tensors lie on the
+    device.
     """
 
     def rasteriser(self, device: torch.device) -> Rasteriser:
@@ -114,6 +116,26 @@ class Backend(Protocol):
     def affine_backward(
         self, image: Tensor, affine: Tensor, grad_output: Tensor
     ) -> tuple[Tensor, Tensor]: ...
+
+    def displacements(
+        self, depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int
+    ) -> DisplacementFields:
+        """`displacement_fields` of a motion in numbers [25], which lie on the CPU: see ``warp_layout``."""
+        ...
+
+    def expose(self, image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
+        """`Warp.forward`, by sample times and disc points [K, 3]."""
+        ...
+
+    def expose_backward(
+        self, light: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int
+    ) -> Tensor:
+        """`Warp.transpose`."""
+        ...
+
+    def through_curve(self, image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]: ...
+
+    def times_slope(self, light: Tensor, slope: Tensor, channels: int) -> Tensor: ...
 
 
 def backend_for(device: torch.device | str) -> Backend:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.search import Sight, luminance
 from cleargs.formation.warp import Warp, displacement_fields, padded, samples
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera
+from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 Image = npt.NDArray[np.float32]
 
@@ -31,6 +33,11 @@ def wall() -> Image:
 MEDIAN = float(np.median(wall()))
 
 
+def wall_fields(motion: FrameMotion) -> DisplacementFields:
+    """Where the pixels of `CAMERA` look at the wall under a motion."""
+    return displacement_fields(motion, CAMERA, torch.from_numpy(wall()), torch.from_numpy(ALPHA))
+
+
 def picture() -> Image:
     """sRGB [H, W, 3]: polygons with anti-aliased borders."""
     rng = np.random.default_rng(5)
@@ -44,8 +51,8 @@ def picture() -> Image:
 
 def photograph(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Image:
     """What a camera that moves so records, with more samples than the code under test takes."""
-    fields = displacement_fields(motion, CAMERA, wall(), ALPHA)
-    light = Warp(fields, 0, samples(301)).forward(padded(linear_from_srgb(truth)))[..., :3]
+    warp = Warp(wall_fields(motion), 0, torch.from_numpy(samples(301)))
+    light = warp.forward(torch.from_numpy(padded(linear_from_srgb(truth)))).numpy()[..., :3]
     grain = noise * np.random.default_rng(0).standard_normal(truth.shape)
     return np.clip(srgb_from_linear(light) + grain, 0, 1).astype(np.float32)
 

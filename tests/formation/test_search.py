@@ -7,11 +7,24 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from photographs import CAMERA, HEIGHT, MEDIAN, WIDTH, Image, photograph, picture, sight, soft, twist, wall
+import torch
+from photographs import (
+    CAMERA,
+    HEIGHT,
+    MEDIAN,
+    WIDTH,
+    Image,
+    photograph,
+    picture,
+    sight,
+    soft,
+    twist,
+    wall,
+    wall_fields,
+)
 
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
 from cleargs.formation.search import preferred, refine, search
-from cleargs.formation.warp import displacement_fields
 from cleargs.splat.kernels.runtime import set_threads
 
 BLUR = FrameMotion(blur=twist(0, 0, 0, 3, 6, 0), median_depth=MEDIAN)
@@ -62,13 +75,12 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
     found = preferred(search(sight(soft(truth), photograph(truth, motion))))
     assert found.model == model
     assert found.explained > 0.3
-    alpha = np.ones((HEIGHT, WIDTH), np.float32)
-    ours, theirs = (displacement_fields(m, CAMERA, wall(), alpha) for m in (found.motion, motion))
-    assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.5
+    ours, theirs = (wall_fields(m) for m in (found.motion, motion))
+    assert torch.hypot(*(ours.offset - theirs.offset)).mean() < 0.5
     # An exposure is the same from its end to its start. A soft render leaves part of a blur unseen.
-    apart = [np.hypot(*(ours.sweep - sign * theirs.sweep)).mean() for sign in (1, -1)]
+    apart = [torch.hypot(*(ours.sweep - sign * theirs.sweep)).mean() for sign in (1, -1)]
     assert min(apart) < 1.0
-    assert np.abs(ours.radius - theirs.radius).mean() < 0.7
+    assert (ours.radius - theirs.radius).abs().mean() < 0.7
 
 
 def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
@@ -89,10 +101,9 @@ def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
     shifted = replace(BLUR, pose=twist(0, 0, 0, 1.0, -2.0, 0))
     observed = photograph(truth, shifted)
     found = preferred(search(sight(soft(truth), observed), pose=True))
-    alpha = np.ones((HEIGHT, WIDTH), np.float32)
-    ours, theirs = (displacement_fields(m, CAMERA, wall(), alpha) for m in (found.motion, shifted))
-    assert np.hypot(*theirs.offset).mean() > 2.0
-    assert np.hypot(*(ours.offset - theirs.offset)).mean() < 0.3
+    ours, theirs = (wall_fields(m) for m in (found.motion, shifted))
+    assert torch.hypot(*theirs.offset).mean() > 2.0
+    assert torch.hypot(*(ours.offset - theirs.offset)).mean() < 0.3
 
 
 def test_masked_pixels_say_nothing(truth: Image) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from photographs import ALPHA, CAMERA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall
+from photographs import ALPHA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall_fields
 
 from cleargs.formation import undo as module
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.undo import undo
-from cleargs.formation.warp import Warp, displacement_fields
+from cleargs.formation.warp import Warp
 
 MOTIONS = [
     FrameMotion(blur=twist(0, 0, 0, 2, 5, 0), median_depth=MEDIAN),
@@ -25,7 +25,7 @@ def truth() -> Image:
 
 
 def warp(motion: FrameMotion) -> Warp:
-    return Warp.of(displacement_fields(motion, CAMERA, wall(), ALPHA))
+    return Warp.of(wall_fields(motion))
 
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=["turn", "long turn with roll", "both", "defocus"])

@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from photographs import CAMERA, MEDIAN, Image, twist, wall
+from photographs import CAMERA, MEDIAN, Image, twist, wall, wall_fields
+from torch import Tensor
+from warp_oracle import ALL, ROLLED, constant_fields, dot, oracle, random_image
 
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.warp import (
-    DisplacementFields,
     Warp,
     displacement_fields,
     linear_curve,
@@ -22,90 +23,29 @@ from cleargs.formation.warp import (
 )
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import frame_warp as kernels
-from cleargs.splat.kernels.cpu.pixel import CHANNELS
 from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST, MAX_NEARNESS
 
 Doubles = npt.NDArray[np.float64]
 
-ALL = FrameMotion(
-    blur=twist(2, 1, -1, 4, 9, 2),
-    skew=twist(1, 0, 2, 3, 5, -2),
-    pose=twist(0, 1, 0, -2, 1, 0),
-    disc_px=3.0,
-    focus=1.4,
-    median_depth=MEDIAN,
-)
-
-
-def tent(distance: torch.Tensor) -> torch.Tensor:
-    """Linear interpolation's share of a pixel at a distance."""
-    return (1 - distance.abs()).clamp(min=0)
-
-
-def keys(distance: torch.Tensor) -> torch.Tensor:
-    """The share that cubic convolution gives a pixel at a distance, as Keys (1981) writes it for a = -1/2."""
-    d = distance.abs()
-    near, far = 1.5 * d**3 - 2.5 * d**2 + 1, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2
-    return torch.where(d <= 1, near, torch.where(d < 2, far, torch.zeros_like(d)))
-
-
-def oracle(image: Doubles, fields: DisplacementFields, margin: int, points: Image) -> torch.Tensor:
-    """What `Warp.forward` should give, in float64 torch with autograd: a mean of looks-up between pixels."""
-    pixels = torch.tensor(image, dtype=torch.float64, requires_grad=True)
-    rows, columns = image.shape[:2]
-    height, width = fields.radius.shape
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    total = torch.zeros(height, width, image.shape[2], dtype=torch.float64)
-    offset, sweep = torch.tensor(fields.offset).double(), torch.tensor(fields.sweep).double()
-    radius = torch.tensor(fields.radius).double()
-    for t, u, v in points.astype(np.float64):
-        at_x = (x + margin + offset[0] + t * sweep[0] + u * radius).clamp(0, columns - 1)
-        at_y = (y + margin + offset[1] + t * sweep[1] + v * radius).clamp(0, rows - 1)
-        i, j = (
-            at_x.floor().clamp(max=max(columns - 2, 0)).long(),
-            at_y.floor().clamp(max=max(rows - 2, 0)).long(),
-        )
-        between = keys if len(points) == 1 else tent
-        for m in range(-1, 3):
-            for n in range(-1, 3):
-                share = between(at_y - j - m) * between(at_x - i - n)
-                pixel = pixels[(j + m).clamp(0, rows - 1), (i + n).clamp(0, columns - 1)]
-                total = total + share[..., None] * pixel
-    total = total / len(points)
-    total.image = pixels  # type: ignore[attr-defined]
-    return total
-
-
-def random_image(rows: int, columns: int) -> Image:
-    return padded(np.random.default_rng(1).random((rows, columns, 3)).astype(np.float32))
-
-
-def constant_fields(height: int, width: int, dx: float, dy: float, radius: float = 0.0) -> DisplacementFields:
-    sweep = np.empty((2, height, width), np.float32)
-    sweep[0], sweep[1] = dx, dy
-    disc = np.full((height, width), radius, np.float32)
-    return DisplacementFields(np.zeros_like(sweep), sweep, disc, abs(dy) / 2 + radius)
-
-
-ROLLED = FrameMotion(skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
+CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize("margin", [0, 12])
 @pytest.mark.parametrize("motion", [ALL, ROLLED], ids=["many samples", "one sample"])
 def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int) -> None:
-    wide = np.pad(wall(), margin, mode="edge")
-    fields = displacement_fields(motion, CAMERA, wide, np.ones_like(wide), margin)
+    wide = torch.from_numpy(np.pad(wall(), margin, mode="edge"))
+    fields = displacement_fields(motion, CAMERA, wide, torch.ones_like(wide), margin)
     warp = Warp.of(fields, margin)
     assert (len(warp.samples) == 1) == (motion is ROLLED)
     image = random_image(*wide.shape)
-    expected = oracle(image[..., :3].astype(np.float64), fields, margin, warp.samples)
+    expected = oracle(image[..., :3], fields, margin, warp.samples)
     made = warp.forward(image)[..., :3]
     assert made.std() > 0.01
     # Positions of up to 240 px in float32 are good to 1.5e-5 px, and the image changes by at most 1 a pixel.
     np.testing.assert_allclose(made, expected.detach().numpy(), atol=5e-5)
     light = random_image(*fields.radius.shape)
-    expected.backward(torch.tensor(light[..., :3]).double())
+    expected.backward(light[..., :3].double())
     back = warp.transpose(light)[..., :3]
     gradient = expected.image.grad.numpy()  # type: ignore[attr-defined]
     np.testing.assert_allclose(back, gradient, atol=2e-4)
@@ -114,13 +54,14 @@ def test_forward_and_transpose_equal_the_oracle(motion: FrameMotion, margin: int
 
 def test_transpose_is_the_transpose() -> None:
     rng = np.random.default_rng(0)
-    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = wall_fields(ALL)
     warp = Warp.of(fields)
-    a, b = (padded(rng.standard_normal((*wall().shape, 3)).astype(np.float32)) for _ in range(2))
+    a, b = (
+        torch.from_numpy(padded(rng.standard_normal((*wall().shape, 3)).astype(np.float32))) for _ in range(2)
+    )
     forth, back = warp.forward(a), warp.transpose(b)
     # Sums of 1e5 products of float32: relative to their norms some 1e-7 are lost.
-    norms = np.linalg.norm(forth) * np.linalg.norm(b)
-    assert abs(np.vdot(forth.astype(float), b) - np.vdot(a.astype(float), back)) < 1e-5 * norms
+    assert abs(dot(forth, b) - dot(a, back)) < 1e-5 * forth.norm() * b.norm()
 
 
 @pytest.mark.parametrize(
@@ -138,72 +79,69 @@ def test_hard_sizes_and_lengths(height: int, width: int, dx: float, dy: float, r
     fields = constant_fields(height, width, dx, dy, radius)
     warp = Warp.of(fields)
     image, light = random_image(height, width), random_image(height, width)
-    expected = oracle(image[..., :3].astype(np.float64), fields, 0, warp.samples)
+    expected = oracle(image[..., :3], fields, 0, warp.samples)
     np.testing.assert_allclose(warp.forward(image)[..., :3], expected.detach().numpy(), atol=2e-5)
-    forth, back = warp.forward(image).astype(float), warp.transpose(light).astype(float)
-    assert np.vdot(forth, light) == pytest.approx(np.vdot(image.astype(float), back), rel=1e-5)
+    assert dot(warp.forward(image), light) == pytest.approx(dot(image, warp.transpose(light)), rel=1e-5)
 
 
 def test_a_flat_image_stays_flat_and_no_light_is_lost() -> None:
-    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = wall_fields(ALL)
     warp = Warp.of(fields)
-    flat = padded(np.full((*wall().shape, 3), 0.25, np.float32))
+    flat = torch.full((*wall().shape, 4), 0.25)
     np.testing.assert_allclose(warp.forward(flat)[..., :3], 0.25, atol=1e-6)
     light = random_image(*wall().shape)
     back = warp.transpose(light)
-    np.testing.assert_allclose(back.sum((0, 1), dtype=float), light.sum((0, 1), dtype=float), rtol=1e-5)
+    torch.testing.assert_close(back.double().sum((0, 1)), light.double().sum((0, 1)), rtol=1e-5, atol=0.0)
 
 
 def test_what_lies_between_pixels_stays_sharp() -> None:
     """Half a pixel aside, linear interpolation leaves 87 % of waves of six pixels, cubics leave 95 %."""
     waves = np.tile(np.cos(np.pi / 3 * np.arange(60)), (20, 1))
-    image = padded(np.repeat(waves[..., None], 3, axis=2).astype(np.float32))
+    image = torch.from_numpy(padded(np.repeat(waves[..., None], 3, axis=2).astype(np.float32)))
     fields = constant_fields(20, 60, 0.0, 0.0)
     fields.offset[0] = 0.5
-    made = Warp.of(fields).forward(image)[:, 3:-3, 0]
+    made = Warp.of(fields).forward(image)[:, 3:-3, 0].numpy()
     expected = np.cos(np.pi / 3 * (np.arange(60) + 0.5))[3:-3]
     assert np.abs(made - expected).max() < 0.06
 
 
 def test_a_still_frame_is_the_image_itself() -> None:
-    still = FrameMotion()
-    warp = Warp.of(displacement_fields(still, CAMERA, wall(), np.ones_like(wall())))
+    warp = Warp.of(wall_fields(FrameMotion()))
     image = random_image(*wall().shape)
     np.testing.assert_array_equal(warp.forward(image), image)
     np.testing.assert_array_equal(warp.transpose(image), image)
 
 
 def test_depth_that_is_no_number_counts_as_the_median() -> None:
-    depth = wall().copy()
+    depth = torch.from_numpy(wall())
     depth[10:20] = np.nan
     depth[30:40] = 0.0
-    alpha = np.ones_like(depth)
+    alpha = torch.ones_like(depth)
     alpha[50:60] = 0.0
     alpha[70:80] = np.nan
     fields = displacement_fields(ALL, CAMERA, depth, alpha)
-    flat = displacement_fields(ALL, CAMERA, np.full_like(depth, MEDIAN), np.ones_like(depth))
+    flat = displacement_fields(ALL, CAMERA, torch.full_like(depth, MEDIAN), torch.ones_like(depth))
     for rows in (slice(10, 20), slice(30, 40), slice(50, 60), slice(70, 80)):
         np.testing.assert_array_equal(fields.sweep[:, rows], flat.sweep[:, rows])
-    assert np.isfinite([fields.offset, fields.sweep]).all()
-    assert np.isfinite(fields.radius).all()
+    assert all(field.isfinite().all() for field in fields[:3])
 
 
 def test_a_depth_edge_moves_each_side_by_its_own_way() -> None:
     """A step to the side moves what is near further: a scene point's way is inverse to its depth."""
-    depth = np.full_like(wall(), 4.0)
+    depth = torch.full(wall().shape, 4.0)
     depth[:, :100] = 2.0
     motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=4.0)
-    fields = displacement_fields(motion, CAMERA, depth, np.ones_like(depth))
+    fields = displacement_fields(motion, CAMERA, depth, torch.ones_like(depth))
     np.testing.assert_allclose(fields.sweep[0, :, :100], -12.0)
     np.testing.assert_allclose(fields.sweep[0, :, 100:], -6.0)
 
 
 def test_floaters_do_not_move_by_whole_images() -> None:
-    depth = wall().copy()
+    depth = torch.from_numpy(wall())
     depth[:10, :10] = 1e-4
     motion = FrameMotion(blur=twist(6, 0, 0, 0, 0, 0), median_depth=MEDIAN)
-    fields = displacement_fields(motion, CAMERA, depth, np.ones_like(depth))
-    assert np.abs(fields.sweep).max() <= 6.0 * kernels.MAX_NEARNESS
+    fields = displacement_fields(motion, CAMERA, depth, torch.ones_like(depth))
+    assert fields.sweep.abs().max() <= 6.0 * MAX_NEARNESS
 
 
 def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
@@ -225,8 +163,8 @@ def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
         at_y = turned[1] / turned[2] * CAMERA.fy + CAMERA.cy - 0.5
         mean += wave(at_x, at_y) / count
     motion = FrameMotion(blur=twist(0, 0, 0, 0, 8, 0), median_depth=MEDIAN)
-    still = padded(np.repeat(wave(x, y)[..., None], 3, 2).astype(np.float32))
-    made = Warp.of(displacement_fields(motion, CAMERA, wall(), np.ones_like(wall()))).forward(still)[..., 0]
+    still = torch.from_numpy(padded(np.repeat(wave(x, y)[..., None], 3, 2).astype(np.float32)))
+    made = Warp.of(wall_fields(motion)).forward(still)[..., 0].numpy()
     inner = np.s_[4:-4, 8:-8]  # a turn bends the rows near the corners
     assert np.abs(wave(x, y) - mean)[inner].max() > 0.02
     # Eight samples of a way of eight pixels, and bilinear interpolation of the waves.
@@ -235,18 +173,23 @@ def test_the_mean_of_views_along_the_path_is_what_one_warp_gives() -> None:
 
 def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
     values = np.linspace(-0.1, 2.5, 9973).reshape(-1, 1, 1).repeat(3, 2).astype(np.float32)
-    usual = (values > 0) & (values < kernels.CURVE_LAST)
+    usual = (values > 0) & (values < CURVE_LAST)
+
+    def followed(image: Image, curve: Tensor) -> tuple[Image, Image]:
+        out, slope = through_curve(torch.from_numpy(image), curve)
+        return out.numpy(), slope.numpy()
+
     for curve, formula, tolerance in (
-        (linear_curve(), linear_from_srgb, 1e-6),
+        (linear_curve(CPU), linear_from_srgb, 1e-6),
         # Steepest where sRGB turns from straight to a power, at 0.003.
-        (srgb_curve(), srgb_from_linear, 3e-5),
+        (srgb_curve(CPU), srgb_from_linear, 3e-5),
     ):
-        out, slope = through_curve(values, curve)
+        out, slope = followed(values, curve)
         expected = formula(values.astype(np.float64))
         np.testing.assert_allclose(out[usual], expected[usual], atol=tolerance)
         assert np.isfinite(out).all()
         step = np.float32(1e-3)
-        (further, _), (before, _) = (through_curve(values + sign * step, curve) for sign in (1, -1))
+        (further, _), (before, _) = (followed(values + sign * step, curve) for sign in (1, -1))
         # Finite differences away from the formula's corner; the tables' pieces are 2.4e-4 wide.
         smooth = usual[..., 0].ravel() & (values[:, 0, 0] > 0.05) & (values[:, 0, 0] < 1.9)
         difference = (further - before)[smooth] / (2 * step)
@@ -254,23 +197,24 @@ def test_curves_are_srgb_and_their_slopes_are_exact() -> None:
 
 
 def test_the_whole_chain_has_the_gradient_that_finite_differences_show() -> None:
-    fields = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
+    fields = wall_fields(ALL)
     warp = Warp.of(fields)
     rng = np.random.default_rng(3)
-    image = rng.uniform(0.2, 0.8, (*wall().shape, 3)).astype(np.float32)
-    weight = rng.standard_normal(image.shape).astype(np.float32)
-    direction = rng.standard_normal(image.shape).astype(np.float32)
+    image = torch.from_numpy(rng.uniform(0.2, 0.8, (*wall().shape, 3)).astype(np.float32))
+    weight, direction = (
+        torch.from_numpy(rng.standard_normal(image.shape).astype(np.float32)) for _ in range(2)
+    )
 
-    def chain(picture: Image) -> tuple[float, Image]:
-        linear, to_linear = through_curve(picture, linear_curve(), CHANNELS)
-        photo, to_srgb = through_curve(warp.forward(linear), srgb_curve())
+    def chain(picture: Tensor) -> tuple[float, Tensor]:
+        linear, to_linear = through_curve(picture, linear_curve(CPU), CHANNELS)
+        photo, to_srgb = through_curve(warp.forward(linear), srgb_curve(CPU))
         back = times_slope(weight, to_srgb, CHANNELS)
-        return float(np.vdot(photo.astype(float), weight)), times_slope(warp.transpose(back), to_linear)
+        return dot(photo, weight), times_slope(warp.transpose(back), to_linear)
 
     _, gradient = chain(image)
     step = 2e-3
     difference = (chain(image + step * direction)[0] - chain(image - step * direction)[0]) / (2 * step)
-    assert float(np.vdot(gradient.astype(float), direction)) == pytest.approx(difference, rel=2e-3)
+    assert dot(gradient, direction) == pytest.approx(difference, rel=2e-3)
 
 
 def test_threads_do_not_change_a_bit() -> None:
@@ -278,7 +222,7 @@ def test_threads_do_not_change_a_bit() -> None:
     results = []
     for threads in (1, 2):
         set_threads(threads)
-        warp = Warp.of(displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall())))
+        warp = Warp.of(wall_fields(ALL))
         results.append((warp.forward(image), warp.transpose(image)))
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
@@ -298,8 +242,8 @@ def test_samples_are_centred() -> None:
 def test_a_camera_of_another_size_scales_the_motion() -> None:
     half = CAMERA.scaled(0.5)
     assert isinstance(half, Camera)
-    full = displacement_fields(ALL, CAMERA, wall(), np.ones_like(wall()))
-    small = wall()[::2, ::2].copy()
-    reduced = displacement_fields(ALL, half, small, np.ones_like(small), scale=0.5)
+    full = wall_fields(ALL)
+    small = torch.from_numpy(wall()[::2, ::2].copy())
+    reduced = displacement_fields(ALL, half, small, torch.ones_like(small), scale=0.5)
     # A reduced pixel's centre lies half a pixel from the ones it is compared with.
     np.testing.assert_allclose(reduced.sweep, 0.5 * full.sweep[:, ::2, ::2], atol=0.06)

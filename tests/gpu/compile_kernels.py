@@ -25,6 +25,7 @@ from cleargs.splat.kernels.cuda import (
     affine_colour,
     binning,
     densify,
+    frame_warp,
     gradients,
     loss,
     projection,
@@ -36,6 +37,8 @@ SCENE = dict.fromkeys(("means", "log_scales", "rotations", "logits", "sh"), F32)
 SIZE = {"width": "i32", "height": "i32"}
 IMAGE = {"image": F32, "target": F32, "height": "i32", "length": "i32"}
 WINDOW = {"ROWS": loss.ROWS, "COLUMNS": loss.COLUMNS}
+FIELDS = dict.fromkeys(("offset", "sweep", "radius"), F32)
+PHOTOGRAPH = {"height": "i32", "width": "i32", "margin": "i32"}
 GRADIENTS = {f"grad_{name}": F32 for name in SCENE}
 UNFUSED = {"enable_fp_fusion": False}
 
@@ -105,6 +108,37 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {},
         ),
     ]
+    found += [
+        (
+            frame_warp.displace,
+            {**dict.fromkeys(("depth", "alpha", "motion"), F32), **FIELDS, **PHOTOGRAPH},
+            {"BLOCK": frame_warp.BLOCK},
+            {},
+        ),
+        (
+            frame_warp.follow_curve,
+            {**dict.fromkeys(("image", "curve", "out", "slope"), F32), "pixels": "i32"},
+            {"FROM": 3, "TO": 4, "BLOCK": frame_warp.BLOCK},
+            {},
+        ),
+    ]
+    for taps in (2, 4):
+        sampled = {**FIELDS, "samples": F32, **PHOTOGRAPH, "count": "i32"}
+        constants = {"TAPS": taps, "BLOCK": frame_warp.BLOCK}
+        found += [
+            (
+                frame_warp.gather_light,
+                {"image": F32, "light": F32, **sampled, "share": "fp32"},
+                constants,
+                {},
+            ),
+            (
+                frame_warp.return_light,
+                {"light": F32, "scale": F32, "sums": I64, **sampled},
+                constants,
+                {},
+            ),
+        ]
     for masked in (False, True):
         mask = {"mask": U8 if masked else F32}
         constants = {"HAS_MASK": masked, **WINDOW}

@@ -14,7 +14,8 @@ import torch
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "splat"))  # splat_scenes, splat_toy
+TESTS = Path(__file__).parent.parent
+sys.path[:0] = [str(TESTS / "splat"), str(TESTS / "formation")]  # splat_scenes, splat_toy; warp_oracle
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import adam, affine_colour, launch, loss, position_noise
+from cleargs.splat.kernels.cpu import adam, affine_colour, frame_warp, launch, loss, position_noise
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
+from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 from cleargs.splat.losses import PhotometricLoss
 from cleargs.splat.strategy import mcmc
 
@@ -212,3 +213,60 @@ def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple
         )
     sums = [math.fsum(column) for column in row_sums.reshape(len(row_sums), 12).T]
     return grad_image, torch.tensor(sums, dtype=torch.float64).reshape(3, 4)
+
+
+# -- motion and defocus ------------------------------------------------------------------------------------
+
+
+def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
+    height, width = (side - 2 * margin for side in depth.shape)
+    offset, sweep = torch.empty(2, height, width), torch.empty(2, height, width)
+    radius, reach = torch.empty(height, width), np.empty(height)
+    with launch.exclusive():
+        frame_warp.displacements(
+            _read(depth),
+            _read(alpha),
+            margin,
+            motion.numpy(),
+            offset.numpy(),
+            sweep.numpy(),
+            radius.numpy(),
+            reach,
+        )
+    return DisplacementFields(offset, sweep, radius, float(reach.max()))
+
+
+def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
+    offset, sweep, radius = map(_read, fields[:3])
+    light = torch.empty(*radius.shape, CHANNELS)
+    with launch.exclusive():
+        frame_warp.expose(_read(image), margin, offset, sweep, radius, _read(samples), light.numpy())
+    return light
+
+
+def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
+    offset, sweep, radius = map(_read, fields[:3])
+    height, width = radius.shape
+    image = torch.empty(height + 2 * margin, width + 2 * margin, CHANNELS)
+    rows, columns, _ = image.shape
+    reach = rows if fields.reach is None else min(math.ceil(fields.reach) + 3, rows)
+    count = -(-height // frame_warp.BAND)
+    bands = np.empty((count, frame_warp.BAND + 2 * reach, columns, CHANNELS), np.float32)
+    with launch.exclusive():
+        frame_warp.spread(_read(light), margin, reach, offset, sweep, radius, _read(samples), bands, rows)
+        frame_warp.gather(bands, margin, reach, image.numpy())
+    return image
+
+
+def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]:
+    out, slope = torch.empty(*image.shape[:2], channels), torch.empty(*image.shape[:2], 3)
+    with launch.exclusive():
+        frame_warp.apply_curve(_read(image), _read(curve), out.numpy(), slope.numpy())
+    return out, slope
+
+
+def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
+    out = torch.empty(*slope.shape[:2], channels)
+    with launch.exclusive():
+        frame_warp.multiply(_read(light), _read(slope), out.numpy())
+    return out

@@ -22,21 +22,13 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from cleargs.splat.kernels import warp_layout as layout
 from cleargs.splat.kernels.cpu.jit import Array, Floats, inlined, kernel
-from cleargs.splat.kernels.cpu.pixel import CHANNELS, black, load_pixel, plus_scaled, scaled, store_pixel
+from cleargs.splat.kernels.cpu.pixel import black, load_pixel, plus_scaled, scaled, store_pixel
+from cleargs.splat.kernels.warp_layout import CHANNELS
 
 BAND = 32
 """Rows of the photograph whose light one work item of the transpose sends back."""
-
-CURVE_LAST = 2.0
-CURVE_STEPS = 8192
-"""The curves between sRGB and linear light are tables of so many steps from 0 to `CURVE_LAST`, with straight
-lines between them and beyond: within 2e-5 of the formulas, and their derivative is exact."""
-
-MIN_COVERED = 0.5
-"""Alpha from which a pixel has a depth."""
-MAX_NEARNESS = 4.0
-"""Of a pixel, as a multiple of the median one: what floats before the lens would move by whole images."""
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _HALF = np.float32(0.5)
@@ -71,9 +63,9 @@ def _neighbours(first: Any, count: Any) -> tuple[Any, Any, Any, Any]:  # int32, 
 @inlined
 def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float32 -> float32, float32
     """The curve at ``value`` and its slope there."""
-    steps = np.float32(CURVE_STEPS / CURVE_LAST)
+    steps = np.float32(layout.CURVE_DENSITY)
     place = value * steps
-    index = np.int32(min(max(place, _ZERO), np.float32(CURVE_STEPS - 1)))
+    index = np.int32(min(max(place, _ZERO), np.float32(layout.CURVE_STEPS - 1)))
     rise = curve[index + 1] - curve[index]
     return curve[index] + (place - np.float32(index)) * rise, rise * steps
 
@@ -83,10 +75,7 @@ def displacements(
     depth: Floats,  # [H + 2 margin, W + 2 margin] accumulated
     alpha: Floats,  # likewise
     margin: int,
-    median: float,
-    intrinsics: Floats,  # [4]: fx, fy, cx, cy of the photograph
-    twists: Floats,  # [3, 6]: pose, blur and skew, in pixels
-    disc: Floats,  # [2]: radius in pixels per unit of nearness, nearness in focus
+    motion: Floats,  # [25]: see `warp_layout`
     offset: Floats,  # [2, H, W] written
     sweep: Floats,  # [2, H, W] written
     radius: Floats,  # [H, W] written
@@ -97,7 +86,8 @@ def displacements(
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
     """
     _, height, width = offset.shape
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    fx, fy, cx, cy = motion[layout.FX], motion[layout.FY], motion[layout.CX], motion[layout.CY]
+    twists = motion[layout.TWISTS :].reshape(3, 6)
     for row in prange(height):
         down = np.float32((row + 0.5) / height - 0.5)
         y = (np.float32(row) + np.float32(0.5) - cy) / fy
@@ -107,8 +97,8 @@ def displacements(
             covered = alpha[row + margin, column + margin]
             behind = depth[row + margin, column + margin]
             near = _ONE
-            if covered > np.float32(MIN_COVERED) and behind > _ZERO:  # false for NaN
-                near = min(np.float32(median) * covered / behind, np.float32(MAX_NEARNESS))
+            if covered > np.float32(layout.MIN_COVERED) and behind > _ZERO:  # false for NaN
+                near = min(motion[layout.MEDIAN] * covered / behind, np.float32(layout.MAX_NEARNESS))
             for part in range(2):
                 # Pose and skew displace, blur sweeps.
                 tx, ty, tz = twists[part, 0], twists[part, 1], twists[part, 2]
@@ -121,7 +111,7 @@ def displacements(
                 field = offset if part == 0 else sweep
                 field[0, row, column] = along_x
                 field[1, row, column] = along_y * (fy / fx)
-            radius[row, column] = disc[0] * abs(near - disc[1])
+            radius[row, column] = motion[layout.DISC] * abs(near - motion[layout.FOCUS])
             vertical = abs(offset[1, row, column]) + np.float32(0.5) * abs(sweep[1, row, column])
             farthest = max(farthest, np.float64(vertical + radius[row, column]))
         reach[row] = farthest

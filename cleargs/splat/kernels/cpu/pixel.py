@@ -18,8 +18,7 @@ from cleargs.splat.kernels.cpu.simd import (
     _intrinsic,
     _register_type,
 )
-
-CHANNELS = 4
+from cleargs.splat.kernels.warp_layout import CHANNELS
 
 _VECTOR = ir.VectorType(ir.FloatType(), CHANNELS)
 

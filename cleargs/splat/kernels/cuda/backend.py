@@ -13,6 +13,11 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import adam, densify, support
 from cleargs.splat.kernels.cuda.affine_colour import affine_backward as affine_backward
 from cleargs.splat.kernels.cuda.affine_colour import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.frame_warp import displacements as displacements
+from cleargs.splat.kernels.cuda.frame_warp import expose as expose
+from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
+from cleargs.splat.kernels.cuda.frame_warp import through_curve as through_curve
+from cleargs.splat.kernels.cuda.frame_warp import times_slope as times_slope
 from cleargs.splat.kernels.cuda.loss import Meter, Photometer, reading
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.losses import PhotometricLoss

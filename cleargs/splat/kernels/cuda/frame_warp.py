@@ -1,0 +1,320 @@
+"""Blur, rolling shutter and defocus as one warp, and its transpose; the mathematics is that of the CPU back
+end's ``frame_warp``.
+
+A lane is a pixel of the photograph, both ways. Backward, pixels send their light to whatever place they saw,
+many to the same one and in no order. So light is sent in whole numbers of a tiny unit, whose sum does not
+depend on the order: the transpose repeats bit for bit.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from cleargs.splat.kernels import warp_layout as layout
+from cleargs.splat.kernels.cuda.support import memory_errors
+from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
+
+BLOCK = 128
+
+SUM_BITS = 61
+"""Bits of what all pixels can send to one place together; the shares of a cubic may make it 25/16 of that."""
+
+LEAST_LIGHT = 1e-18
+"""The unit is a share of the brightest light, which is taken for no less than this."""
+
+
+@triton.jit
+def twist_of(motion, part):
+    """Six numbers of a frame's motion: ``part`` 0 is the pose, 1 the blur, 2 the skew."""
+    first = motion + layout.TWISTS + 6 * part
+    return (
+        tl.load(first),
+        tl.load(first + 1),
+        tl.load(first + 2),
+        tl.load(first + 3),
+        tl.load(first + 4),
+        tl.load(first + 5),
+    )
+
+
+@triton.jit
+def flow(x, y, near, twist):
+    """Where a pixel on the ray (x, y, 1) of this nearness looks under a twist, in units of fx."""
+    tx, ty, tz, rx, ry, rz = twist
+    along_x = near * (x * tz - tx) + x * y * rx - (1.0 + x * x) * ry + y * rz
+    along_y = near * (y * tz - ty) + (1.0 + y * y) * rx - x * y * ry - x * rz
+    return along_x, along_y
+
+
+@triton.jit(do_not_specialize=["height", "width", "margin"])
+def displace(depth, alpha, motion, offset, sweep, radius, height, width, margin, BLOCK: tl.constexpr):
+    """The fields of a frame's motion and defocus; depth and alpha [H + 2 margin, W + 2 margin]."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    plane = height * width
+    inside = pixel < plane
+    row, column = pixel // width, pixel % width
+    at = (row + margin) * (width + 2 * margin) + column + margin
+    covered = tl.load(alpha + at, mask=inside, other=0.0)
+    behind = tl.load(depth + at, mask=inside, other=0.0)
+    seen = (covered > layout.MIN_COVERED) & (behind > 0.0)  # false for NaN
+    near = tl.load(motion + layout.MEDIAN) * covered / tl.where(seen, behind, 1.0)
+    near = tl.where(seen, tl.minimum(near, layout.MAX_NEARNESS), 1.0)
+    fx, fy = tl.load(motion + layout.FX), tl.load(motion + layout.FY)
+    x = (column.to(tl.float32) + 0.5 - tl.load(motion + layout.CX)) / fx
+    y = (row.to(tl.float32) + 0.5 - tl.load(motion + layout.CY)) / fy
+    down = (row.to(tl.float32) + 0.5) / height - 0.5
+    # Pose and skew displace, blur sweeps.
+    pose_x, pose_y = flow(x, y, near, twist_of(motion, 0))
+    skew_x, skew_y = flow(x, y, near, twist_of(motion, 2))
+    tl.store(offset + pixel, pose_x + down * skew_x, mask=inside)
+    tl.store(offset + plane + pixel, (pose_y + down * skew_y) * (fy / fx), mask=inside)
+    blur_x, blur_y = flow(x, y, near, twist_of(motion, 1))
+    tl.store(sweep + pixel, blur_x, mask=inside)
+    tl.store(sweep + plane + pixel, blur_y * (fy / fx), mask=inside)
+    disc = tl.load(motion + layout.DISC) * tl.abs(near - tl.load(motion + layout.FOCUS))
+    tl.store(radius + pixel, disc, mask=inside)
+
+
+@triton.jit
+def look(pixel, inside, offset, sweep, radius, height, width, margin):
+    """Where pixels look at the middle of the exposure, what they sweep, and the radius of their discs."""
+    plane = height * width
+    x = (pixel % width + margin).to(tl.float32) + tl.load(offset + pixel, mask=inside, other=0.0)
+    y = (pixel // width + margin).to(tl.float32) + tl.load(offset + plane + pixel, mask=inside, other=0.0)
+    along_x = tl.load(sweep + pixel, mask=inside, other=0.0)
+    along_y = tl.load(sweep + plane + pixel, mask=inside, other=0.0)
+    return x, y, along_x, along_y, tl.load(radius + pixel, mask=inside, other=0.0)
+
+
+@triton.jit
+def between(position, count):
+    """The first of the two pixels, of ``count``, that ``position`` lies between; the share of the second."""
+    last = (count - 1).to(tl.float32)
+    position = tl.minimum(tl.maximum(position, 0.0), last)
+    first = tl.minimum(position, tl.maximum(last - 1.0, 0.0)).to(tl.int32)
+    return first, position - first.to(tl.float32)
+
+
+@triton.jit
+def shares(a, TAPS: tl.constexpr):
+    """Shares of the pixels about a place that lies ``a`` behind the first of two, or the second of four.
+
+    Source of the latter: Keys, "Cubic convolution interpolation for digital image processing" (1981), with
+    -1/2.
+    """
+    b = 1.0 - a
+    if TAPS == 2:
+        return b, a
+    else:
+        inner = 0.5 * a * b
+        return -inner * b, b + inner * (b + b - a), a + inner * (a + a - b), -inner * a
+
+
+@triton.jit
+def neighbour(first, tap: tl.constexpr, count, TAPS: tl.constexpr):
+    """The index of a pixel that has a share; beyond the border that of the one at the border."""
+    return tl.minimum(tl.maximum(first + (tap - (TAPS // 2 - 1)), 0), count - 1)
+
+
+@triton.jit(do_not_specialize=["height", "width", "margin", "count"])
+def gather_light(
+    image,
+    offset,
+    sweep,
+    radius,
+    samples,
+    light,
+    height,
+    width,
+    margin,
+    count,
+    share,
+    TAPS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """What the sensor gathers of a still image: [H + 2 margin, W + 2 margin, 4] -> ``light`` [H, W, 4].
+
+    ``share`` is that of each of the ``count`` samples.
+    """
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < height * width
+    channel = tl.arange(0, layout.CHANNELS)[None, :]
+    rows, columns = height + 2 * margin, width + 2 * margin
+    x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    shape: tl.constexpr = [BLOCK, layout.CHANNELS]
+    total = tl.zeros(shape, tl.float32)
+    for k in range(0, count):
+        t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
+        i, a = between(x + t * along_x + u * wide, columns)
+        j, b = between(y + t * along_y + v * wide, rows)
+        across, down = shares(a, TAPS), shares(b, TAPS)
+        for m in tl.static_range(TAPS):
+            for n in tl.static_range(TAPS):
+                at = neighbour(j, m, rows, TAPS) * columns + neighbour(i, n, columns, TAPS)
+                part = (down[m] * across[n])[:, None]
+                total += part * tl.load(image + at[:, None] * layout.CHANNELS + channel)
+    here = light + pixel[:, None] * layout.CHANNELS + channel
+    tl.store(here, total * share, mask=inside[:, None])
+
+
+@triton.jit(do_not_specialize=["height", "width", "margin", "count"])
+def return_light(
+    light,
+    offset,
+    sweep,
+    radius,
+    samples,
+    scale,
+    sums,
+    height,
+    width,
+    margin,
+    count,
+    TAPS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The transpose of `gather_light`: adds ``light`` times ``scale`` to ``sums``, which are int64."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < height * width
+    channel = tl.arange(0, layout.CHANNELS)[None, :]
+    rows, columns = height + 2 * margin, width + 2 * margin
+    x, y, along_x, along_y, wide = look(pixel, inside, offset, sweep, radius, height, width, margin)
+    coloured = inside[:, None] & (channel < 3)
+    seen = tl.load(light + pixel[:, None] * layout.CHANNELS + channel, mask=coloured, other=0.0)
+    seen *= tl.load(scale)
+    for k in range(0, count):
+        t, u, v = tl.load(samples + 3 * k), tl.load(samples + 3 * k + 1), tl.load(samples + 3 * k + 2)
+        i, a = between(x + t * along_x + u * wide, columns)
+        j, b = between(y + t * along_y + v * wide, rows)
+        across, down = shares(a, TAPS), shares(b, TAPS)
+        for m in tl.static_range(TAPS):
+            for n in tl.static_range(TAPS):
+                at = neighbour(j, m, rows, TAPS) * columns + neighbour(i, n, columns, TAPS)
+                units = (seen * (down[m] * across[n])[:, None]).to(tl.int64)
+                tl.atomic_add(
+                    sums + at[:, None] * layout.CHANNELS + channel, units, mask=coloured, sem="relaxed"
+                )
+
+
+@triton.jit(do_not_specialize=["pixels"])
+def follow_curve(image, curve, out, slope, pixels, FROM: tl.constexpr, TO: tl.constexpr, BLOCK: tl.constexpr):
+    """The colours of images [pixels, FROM or TO] through a curve, and its slope there [pixels, 3]."""
+    pixel = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
+    channel = tl.arange(0, layout.CHANNELS)[None, :]
+    coloured = (pixel < pixels) & (channel < 3)
+    place = tl.load(image + pixel * FROM + channel, mask=coloured, other=0.0) * layout.CURVE_DENSITY
+    index = tl.minimum(tl.maximum(place, 0.0), layout.CURVE_STEPS - 1).to(tl.int32)
+    low = tl.load(curve + index)
+    rise = tl.load(curve + index + 1) - low
+    value = low + (place - index.to(tl.float32)) * rise
+    tl.store(slope + pixel * 3 + channel, rise * layout.CURVE_DENSITY, mask=coloured)
+    padded = tl.where(channel < 3, value, 0.0)
+    tl.store(out + pixel * TO + channel, padded, mask=(pixel < pixels) & (channel < TO))
+
+
+@memory_errors()
+def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) -> DisplacementFields:
+    """See ``cleargs.formation.warp.displacement_fields``; ``motion`` [25] lies on the CPU."""
+    height, width = (side - 2 * margin for side in depth.shape)
+    offset, sweep = depth.new_empty(2, height, width), depth.new_empty(2, height, width)
+    radius = depth.new_empty(height, width)
+    displace[(_blocks(radius),)](
+        depth.contiguous(),
+        alpha.contiguous(),
+        motion.to(depth.device, non_blocking=True),  # read before the call returns
+        offset,
+        sweep,
+        radius,
+        height,
+        width,
+        margin,
+        BLOCK=BLOCK,
+        num_warps=4,
+    )
+    return DisplacementFields(offset, sweep, radius)
+
+
+@memory_errors()
+def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
+    """See ``cleargs.formation.warp.Warp.forward``."""
+    height, width = fields.radius.shape
+    light = image.new_empty(height, width, CHANNELS)
+    gather_light[(_blocks(fields.radius),)](
+        image.contiguous(),
+        *fields[:3],
+        samples,
+        light,
+        height,
+        width,
+        margin,
+        len(samples),
+        1.0 / len(samples),
+        TAPS=_taps(samples),
+        BLOCK=BLOCK,
+        num_warps=4,
+    )
+    return light
+
+
+@memory_errors()
+def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
+    """See ``cleargs.formation.warp.Warp.transpose``."""
+    height, width = fields.radius.shape
+    brightest = light.abs().amax().clamp(min=LEAST_LIGHT)
+    # The power of two above it, so that scaling rounds nothing; NaN, and with it all, if it is not finite.
+    bound = brightest / torch.frexp(brightest).mantissa
+    bits = SUM_BITS - (height * width - 1).bit_length()
+    sums = torch.zeros(
+        height + 2 * margin, width + 2 * margin, CHANNELS, dtype=torch.int64, device=light.device
+    )
+    return_light[(_blocks(fields.radius),)](
+        light.contiguous(),
+        *fields[:3],
+        samples,
+        2.0**bits / len(samples) / bound,
+        sums,
+        height,
+        width,
+        margin,
+        len(samples),
+        TAPS=_taps(samples),
+        BLOCK=BLOCK,
+        num_warps=4,
+    )
+    return sums.float().mul_(bound * 2.0**-bits)
+
+
+def _taps(samples: Tensor) -> int:
+    """Pixels that have a share of a place, along an axis."""
+    return 4 if len(samples) == 1 else 2
+
+
+def _blocks(plane: Tensor) -> int:
+    return -(-plane.numel() // BLOCK)
+
+
+@memory_errors()
+def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]:
+    """See ``cleargs.formation.warp.through_curve``."""
+    height, width, stored = image.shape
+    out, slope = image.new_empty(height, width, channels), image.new_empty(height, width, 3)
+    follow_curve[(_blocks(image[..., 0]),)](
+        image.contiguous(),
+        curve,
+        out,
+        slope,
+        height * width,
+        FROM=stored,
+        TO=channels,
+        BLOCK=BLOCK,
+        num_warps=4,
+    )
+    return out, slope
+
+
+def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
+    """See ``cleargs.formation.warp.times_slope``."""
+    return torch.nn.functional.pad(light[..., :3] * slope, (0, channels - 3))

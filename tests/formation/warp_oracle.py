@@ -1,0 +1,76 @@
+"""What a frame's warp should give, in float64, and motions and fields to try it on."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from photographs import MEDIAN, twist
+from torch import Tensor
+
+from cleargs.formation.motion import FrameMotion
+from cleargs.formation.warp import padded
+from cleargs.splat.kernels.warp_layout import DisplacementFields
+
+ALL = FrameMotion(
+    blur=twist(2, 1, -1, 4, 9, 2),
+    skew=twist(1, 0, 2, 3, 5, -2),
+    pose=twist(0, 1, 0, -2, 1, 0),
+    disc_px=3.0,
+    focus=1.4,
+    median_depth=MEDIAN,
+)
+
+ROLLED = FrameMotion(skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
+
+
+def tent(distance: Tensor) -> Tensor:
+    """Linear interpolation's share of a pixel at a distance."""
+    return (1 - distance.abs()).clamp(min=0)
+
+
+def keys(distance: Tensor) -> Tensor:
+    """The share that cubic convolution gives a pixel at a distance, as Keys (1981) writes it for a = -1/2."""
+    d = distance.abs()
+    near, far = 1.5 * d**3 - 2.5 * d**2 + 1, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2
+    return torch.where(d <= 1, near, torch.where(d < 2, far, torch.zeros_like(d)))
+
+
+def oracle(image: Tensor, fields: DisplacementFields, margin: int, points: Tensor) -> Tensor:
+    """What `Warp.forward` should give, in float64 torch with autograd: a mean of looks-up between pixels."""
+    pixels = image.detach().double().cpu().requires_grad_()
+    rows, columns = image.shape[:2]
+    height, width = fields.radius.shape
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    total = torch.zeros(height, width, image.shape[2], dtype=torch.float64)
+    offset, sweep, radius = (field.double().cpu() for field in fields[:3])
+    for t, u, v in points.double().cpu():
+        at_x = (x + margin + offset[0] + t * sweep[0] + u * radius).clamp(0, columns - 1)
+        at_y = (y + margin + offset[1] + t * sweep[1] + v * radius).clamp(0, rows - 1)
+        i, j = (
+            at_x.floor().clamp(max=max(columns - 2, 0)).long(),
+            at_y.floor().clamp(max=max(rows - 2, 0)).long(),
+        )
+        between = keys if len(points) == 1 else tent
+        for m in range(-1, 3):
+            for n in range(-1, 3):
+                share = between(at_y - j - m) * between(at_x - i - n)
+                pixel = pixels[(j + m).clamp(0, rows - 1), (i + n).clamp(0, columns - 1)]
+                total = total + share[..., None] * pixel
+    total = total / len(points)
+    total.image = pixels  # type: ignore[attr-defined]
+    return total
+
+
+def random_image(rows: int, columns: int) -> Tensor:
+    return torch.from_numpy(padded(np.random.default_rng(1).random((rows, columns, 3)).astype(np.float32)))
+
+
+def constant_fields(height: int, width: int, dx: float, dy: float, radius: float = 0.0) -> DisplacementFields:
+    sweep = torch.empty(2, height, width)
+    sweep[0], sweep[1] = dx, dy
+    return DisplacementFields(torch.zeros_like(sweep), sweep, torch.full((height, width), radius))
+
+
+def dot(a: Tensor, b: Tensor) -> float:
+    """The scalar product, in float64."""
+    return float((a.double() * b.double()).sum())
