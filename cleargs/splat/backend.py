@@ -97,6 +97,7 @@ class Backend(Protocol):
         gaussians: Gaussians,
         moments: Moments,
         *,
+        errors: Tensor | None,
         rate: float,
         budget: int,
         min_opacity: float,

@@ -195,6 +195,8 @@ class Trainer:
         image = render.image if formed is None else formed.forward(render)
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
+        if config.densify and self._strategy.wants_errors(self._gaussians, self.done + 1):
+            self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
         if config.densify:
             self._strategy.observe(self._engine, view.camera if formed is None else formed.camera)
@@ -316,6 +318,19 @@ class Trainer:
         )
         self._note(self.done, loss.loss, loss.l1, loss.ssim, psnr(image, target, mask))
         return loss.grad_image
+
+    def _shares_of_error(
+        self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float, formed: Formed | None
+    ) -> Tensor:
+        """What each Gaussian contributes to the squared error of a frame, [N] >= 0.
+
+        A Gaussian's share in a pixel is the pixel's derivative by its colour: the backward pass adds them up.
+        """
+        error = (image - target).square_().mul_(weight)
+        if mask is not None:
+            error *= mask[..., None]
+        shares = self._engine.backward(error if formed is None else formed.backward(error))
+        return shares.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 
     def _read_meter(self) -> None:
         """Bring the log up to date. Waits for the GPU."""

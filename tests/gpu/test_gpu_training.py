@@ -187,11 +187,31 @@ def test_relocation_moves_the_dead_and_keeps_the_sum_of_opacity_plausible(device
 def test_growth_stops_at_the_budget(device, densify):
     gaussians = crowd(40, device)
     moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
-    grown, reset_moments = densify.grow(gaussians, moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    grown, reset_moments = densify.grow(
+        gaussians, moments, errors=None, rate=0.5, budget=55, min_opacity=0.005, seed=1
+    )
     assert grown.num == 55
     assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in reset_moments[0].values())
-    same, _ = densify.grow(grown, reset_moments, rate=0.5, budget=55, min_opacity=0.005, seed=1)
+    same, _ = densify.grow(grown, reset_moments, errors=None, rate=0.5, budget=55, min_opacity=0.005, seed=1)
     assert same is grown
+
+
+def test_what_is_cut_is_cut_as_on_the_cpu(device, densify):
+    gaussians = crowd(40, device)
+    errors = torch.zeros(40, device=device)
+    errors[[20, 33]] = 2.0
+    arrays = {name: tensor.cpu().numpy().copy() for name, tensor in gaussians.tensors().items()}
+    settings = {"rate": 0.5, "budget": 100, "min_opacity": 0.005}
+    grown, _ = densify.grow(gaussians, [], errors=errors, seed=1, **settings)
+    expected, _ = mcmc.grow(
+        arrays, [], errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
+    )
+    order = np.argsort(grown.means[:, 0].cpu().numpy()), np.argsort(expected["means"][:, 0])
+    for name, tensor in grown.tensors().items():
+        # float32 on both sides, but for the opacities.
+        np.testing.assert_allclose(
+            tensor.cpu().numpy()[order[0]], expected[name][order[1]], rtol=1e-5, atol=1e-6
+        )
 
 
 def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):

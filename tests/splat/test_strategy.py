@@ -87,12 +87,63 @@ def test_growth_stops_at_the_budget(budget: int, expected: int) -> None:
     made = arrays(100, np.random.default_rng(0))
     moments = [{name: np.ones_like(array) for name, array in made.items()}]
     grown, reset_moments = grow(
-        made, moments, rate=0.05, budget=budget, min_opacity=OPEN, rng=np.random.default_rng(1)
+        made, moments, errors=None, rate=0.05, budget=budget, min_opacity=OPEN, rng=np.random.default_rng(1)
     )
     assert {len(array) for array in grown.values()} == {expected}
     assert {len(array) for array in reset_moments[0].values()} == {expected}
     assert (reset_moments[0]["sh"][100:] == 0).all()
     assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in grown.values())
+
+
+def test_growth_cuts_what_takes_part_in_errors() -> None:
+    made = arrays(100, np.random.default_rng(0))
+    made["logit_opacities"][7] = -9.0  # dead: its error is nobody's
+    before = {name: array.copy() for name, array in made.items()}
+    moments = [{name: np.ones_like(array) for name, array in made.items()}]
+    errors = np.zeros(100)
+    errors[[3, 7, 20]] = 1.0
+    grown, (running,) = grow(
+        made,
+        moments,
+        errors=errors,
+        rate=0.05,
+        budget=1000,
+        min_opacity=OPEN,
+        rng=np.random.default_rng(1),
+    )
+    assert len(grown["means"]) == 102
+    touched = [3, 20]
+    same = np.setdiff1d(np.arange(100), touched)
+    for name, array in grown.items():
+        assert np.array_equal(array[same], before[name][same]), name
+        assert (running[name][same] == 1).all() and not running[name][[*touched, 100, 101]].any(), name
+    assert np.array_equal(np.sort(grown["sh"][100:], axis=0), np.sort(before["sh"][touched], axis=0))
+
+
+@given(opacity=st.floats(0.02, 0.99), seed=st.integers(0, 99))
+def test_two_halves_look_like_the_whole(opacity: float, seed: int) -> None:
+    made = arrays(1, np.random.default_rng(seed))
+    made["logit_opacities"][0] = np.log(opacity / (1 - opacity))
+    whole = {name: array[0].astype(np.float64) for name, array in made.items()}
+    grown, _ = grow(
+        made, [], errors=np.ones(1), rate=1.0, budget=2, min_opacity=OPEN, rng=np.random.default_rng(1)
+    )
+    # They lie on either side of it, along its longest axis.
+    np.testing.assert_allclose(grown["means"].mean(axis=0), whole["means"], atol=1e-6)
+    longest = whole["log_scales"].argmax()
+    axis = rotation_matrices(whole["rotations"][None].astype(np.float32))[0][:, longest]
+    apart = grown["means"][1] - grown["means"][0]
+    assert abs(apart @ axis) == pytest.approx(np.linalg.norm(apart), rel=1e-4)
+    # Along that axis, in units of its scale: mass and spread of the optical depth stay, within 5 %.
+    x = np.linspace(-6, 6, 2001)
+    place = np.linalg.norm(apart) / 2 / np.exp(whole["log_scales"][longest])
+    scales = np.exp(grown["log_scales"][:, longest] - whole["log_scales"][longest])
+    assert scales[0] == scales[1] and grown["logit_opacities"][0] == grown["logit_opacities"][1]
+    depth = -np.log1p(-sigmoid(np.float64(grown["logit_opacities"][0])))
+    halves = sum(depth * np.exp(-(((x - at) / scales[0]) ** 2) / 2) for at in (-place, place))
+    one = -np.log1p(-opacity) * np.exp(-(x**2) / 2)
+    assert halves.sum() == pytest.approx(one.sum(), rel=0.05)
+    assert (halves * x**2).sum() == pytest.approx((one * x**2).sum(), rel=0.05)
 
 
 def test_samples_follow_the_weights() -> None:

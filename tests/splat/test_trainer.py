@@ -154,6 +154,53 @@ def test_masked_pixels_contribute_nothing(pictures: list[np.ndarray], tmp_path: 
     assert_same(*results)
 
 
+LOOKING = CONFIG.model_copy(update={"refine_every": 16 / 40})
+"""Refined after 16 and 32 steps; the errors of the two steps before count."""
+
+
+def looking(scene: Scene, pictures: list[np.ndarray]) -> Trainer:
+    trainer = Trainer(scene, views(pictures), LOOKING, seed=(1,))
+    while trainer.done < 15:
+        trainer.step()
+    return trainer
+
+
+def test_an_error_is_charged_to_the_gaussians_that_take_part_in_it(pictures: list[np.ndarray]) -> None:
+    """Where growth looks: one Gaussian of the truth has the wrong colour, and no rate to change it."""
+    wrong = gaussians()
+    still = LOOKING.model_copy(
+        update={f"lr_{name}": 0.0 for name in ("means", "scales", "rotations", "opacities", "sh")}
+    )
+
+    def charged(scene: Gaussians) -> np.ndarray:
+        trainer = Trainer(Scene(scene), views(pictures), still, seed=(1,))
+        while trainer.done < 15:
+            trainer.step()
+        return trainer.state()["strategy.errors"].numpy()
+
+    hidden = charged(gaussians())
+    shown = int(hidden.argmax())
+    wrong.sh[shown] *= -1.0
+    errors = charged(wrong)
+    assert errors.argmax() == shown
+    # What is left in the truth is that pictures are stored in whole steps of 1/255.
+    assert hidden.sum() < 0.01 * errors.sum()
+
+
+def test_resumed_amid_looks_equals_undisturbed(pictures: list[np.ndarray]) -> None:
+    whole = looking(start(), pictures)
+    saved = {name: tensor.clone() for name, tensor in whole.state().items()}
+    assert "strategy.errors" in saved
+    resumed = Trainer(start(), views(pictures), LOOKING, seed=(1,))
+    resumed.restore(saved)
+    for trainer in (whole, resumed):
+        while trainer.done < 20:
+            trainer.step()
+    assert whole.scene.gaussians.num > start().gaussians.num
+    for name, tensor in whole.scene.gaussians.tensors().items():
+        assert torch.equal(tensor, resumed.scene.gaussians.tensors()[name]), name
+
+
 def test_resumed_equals_undisturbed(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

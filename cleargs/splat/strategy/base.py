@@ -24,6 +24,17 @@ class Strategy:
     def observe(self, engine: Engine, camera: Camera) -> None:
         """Called after every backward pass: ``engine`` knows the radii and gradients on the screen."""
 
+    def wants_errors(self, gaussians: Gaussians, step: int) -> bool:
+        """Whether `add_errors` is to be called in this step, which costs it another backward pass."""
+        return False
+
+    def add_errors(self, errors: Tensor) -> None:
+        """What each Gaussian contributes to squared errors of this step's frame: [N], at least 0.
+
+        The sum over the pixels of the squared difference (times the frame's weight) times the Gaussian's
+        share in the pixel.
+        """
+
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
         """Called every ``refine_interval`` steps between ``refine_start`` and ``refine_stop``.
 

@@ -1,7 +1,11 @@
 """Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
-As gsplat's MCMCStrategy does it: dead Gaussians move onto live ones, the number grows to a hard budget, and
-noise that only transparent Gaussians feel is added to the means.
+As gsplat's MCMCStrategy does it, dead Gaussians move onto live ones, the number grows to a hard budget, and
+noise that only transparent Gaussians feel is added to the means. But growth follows the error: what takes
+part in pixels that are far from their frames (Rota Bulò et al., "Revising densification in Gaussian
+splatting", 2024) is cut in two along its longest axis (Deng et al., "Efficient density control", 2024). Drawn
+by opacity, copies at one place take long to part, and what lies in the dark or behind the sparse points gets
+none.
 
 Relocation and growth are pure functions on numpy arrays: one thread, so the results depend on no thread
 count. The noise, of every step, is a kernel. A GPU has the same rules, and draws other random numbers.
@@ -21,6 +25,8 @@ from cleargs.splat.backend import backend_for
 from cleargs.splat.strategy.base import Strategy
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from cleargs.splat.adam import Moments
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.gaussians import Gaussians
@@ -36,19 +42,46 @@ NOISE_CUT = 0.15
 """Opacity above which the noise factor is under 1e-6, and is left out."""
 
 
+LOOKS = 5
+"""Steps before a refinement whose errors say what is to grow, one frame each. Where refinements follow each
+other within eight times as many steps there are fewer, since each costs a backward pass."""
+
+PART = 0.7
+"""How far the halves of a Gaussian lie from its middle, and their scale, as shares of its scale along its
+longest axis: together they spread about as far (0.7² + 0.7² = 0.98)."""
+
+
 class MCMC(Strategy):
-    """See the module. It remembers nothing from step to step."""
+    """See the module. It remembers the errors since the last refinement."""
 
     def __init__(self, config: TrainConfig, budget: int, seed: Sequence[int]) -> None:
         self._config = config
         self._budget = budget
         self._seed = tuple(seed)
+        self._errors: Tensor | None = None  # [N]
+
+    def wants_errors(self, gaussians: Gaussians, step: int) -> bool:
+        """In the last steps up to a refinement at which there is room to grow."""
+        config = self._config
+        interval = config.refine_interval
+        refined = -(-step // interval) * interval
+        return (
+            gaussians.num < self._budget
+            and refined - step < min(LOOKS, max(1, interval // 8))
+            and config.refine_start * config.length <= refined <= config.refine_stop * config.length
+        )
+
+    def add_errors(self, errors: Tensor) -> None:
+        """Summed over the steps."""
+        self._errors = errors.clone() if self._errors is None else self._errors + errors
 
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
         """Relocate the dead and grow."""
+        errors, self._errors = self._errors, None
         return backend_for(gaussians.device).relocate_and_grow(
             gaussians,
             moments,
+            errors=errors,
             rate=self._config.growth,
             budget=self._budget,
             min_opacity=self._config.min_opacity,
@@ -65,6 +98,14 @@ class MCMC(Strategy):
                 min_opacity=config.min_opacity,
                 seed=(*self._seed, Stream.POSITION_NOISE, step),
             )
+
+    def state(self) -> dict[str, Tensor]:
+        """The errors since the last refinement."""
+        return {} if self._errors is None else {"errors": self._errors}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Resume from what `state` gave."""
+        self._errors = state.get("errors")
 
 
 def sample(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -119,28 +160,31 @@ def grow(
     arrays: Arrays,
     moments: Sequence[Arrays],
     *,
+    errors: F64 | None,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
     rng: np.random.Generator,
 ) -> tuple[Arrays, list[Arrays]]:
-    """Add copies, drawn by opacity: at most a share ``rate``, never beyond ``budget``.
+    """Cut Gaussians in two, drawn in proportion to ``errors`` (None: to their opacities): at most a share
+    ``rate``, never beyond ``budget``.
 
     Returns new arrays and moments. ``arrays`` and ``moments`` as in `relocate`; those given are changed and
-    must not be used again.
+    must not be used again. The moments of both halves are 0.
     """
-    count = len(arrays["logit_opacities"])
-    extra = min(budget, int((1.0 + rate) * count)) - count
+    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
+    weights = np.where(opacity > min_opacity, opacity if errors is None else errors, 0.0)
+    count = len(opacity)
+    extra = min(min(budget, int((1.0 + rate) * count)) - count, int((weights > 0.0).sum()))
     if extra <= 0:
         return arrays, list(moments)
-    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
-    sources = sample(opacity, extra, rng)
-    changed = _split(arrays, sources, min_opacity)
-    grown = {name: np.concatenate([array, array[sources]]) for name, array in arrays.items()}
+    cut = sample_once(weights, extra, rng)
+    others = _halves(arrays, cut, opacity[cut], min_opacity)
+    grown = {name: np.concatenate([array, others[name]]) for name, array in arrays.items()}
     reset_moments = []
     for moment in moments:
         for array in moment.values():
-            array[changed] = 0
+            array[cut] = 0
         reset_moments.append(
             {
                 name: np.concatenate([array, np.zeros((extra, *array.shape[1:]), array.dtype)])
@@ -148,6 +192,34 @@ def grow(
             }
         )
     return grown, reset_moments
+
+
+def sample_once(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """``count`` different indices, in proportion to ``weights`` [N] >= 0, of which as many are above 0.
+
+    Efraimidis and Spirakis, "Weighted random sampling with a reservoir" (2006).
+    """
+    with np.errstate(divide="ignore"):
+        keys = rng.standard_exponential(len(weights)) / weights
+    first: NDArray[np.int64] = np.argsort(keys, kind="stable")[:count]
+    return first
+
+
+def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: F64, min_opacity: float) -> Arrays:
+    """Make the Gaussians ``cut`` one of their halves, in place, and return the other ones.
+
+    The opacity is such that the optical depth, summed along the axis, stays.
+    """
+    longest = arrays["log_scales"][cut].argmax(axis=1)
+    axes = rotation_matrices(arrays["rotations"][cut])[np.arange(len(cut)), :, longest]
+    away = axes * (PART * np.exp(arrays["log_scales"][cut, longest]))[:, None]
+    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / PART), min_opacity, 1.0 - 1e-6)
+    arrays["log_scales"][cut, longest] += np.float32(math.log(PART))
+    arrays["logit_opacities"][cut] = np.log(faint) - np.log1p(-faint)
+    others = {name: array[cut] for name, array in arrays.items()}
+    arrays["means"][cut] -= away
+    others["means"] += away
+    return others
 
 
 def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> NDArray[np.int64]:

@@ -153,6 +153,7 @@ def relocate_and_grow(
     gaussians: Gaussians,
     moments: Moments,
     *,
+    errors: Tensor | None,
     rate: float,
     budget: int,
     min_opacity: float,
@@ -164,7 +165,10 @@ def relocate_and_grow(
         {name: tensor.numpy() for name, tensor in group.items()} for group in (moments.first, moments.second)
     ]
     mcmc.relocate(arrays, running, min_opacity=min_opacity, rng=rng)
-    arrays, running = mcmc.grow(arrays, running, rate=rate, budget=budget, min_opacity=min_opacity, rng=rng)
+    weights = None if errors is None else errors.double().numpy()
+    arrays, running = mcmc.grow(
+        arrays, running, errors=weights, rate=rate, budget=budget, min_opacity=min_opacity, rng=rng
+    )
     grown, first, second = (
         {name: torch.from_numpy(array) for name, array in group.items()} for group in (arrays, *running)
     )

@@ -88,6 +88,7 @@ def relocate_and_grow(
     gaussians: Gaussians,
     moments: Moments,
     *,
+    errors: Tensor | None,
     rate: float,
     budget: int,
     min_opacity: float,
@@ -97,7 +98,13 @@ def relocate_and_grow(
     seeds = [densify.seed_of(*seed, part) for part in (0, 1)]
     densify.relocate(gaussians, running, min_opacity=min_opacity, seed=seeds[0])
     gaussians, running = densify.grow(
-        gaussians, running, rate=rate, budget=budget, min_opacity=min_opacity, seed=seeds[1]
+        gaussians,
+        running,
+        errors=errors,
+        rate=rate,
+        budget=budget,
+        min_opacity=min_opacity,
+        seed=seeds[1],
     )
     return gaussians, Moments(*running)
 

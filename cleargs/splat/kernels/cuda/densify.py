@@ -96,29 +96,32 @@ def grow(
     gaussians: Gaussians,
     moments: Sequence[dict[str, Tensor]],
     *,
+    errors: Tensor | None,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
     seed: int,
 ) -> tuple[Gaussians, list[dict[str, Tensor]]]:
-    """Add copies, drawn by opacity: at most a share ``rate``, never beyond ``budget``.
+    """Cut Gaussians in two, drawn in proportion to ``errors`` (None: to their opacities): at most a share
+    ``rate``, never beyond ``budget``.
 
     Returns new Gaussians and moments; those given are changed and must not be used again.
     """
+    opacity = gaussians.logit_opacities.double().sigmoid()
+    weights = torch.where(opacity > min_opacity, opacity if errors is None else errors.double(), 0.0)
     count = gaussians.num
-    extra = min(budget, int((1.0 + rate) * count)) - count
+    extra = min(min(budget, int((1.0 + rate) * count)) - count, int((weights > 0.0).sum()))
     if extra <= 0:
         return gaussians, list(moments)
-    opacity = gaussians.logit_opacities.double().sigmoid()
-    sources = sample(opacity, extra, generator_of(seed, gaussians.device))
-    changed = _split(gaussians, sources, min_opacity)
+    cut = sample_once(weights, extra, generator_of(seed, gaussians.device))
+    others = _halves(gaussians, cut, opacity[cut], min_opacity)
     grown = Gaussians(
-        **{name: torch.cat([tensor, tensor[sources]]) for name, tensor in gaussians.tensors().items()}
+        **{name: torch.cat([tensor, others[name]]) for name, tensor in gaussians.tensors().items()}
     )
     reset_moments = []
     for moment in moments:
         for tensor in moment.values():
-            tensor[changed] = 0
+            tensor[cut] = 0
         reset_moments.append(
             {
                 name: torch.cat([tensor, tensor.new_zeros(extra, *tensor.shape[1:])])
@@ -126,6 +129,35 @@ def grow(
             }
         )
     return grown, reset_moments
+
+
+def sample_once(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """``mcmc.sample_once`` of float64 ``weights`` [N]."""
+    draws = torch.rand(len(weights), generator=generator, dtype=torch.float64, device=weights.device)
+    return torch.sort(-torch.log1p(-draws) / weights, stable=True).indices[:count]
+
+
+def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: float) -> dict[str, Tensor]:
+    """``mcmc._halves``: make the Gaussians ``cut`` one of their halves, and return the other ones."""
+    rows = torch.arange(len(cut), device=cut.device)
+    longest = gaussians.log_scales[cut].argmax(dim=1)
+    w, x, y, z = torch.nn.functional.normalize(gaussians.rotations[cut], dim=1).unbind(1)
+    columns = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=1),
+            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=1),
+            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1),
+        ],
+        dim=1,
+    )
+    away = columns[rows, longest] * (mcmc.PART * gaussians.log_scales[cut, longest].exp())[:, None]
+    faint = (1.0 - (1.0 - opacity) ** (0.5 / mcmc.PART)).clamp(min_opacity, 1.0 - 1e-6)
+    gaussians.log_scales[cut, longest] += math.log(mcmc.PART)
+    gaussians.logit_opacities[cut] = (faint.log() - torch.log1p(-faint)).float()
+    others = {name: tensor[cut] for name, tensor in gaussians.tensors().items()}
+    gaussians.means[cut] -= away
+    others["means"] += away
+    return others
 
 
 def _split(gaussians: Gaussians, sources: Tensor, min_opacity: float) -> Tensor:
