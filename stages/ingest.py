@@ -10,7 +10,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
 
-VERSION = 4
+VERSION = 5
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
@@ -64,6 +64,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
+    from cleargs.capture.sharpest import sharpest
     from cleargs.capture.sources import open_capture
     from cleargs.media.image import read_rgb
 
@@ -78,7 +79,9 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
             "highlights compressed; record in SDR where colours must be exact"
         )
-    frames = prepare(capture, work, max(config.feature_size, config.max_size), reporter)
+    long_side = max(config.feature_size, config.max_size)
+    capture = sharpest(capture, work, long_side, reporter)
+    frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(

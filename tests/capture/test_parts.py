@@ -15,11 +15,12 @@ from pydantic import ValidationError
 
 from cleargs.capture.cameras import Camera, Pose, pinhole
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.holdout import held_out, holdout_hash, sharpness
+from cleargs.capture.holdout import held_out, holdout_hash
 from cleargs.capture.layout import externals
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
 from cleargs.capture.sfm_worker import apply_exif_focal
+from cleargs.capture.sharpest import sharpness
 from cleargs.capture.sources import choose_times, frame_key, natural_key, open_capture, spread
 from cleargs.capture.transforms import read_transforms
 from cleargs.capture.undistort import undistorter
