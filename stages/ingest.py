@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         lambda index: read_rgb(work / "images" / frames[index].image),
         [frame.image in registered for frame in frames],
     )
-    model = publish(frames, scene.model, test, work, context.out, config.max_size, reporter)
+    model = publish(frames, scene.model, scene.placed, test, work, context.out, config.max_size, reporter)
     return StageResult(
         summary={
             "kind": capture.kind,
@@ -99,6 +100,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),
+            "placed": dict(Counter(scene.placed[frame.image] for frame in frames)),
             "test": len(test),
             "holdout_hash": holdout_hash(config.holdout, (frames[index].source.name for index in test)),
             "points": len(model.point_ids),
