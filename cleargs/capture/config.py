@@ -27,7 +27,7 @@ class IngestConfig(BaseModel):
     max_frames: int = Field(
         150,
         ge=3,
-        description="most frames to take; of a video the sharpest of as many equal stretches of time",
+        description="most frames to take, evenly; of a video, the sharpest nearby",
     )
     max_size: int = Field(
         960,
