@@ -29,10 +29,16 @@ def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:
 def read_table(path: Path, schema: pa.Schema) -> pa.Table:
     """Read a table written by `write_table`; columns of ``schema`` in its order.
 
-    Raises StoreError when the file is missing, damaged, or lacks a column.
+    A nullable column that the file of an older version lacks is null. Raises StoreError when the file is
+    missing, damaged, or lacks another column.
     """
     try:
-        return pq.read_table(path, columns=schema.names).cast(schema)
+        there = pq.read_schema(path).names
+        newer = [field for field in schema if field.nullable and field.name not in there]
+        table = pq.read_table(path, columns=[name for name in schema.names if name in there])
+        for field in newer:
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+        return table.select(schema.names).cast(schema)
     except (OSError, pa.ArrowException, ValueError, KeyError) as error:
         raise StoreError(
             f"cannot read the table {path.name}: {str(error).splitlines()[0]}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
 
-VERSION = 4
+VERSION = 5
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
@@ -64,6 +65,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
+    from cleargs.capture.sharpest import sharpest
     from cleargs.capture.sources import open_capture
     from cleargs.media.image import read_rgb
 
@@ -78,7 +80,9 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
             "highlights compressed; record in SDR where colours must be exact"
         )
-    frames = prepare(capture, work, max(config.feature_size, config.max_size), reporter)
+    long_side = max(config.feature_size, config.max_size)
+    capture = sharpest(capture, work, long_side, reporter)
+    frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
     registered = {image.name for image in scene.model.images.values()}
     test = held_out(
@@ -87,7 +91,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         lambda index: read_rgb(work / "images" / frames[index].image),
         [frame.image in registered for frame in frames],
     )
-    model = publish(frames, scene.model, test, work, context.out, config.max_size, reporter)
+    model = publish(frames, scene.model, scene.placed, test, work, context.out, config.max_size, reporter)
     return StageResult(
         summary={
             "kind": capture.kind,
@@ -96,6 +100,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),
+            "placed": dict(Counter(scene.placed[frame.image] for frame in frames)),
             "test": len(test),
             "holdout_hash": holdout_hash(config.holdout, (frames[index].source.name for index in test)),
             "points": len(model.point_ids),

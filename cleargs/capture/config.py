@@ -21,9 +21,14 @@ class IngestConfig(BaseModel):
         None,
         gt=0,
         le=1000,
-        description="frames per second to take from a video; unset: max_frames alone decides",
+        description="frames per second to take from a video, each the sharpest nearby; unset: max_frames "
+        "alone decides",
     )
-    max_frames: int = Field(150, ge=3, description="most frames to take, evenly in time")
+    max_frames: int = Field(
+        150,
+        ge=3,
+        description="most frames to take, evenly; of a video, the sharpest nearby",
+    )
     max_size: int = Field(
         960,
         ge=64,

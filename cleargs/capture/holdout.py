@@ -8,13 +8,11 @@ from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.sharpest import sharpness
 from cleargs.errors import InputError
-
-_BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
 def held_out(
@@ -49,21 +47,6 @@ def held_out(
 def holdout_hash(rule: str, names: Iterable[str]) -> str:
     """SHA-256 over the rule and the sorted names of the test frames: equal for equal splits by one rule."""
     return hashlib.sha256(json.dumps([rule, sorted(names)]).encode()).hexdigest()
-
-
-def sharpness(rgb: NDArray[np.uint8]) -> float:  # [H, W, 3]
-    """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
-
-    It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
-    rank noise first: of a frame and its blurred copy with noise of 4 levels, it takes the copy more often
-    than not. All values are whole numbers below 2^24, so the sums are exact.
-    """
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    smooth = cv2.sepFilter2D(grey, cv2.CV_32F, _BINOMIAL, _BINOMIAL)
-    laplacian = np.asarray(cv2.Laplacian(smooth, cv2.CV_32F)).astype(np.int64)
-    count = laplacian.size
-    # The filter's weights sum to 256.
-    return float(count * int((laplacian**2).sum()) - int(laplacian.sum()) ** 2) / count**2 / 256**2
 
 
 def _matching(item: str, names: Sequence[str]) -> list[int]:

@@ -84,7 +84,7 @@ def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = 
         return False
 
 
-def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W, 3]
+def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W] or [H, W, 3]
     """The image with a long side of at most ``long_side`` px, by area averaging."""
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:

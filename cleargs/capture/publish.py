@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +31,14 @@ class _View:
     camera: Camera
     image: ModelImage | None
     """Observations in pixels of the published image; None when unregistered."""
+    placed: str
+    """How the pose was found, or why there is none."""
 
 
 def publish(
     frames: Sequence[WorkFrame],
     model: SparseModel,
+    placed: Mapping[str, str],
     test: set[int],
     work: Path,
     out: Path,
@@ -44,6 +47,7 @@ def publish(
 ) -> SparseModel:
     """Write images, masks, the three tables and the COLMAP model of the undistorted capture into ``out``.
 
+    ``placed`` says of every working image how its pose was found, or why there is none.
     Points take their colour from train frames; a point that no train frame shows (or fewer than two frames in
     all, after undistortion cropped them) is left out. Returns the published model.
     """
@@ -76,7 +80,7 @@ def publish(
                     x, y = image.xy.astype(np.int64).T
                     sums[rows] += rgb[y, x]
                     samples[rows] += 1
-            views.append(_View(frame, undistortion.pinhole, image))
+            views.append(_View(frame, undistortion.pinhole, image, placed[frame.image]))
             task.advance()
     counts = _track_lengths(views, model.point_ids)
     kept = (counts >= 2) & (samples >= 1)
@@ -145,7 +149,7 @@ def _restricted(view: _View, point_ids: NDArray[np.int64]) -> _View:
     image = view.image
     keep = np.isin(image.point_ids, point_ids)
     kept = ModelImage(image.name, image.camera_id, image.pose, image.xy[keep], image.point_ids[keep])
-    return _View(view.frame, view.camera, kept)
+    return replace(view, image=kept)
 
 
 def _track_lengths(views: Sequence[_View], point_ids: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -213,6 +217,7 @@ def _frame_row(index: int, view: _View, split: str) -> dict[str, object]:
         "registered": view.image is not None,
         "n_points": 0 if view.image is None else len(view.image.point_ids),
         "split": split,
+        "placed": view.placed,
     }
     if view.image is not None:
         pose = view.image.pose

@@ -32,6 +32,9 @@ FARTHEST = 1e9
 GIVEN_POSES = "given_poses.json"
 """In the folder of the model: how far the input's poses missed, and whether they were refined."""
 
+PLACED = "placed.json"
+"""In the folder of the model: how SfM placed each working image, or why it did not."""
+
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
 
@@ -51,6 +54,8 @@ class Reconstruction:
     """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
     refined: bool
     """Whether they were adjusted."""
+    placed: dict[str, str]
+    """Working image -> how its pose was found, or why there is none."""
 
 
 def reconstruct(
@@ -73,7 +78,7 @@ def reconstruct(
         model = _run(_sfm_job(frames, config), folder, config, seed, threads, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity, None, refined=False)
+        return Reconstruction(_moved(model, similarity), similarity, None, False, _placed_by_sfm(folder))
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
     adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
@@ -84,7 +89,7 @@ def reconstruct(
     if adopted is not None and len(adopted.error):
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
-            return Reconstruction(adopted, similarity, missed, refined=False)
+            return Reconstruction(adopted, similarity, missed, False, _placed_by_input(frames, refined=False))
     poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
     model = _run(_triangulation_job(posed, poses), folder, config, seed, threads, reporter)
     if not len(model.point_ids):
@@ -106,7 +111,7 @@ def reconstruct(
         )
     if adopted is not None and len(adopted.error) and not refined:
         model = adopted
-    return Reconstruction(model, similarity, missed, refined)
+    return Reconstruction(model, similarity, missed, refined, _placed_by_input(frames, refined))
 
 
 def _check_registered(registered: int, total: int, config: IngestConfig, reporter: Reporter) -> None:
@@ -199,8 +204,7 @@ def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | 
     if model.exists():
         try:
             found = read_model(model)
-            if posed:
-                _what_became_of_poses(folder)
+            (_what_became_of_poses if posed else _placed_by_sfm)(folder)
             return found
         except InputError as error:
             reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
@@ -228,6 +232,19 @@ def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
         return float(said["missed_px"]), bool(said["refined"])
     except FAULTS as error:
         raise InputError(f"{GIVEN_POSES} cannot be read: {cause(error)}", hint="run ingest again") from error
+
+
+def _placed_by_sfm(folder: Path) -> dict[str, str]:
+    """What SfM says of each working image."""
+    try:
+        return {str(name): str(word) for name, word in read_json(folder / "model" / PLACED).items()}
+    except FAULTS as error:
+        raise InputError(f"{PLACED} cannot be read: {cause(error)}", hint="run ingest again") from error
+
+
+def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, str]:
+    found = "adjusted" if refined else "given"
+    return {frame.image: "no pose in the input" if frame.source.pose is None else found for frame in frames}
 
 
 def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:

@@ -1,7 +1,8 @@
 """The COLMAP side of ingest: ``python -m cleargs.capture.sfm_worker job.json``, run by `cleargs.capture.sfm`.
 
 Reads its job from JSON, works in ``job["folder"]`` and leaves a binary model in ``folder/model``. What a
-killed run left in the database (features, matches) is used again.
+killed run left in the database (features, matches) is used again. Frames that mapping leaves out are tried a
+second time at half resolution.
 
 Equal for any number of threads: ids are given in frame order before any thread starts, every random choice is
 seeded, and mapping and triangulation (whose least squares sum in thread order) run on one thread.
@@ -14,6 +15,7 @@ import filecmp
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,13 @@ from numpy.typing import NDArray
 from cleargs.capture.child import ChildChannel
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.capture.sfm_missing import copy_without_features, why_missing
 from cleargs.files import make_folder, sync, sync_tree
 
 _PAIRS_PER_BLOCK = 100
+_MIN_MODEL = 10
+"""COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
+third of its frames: eight of a dozen are a model."""
 _REFINEMENTS = 4
 _CONVINCING = 0.5
 """Adjusted poses are taken where features then miss their points by at most this share of before. What was
@@ -33,6 +39,25 @@ left on measured captures: 0.05 with random errors of poses, 0.34 and 0.41 with 
 and of a headset, but 0.77 with a rolling shutter and all with blur, which other poses do not explain."""
 _HELD_BY = 15
 """Fewest points that a frame must see to take part in an adjustment."""
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How features are found and matched, and when a frame counts as placed by them."""
+
+    reduced: int
+    """The images are reduced to one over this, if any is as large as the largest."""
+    contrast: float
+    inliers: int
+    """Fewest points of the model that must fit the pose of a frame."""
+    again: str = ""
+
+
+_FIRST = _Effort(reduced=1, contrast=0.02 / 3, inliers=30)
+"""COLMAP's defaults."""
+_SECOND = _Effort(reduced=2, contrast=0.002, inliers=15, again=" again")
+"""For frames with a blur of 24 px at 480: at half the size it is half as long, and what contrast it left is
+enough (docs/experiments/poses.md)."""
 
 
 def main() -> int:
@@ -43,7 +68,7 @@ def main() -> int:
     folder = Path(job["folder"])
     database = folder / "database.db"
     _import(job, database)
-    _extract(job, database, channel)
+    _extract(job, database, job["names"], _FIRST, channel)
     with pycolmap.Database.open(database) as opened:
         featureless = opened.num_keypoints() == 0
     if featureless:
@@ -59,11 +84,14 @@ def main() -> int:
             "the camera must move while it records; look whether the video froze",
         )
         return 3
-    _match(job, database, channel)
+    pairs = _pairs(job, database, channel)
+    _match(job, database, pairs, _FIRST, channel)
     partial = folder / "model.partial"
     make_folder(partial, empty=True)
     if job["poses"] is None:
         model = _map(job, database, partial, channel)
+        if model is not None:
+            model, placed = _place_the_rest(job, database, pairs, model, partial, channel)
     else:
         model = _triangulate(job, database, partial, channel)
         missed, refined = _median_error(model), False
@@ -79,7 +107,9 @@ def main() -> int:
         return 3
     make_folder(partial, empty=True)
     model.write_binary(partial)
-    if job["poses"] is not None:
+    if job["poses"] is None:
+        (partial / "placed.json").write_text(json.dumps(placed), encoding="utf-8")
+    else:
         said = {"missed_px": missed, "refined": refined}
         (partial / "given_poses.json").write_text(json.dumps(said), encoding="utf-8")
     sync_tree(partial)
@@ -133,15 +163,19 @@ def apply_exif_focal(cameras: Sequence[pycolmap.Camera], image: Path) -> None:
         camera.has_prior_focal_length = True
 
 
-def _extract(job: dict[str, Any], database: Path, channel: ChildChannel) -> None:
+def _extract(
+    job: dict[str, Any], database: Path, names: Sequence[str], effort: _Effort, channel: ChildChannel
+) -> None:
     """SIFT on the working images; frames that have features already are skipped by COLMAP."""
     options = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], use_gpu=False)
+    largest = max(max(camera["width"], camera["height"]) for camera in job["cameras"])
+    options.max_image_size = largest // effort.reduced
     options.sift.max_num_features = job["max_features"]
+    options.sift.peak_threshold = effort.contrast
     reader = pycolmap.ImageReaderOptions()
     if job["masks"] is not None:
         reader.mask_path = job["masks"]
-    names: list[str] = job["names"]
-    channel.phase("finding features", len(names))
+    channel.phase(f"finding features{effort.again}", len(names))
     for start, block in _blocks(names, 4 * job["threads"]):
         pycolmap.extract_features(
             database, job["images"], image_names=block, reader_options=reader, extraction_options=options
@@ -149,15 +183,20 @@ def _extract(job: dict[str, Any], database: Path, channel: ChildChannel) -> None
         channel.done(start + len(block))
 
 
-def _match(job: dict[str, Any], database: Path, channel: ChildChannel) -> None:
-    """Match and verify the pairs of `_pairs`; pairs that were matched before are skipped by COLMAP."""
+def _match(
+    job: dict[str, Any],
+    database: Path,
+    pairs: Sequence[tuple[int, int]],
+    effort: _Effort,
+    channel: ChildChannel,
+) -> None:
+    """Match and verify pairs of frames; pairs that were matched before are skipped by COLMAP."""
     matching = pycolmap.FeatureMatchingOptions(num_threads=job["threads"], use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job["seed"]
     pairing = pycolmap.ImportedPairingOptions(match_list_path=database.with_name("pairs.txt"))
     names: list[str] = job["names"]
-    pairs = _pairs(job, database, channel)
-    channel.phase("matching", len(pairs))
+    channel.phase(f"matching{effort.again}", len(pairs))
     for start, block in _blocks(pairs, _PAIRS_PER_BLOCK):
         lines = (f"{names[i]} {names[j]}\n" for i, j in block)
         Path(pairing.match_list_path).write_text("".join(lines), encoding="utf-8")
@@ -184,10 +223,11 @@ def _map(
 ) -> pycolmap.Reconstruction | None:
     """Incremental mapping; the model with the most registered frames (the first of equals), or None."""
     options = _pipeline_options(job)
-    # Fewer than COLMAP's ten: a capture of a dozen frames may register eight, and that is a model.
-    options.min_model_size = 3
-    options.max_num_models = 5
     total = len(job["names"])
+    options.min_model_size = min(_MIN_MODEL, max(3, total // 3))
+    options.max_num_models = 5
+    # COLMAP's 1.1 adjusts the whole model after every tenth frame more: half as much again, equal errors.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     channel.phase("reconstructing", total)
     registered = 0
 
@@ -210,6 +250,48 @@ def _map(
         next_image_callback=registered_next,
     )
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _place_the_rest(
+    job: dict[str, Any],
+    database: Path,
+    pairs: Sequence[tuple[int, int]],
+    model: pycolmap.Reconstruction,
+    output: Path,
+    channel: ChildChannel,
+) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
+    """Go on mapping with the features of the frames without a pose found anew by `_SECOND`; how each frame
+    was placed, or why it was not.
+
+    Works in a copy of the database: a killed run finds the first as it was.
+    """
+    names: list[str] = job["names"]
+    first = {image.name for image in model.images.values()}
+    missing = {index for index, name in enumerate(names) if name not in first}
+    if not missing:
+        return model, dict.fromkeys(names, "sfm")
+    copy = database.with_name("second.db")
+    copy_without_features(database, copy, [index + 1 for index in sorted(missing)])
+    _extract(job, copy, [names[index] for index in sorted(missing)], _SECOND, channel)
+    _match(job, copy, [pair for pair in pairs if not missing.isdisjoint(pair)], _SECOND, channel)
+    channel.phase("placing frames again", None)
+    options = _pipeline_options(job)
+    options.multiple_models = False
+    options.mapper.abs_pose_min_num_inliers = _SECOND.inliers
+    make_folder(output / "first")
+    model.write_binary(output / "first")
+    models = pycolmap.incremental_mapping(copy, job["images"], output, options, input_path=output / "first")
+    model = max([model, *models.values()], key=lambda model: model.num_reg_images())
+    placed = {image.name for image in model.images.values()}
+    reasons = why_missing(copy, [index + 1 for index, name in enumerate(names) if name not in placed])
+    return model, {
+        name: reasons[index + 1]
+        if name not in placed
+        else "sfm"
+        if name in first
+        else "sfm at half resolution"
+        for index, name in enumerate(names)
+    }
 
 
 def _triangulate(

@@ -134,13 +134,14 @@ def _open_video(source: Path, config: IngestConfig) -> Capture:
             f"{source.name} gives {len(chosen)} frames; a scene needs at least {MIN_FRAMES}",
             hint="record longer, or raise ingest.fps or ingest.max_frames",
         )
-    frames = tuple(
-        SourceFrame(
-            f"{source.stem}_{index:06d}", source, pts=timeline.pts[index], time_s=timeline.seconds(index)
-        )
-        for index in chosen
-    )
+    frames = tuple(video_frame(source, timeline, index) for index in chosen)
     return Capture("video", frames, len(timeline.pts), hdr=timeline.transfer)
+
+
+def video_frame(source: Path, timeline: Timeline, index: int) -> SourceFrame:
+    """Frame ``index`` of a video."""
+    name = f"{source.stem}_{index:06d}"
+    return SourceFrame(name, source, pts=timeline.pts[index], time_s=timeline.seconds(index))
 
 
 def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:

@@ -41,6 +41,7 @@ FRAMES = pa.schema(
         column("registered", pa.bool_(), "whether the frame has a pose"),
         column("n_points", pa.int32(), "sparse points that the frame observes"),
         column("split", pa.string(), "train, or test (held out: has a pose, enters nothing else)"),
+        column("placed", pa.string(), "how the pose was found, or why there is none", nullable=True),
     ]
 )
 
@@ -93,6 +94,8 @@ class Frame:
     registered: bool
     n_points: int
     split: Literal["train", "test"]
+    placed: str | None
+    """How the pose was found, or why there is none; None in runs of older versions."""
 
 
 @dataclass(frozen=True)

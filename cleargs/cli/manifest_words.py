@@ -23,6 +23,7 @@ WORDS: Mapping[str, str] = {
     "frames": "frames",
     "frames_available": "frames in the input",
     "registered": "frames with a pose",
+    "placed": "poses",
     "test": "frames held out for testing",
     "points": "sparse points",
     "observations": "observations of points",

@@ -115,12 +115,14 @@ def in_lines(facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
     if facts["split"] == "test":
         yield "held out", "for testing: it enters no training"
     if facts["centre"] is None:
-        yield "pose", "none found"
+        yield "pose", f"none found: {facts['placed']}" if facts["placed"] else "none found"
     else:
         x, y, z = facts["centre"]
         quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
         place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) of the run's world"
         yield "pose", f"{place}, world to camera ({quaternion}), w first"
+        if facts["placed"]:
+            yield "placed by", facts["placed"]
         yield "points", f"{facts['n_points']} sparse points seen"
     if facts["rva"] is not None:
         yield from _judged(facts["rva"])

@@ -88,6 +88,17 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
 
     Raises InputError when a wanted frame cannot be decoded.
     """
+    for number, frame in _decoded(path, pts):
+        yield number, frame_rgb(frame)
+
+
+def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast."""
+    for number, frame in _decoded(path, pts):
+        yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)
+
+
+def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame]]:
     wanted = set(pts)
     last = max(wanted)
     with _open(path) as (container, stream):
@@ -97,7 +108,7 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
                 continue
             if frame.pts in wanted:
                 wanted.discard(frame.pts)
-                yield frame.pts, frame_rgb(frame)
+                yield frame.pts, frame
             if not wanted:
                 return
     if wanted:

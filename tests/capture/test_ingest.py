@@ -148,6 +148,7 @@ def test_poses_that_the_images_contradict_are_adjusted(shaken: Path, ingest: Ing
         kept.result.summary["given_poses_missed_px"] == adjusted.result.summary["given_poses_missed_px"] > 1
     )
     assert [frame.registered for frame in load_frames(adjusted.out)] == [True] * 10
+    assert {frame.placed for frame in load_frames(adjusted.out)} == {"adjusted"}
     off = [errors_of_poses(done.out) for done in (kept, adjusted)]
     # A feature lies within a few tenths of a pixel, which is a twentieth of a degree at f = 300; what is left
     # of 1.6 degrees and 0.026 is 0.04 and 0.003.
@@ -229,6 +230,7 @@ def test_own_result_is_a_colmap_project(posed: Path, ingest: Ingest) -> None:
     assert second.result.summary["kind"] == "colmap"
     # An image that the model does not know stays in the table, unregistered, with the shared camera.
     assert [frame.registered for frame in frames] == [True] * 10 + [False]
+    assert [frame.placed for frame in frames] == ["given"] * 10 + ["no pose in the input"]
     assert frames[-1].qw is None and frames[-1].n_points == 0 and frames[-1].fx == frames[0].fx
     one, two = load_points(first.out), load_points(second.out)
     assert np.array_equal(one.point_id, two.point_id) and np.allclose(one.xyz, two.xyz, atol=1e-9)
@@ -332,6 +334,7 @@ def test_few_registered_frames_fail_or_warn(images: Path, ingest: Ingest) -> Non
         cv2.imwrite(str(images / f"view{index}.png"), flat)
     done = ingest(images, min_registered=0.5)
     assert [frame.registered for frame in load_frames(done.out)] == [True] * 10 + [False] * 8
+    assert [frame.placed for frame in load_frames(done.out)] == ["sfm"] * 10 + ["no features"] * 8
     assert len(done.warnings) == 1 and "10 of 18" in done.warnings[0]
     (images.parent / "strict.work").symlink_to(images.parent / "out.work")  # the same work, judged anew
     with pytest.raises(StageError, match="only 10 of 18") as caught:
@@ -346,3 +349,17 @@ def test_textureless_frames(tmp_path: Path, ingest: Ingest) -> None:
         cv2.imwrite(str(folder / f"{index}.png"), np.full((HEIGHT, WIDTH, 3), 100 + index, np.uint8))
     with pytest.raises(StageError, match="no features were found in any frame"):
         ingest(folder)
+
+
+def test_blurred_frames_are_placed_at_half_resolution(images: Path, ingest: Ingest) -> None:
+    for index in (4, 7):
+        path = images / f"view{index}.png"
+        cv2.imwrite(str(path), cv2.blur(cv2.imread(str(path)), (25, 1)))
+    done = ingest(images)
+    words = [frame.placed for frame in load_frames(done.out)]
+    second = "sfm at half resolution"
+    assert words == [second if index in (4, 7) else "sfm" for index in range(10)]
+    assert done.result.summary["placed"] == {"sfm": 8, "sfm at half resolution": 2}
+    # Of an arc 2.4 long. The blur covers 25 px, 0.3 at the depth of the planes; what is left of it is 0.06.
+    assert errors_of_poses(done.out)[1] < 0.1
+    assert same_bytes(done.out, ingest(images, "again", threads=2).out)

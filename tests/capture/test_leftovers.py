@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cleargs.capture.sfm import GIVEN_POSES
+from cleargs.capture.sfm import GIVEN_POSES, PLACED
 from cleargs.files import remove
 from cleargs.pipeline.digest import file_digest
 from cleargs.pipeline.manifest import published_files
@@ -83,6 +83,15 @@ def test_a_damaged_database_is_made_again(
         remove(tmp_path / "out.work" / "model")
         damage(tmp_path / "out.work" / "database.db")
         assert digests(ingest(posed, **settings).out) == healthy
+
+
+def test_a_model_that_does_not_say_how_frames_were_placed_is_made_again(
+    images: Path, ingest: Ingest, tmp_path: Path, settings: dict[str, int]
+) -> None:
+    healthy = digests(ingest(images, **settings).out)
+    for damage in (empty, garbage, Path.unlink):
+        damage(tmp_path / "out.work" / "model" / PLACED)
+        assert digests(ingest(images, **settings).out) == healthy
 
 
 def test_foreign_images_and_masks_are_not_published(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pycolmap
 import pytest
 from hypothesis import given, settings
@@ -15,18 +16,20 @@ from pydantic import ValidationError
 
 from cleargs.capture.cameras import Camera, Pose, pinhole
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.holdout import held_out, holdout_hash, sharpness
+from cleargs.capture.holdout import held_out, holdout_hash
 from cleargs.capture.layout import externals
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
 from cleargs.capture.sfm_worker import apply_exif_focal
+from cleargs.capture.sharpest import sharpness
 from cleargs.capture.sources import choose_times, frame_key, natural_key, open_capture, spread
 from cleargs.capture.transforms import read_transforms
 from cleargs.capture.undistort import undistorter
 from cleargs.capture.world import normalise
-from cleargs.errors import InputError
+from cleargs.errors import InputError, StoreError
 from cleargs.media.image import read_rgb
 from cleargs.media.video import Timeline
+from cleargs.parquet import column, read_table, write_table
 
 from .conftest import HEIGHT, WIDTH, texture
 
@@ -340,3 +343,14 @@ def test_exif_focal_length_is_the_starting_guess(tmp_path: Path) -> None:
     other = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 720.0, 600, 400)
     apply_exif_focal([other], tmp_path / "plain.png")
     assert not other.has_prior_focal_length and other.params[0] == 720
+
+
+def test_a_table_of_an_older_version_is_read(tmp_path: Path) -> None:
+    """It lacks what frames came to say later; what every version says must be there."""
+    old = pa.schema([column("a", pa.int32(), "old")])
+    new = pa.schema([*old, column("b", pa.string(), "new", nullable=True)])
+    write_table(tmp_path / "t.parquet", pa.table({"a": [1, 2]}), old)
+    rows = read_table(tmp_path / "t.parquet", new).to_pylist()
+    assert rows == [{"a": 1, "b": None}, {"a": 2, "b": None}]
+    with pytest.raises(StoreError, match=r"t\.parquet"):
+        read_table(tmp_path / "t.parquet", pa.schema([*old, column("c", pa.string(), "needed")]))

@@ -132,7 +132,10 @@ def test_run_file_tells_what_each_setting_means(bench: Bench) -> None:
     document = check_document(installed(), {"ingest": {"holdout": "every:8"}})
     write_run_file(Run(bench.folder, bench.capture, document, bench.store, "cpu"))
     text = (bench.folder / "run.toml").read_text()
-    comment = "# most frames to take, evenly in time (a whole number, at least 3; default 150)"
+    comment = (
+        "# most frames to take, evenly; of a video, the sharpest nearby "
+        "(a whole number, at least 3; default 150)"
+    )
     assert f"{comment}\nmax_frames = 150\n" in text
     assert 'holdout = "every:8"' in text
     assert "default unset)\n# fps =\n" in text, "a setting without a value is there too"
