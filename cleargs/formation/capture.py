@@ -20,6 +20,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import NUMBERS, FrameFormation, explain, packed, unpacked
+from cleargs.formation.unexplained import Doubt
 from cleargs.formation.view import FormedView
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
@@ -119,7 +120,8 @@ class CaptureFormation:
         camera = view.camera.scaled(factor)
         affines = self._affines
         affine = None if affines is None else affines.affine(view.frame_id)
-        searched = view.kind == "real" and self._config.enabled and progress >= self._config.start
+        begun = self._config.enabled and progress >= self._config.start
+        searched = begun and view.kind == "real"
         if searched and self._due(view.frame_id):
             self._fit(view.frame_id, factor, camera, affine, target, mask, render)
         weight = view.weight
@@ -130,7 +132,10 @@ class CaptureFormation:
             weight = self.weight(view.frame_id)
             if frame.model != "none":
                 motion = frame
-        if motion is None and affine is None:
+        doubt = None
+        if begun and self._config.unexplained > 0.0:
+            doubt = Doubt(target, mask, self._config.unexplained)
+        if motion is None and affine is None and doubt is None:
             return None
         return FormedView(
             camera,
@@ -140,6 +145,7 @@ class CaptureFormation:
             affines=affines,
             formation=motion,
             factor=factor,
+            doubt=doubt,
         )
 
     def digest(self) -> str:

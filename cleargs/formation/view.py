@@ -8,6 +8,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, affine_backward, apply_affine
 from cleargs.formation.frame import FrameFormation, margin_for, widened
+from cleargs.formation.unexplained import Doubt
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -23,7 +24,10 @@ from cleargs.splat.kernels.warp_layout import CHANNELS
 
 @dataclass(eq=False)
 class FormedView:
-    """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light."""
+    """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
+
+    With a ``doubt``, pixels that stay unexplained teach less.
+    """
 
     camera: Camera
     weight: float
@@ -32,6 +36,7 @@ class FormedView:
     affines: AffineOptimiser | None = None
     formation: FrameFormation | None = None
     factor: float = 1.0
+    doubt: Doubt | None = None
 
     def __post_init__(self) -> None:
         self._photo = self.camera
@@ -42,6 +47,12 @@ class FormedView:
         self.needs_depth = self.formation is not None
 
     def forward(self, render: Render) -> Tensor:
+        photograph = self._photograph(render)
+        if self.doubt is not None:
+            self._counts = self.doubt.counts(photograph)
+        return photograph
+
+    def _photograph(self, render: Render) -> Tensor:
         image = render.image
         if self.affine is not None:
             self._rendered = render.image
@@ -62,6 +73,8 @@ class FormedView:
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
+        if self.doubt is not None:
+            gradient = gradient * self._counts[..., None]
         if self.formation is not None:
             light = times_slope(gradient, self._to_srgb, CHANNELS)
             gradient = times_slope(self._warp.transpose(light), self._to_linear)

@@ -38,6 +38,13 @@ class FormationConfig(BaseModel):
         description="how fast an explained frame loses weight with what is left unexplained; 0: never",
     )
     pose: bool = Field(False, description="correct the pose of a frame along with its motion")
+    unexplained: float = Field(
+        0.05,
+        ge=0,
+        le=1,
+        description="difference of colour (sRGB, mean of a neighbourhood) beyond which pixels that stay "
+        "unexplained, as of what moves, count less; 0: never",
+    )
 
 
 class AdaptiveConfig(BaseModel):

@@ -193,9 +193,9 @@ def test_resumed_amid_looks_equals_undisturbed(pictures: list[np.ndarray]) -> No
     assert "strategy.errors" in saved
     resumed = Trainer(start(), views(pictures), LOOKING, seed=(1,))
     resumed.restore(saved)
-    for trainer in (whole, resumed):
-        while trainer.done < 20:
-            trainer.step()
+    for continued in (whole, resumed):
+        while continued.done < 20:
+            continued.step()
     assert whole.scene.gaussians.num > start().gaussians.num
     for name, tensor in whole.scene.gaussians.tensors().items():
         assert torch.equal(tensor, resumed.scene.gaussians.tensors()[name]), name
