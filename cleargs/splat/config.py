@@ -39,11 +39,11 @@ class FormationConfig(BaseModel):
     )
     pose: bool = Field(False, description="correct the pose of a frame along with its motion")
     unexplained: float = Field(
-        0.05,
+        0.0,
         ge=0,
         le=1,
-        description="difference of colour (sRGB, mean of a neighbourhood) beyond which pixels that stay "
-        "unexplained, as of what moves, count less; 0: never",
+        description="difference of colour (sRGB, mean of a neighbourhood; 0.05, say) beyond which pixels "
+        "that stay unexplained count less: for captures with people or things that move; 0: never",
     )
 
 
