@@ -33,11 +33,10 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
     missing, damaged, or lacks another column.
     """
     try:
-        there = pq.read_schema(path).names
-        newer = [field for field in schema if field.nullable and field.name not in there]
-        table = pq.read_table(path, columns=[name for name in schema.names if name in there])
-        for field in newer:
-            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+        table = pq.read_table(path)
+        for field in schema:
+            if field.nullable and field.name not in table.column_names:
+                table = table.append_column(field, pa.nulls(table.num_rows, field.type))
         return table.select(schema.names).cast(schema)
     except (OSError, pa.ArrowException, ValueError, KeyError) as error:
         raise StoreError(
