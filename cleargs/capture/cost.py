@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _UNKNOWN = (60, 0.5)
 """Frames and megapixels assumed where nothing is known of the capture."""
-_UNKNOWN_POINTS = 20_000
+_UNKNOWN_POINTS = 10_000
 """Sparse points assumed there."""
 _SERIAL = 0.1
 """Share of the work that more threads do not speed up (a guess)."""

@@ -218,7 +218,7 @@ class G0Config(TrainConfig):
         (0.0, 0.0, 0.0), description="sRGB behind the scene, each in [0, 1]"
     )
     min_points: int = Field(
-        20_000,
+        10_000,
         ge=1,
         le=5_000_000,
         description="fewest Gaussians to start from, within the budget; points are added to reach it",
