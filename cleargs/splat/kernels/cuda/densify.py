@@ -18,6 +18,7 @@ from torch import Tensor
 
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
+from cleargs.splat.kernels.reference import rotation_matrices
 from cleargs.splat.strategy import mcmc
 
 BLOCK = 256
@@ -141,16 +142,8 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
     """``mcmc._halves``: make the Gaussians ``cut`` one of their halves, and return the other ones."""
     rows = torch.arange(len(cut), device=cut.device)
     longest = gaussians.log_scales[cut].argmax(dim=1)
-    w, x, y, z = torch.nn.functional.normalize(gaussians.rotations[cut], dim=1).unbind(1)
-    columns = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=1),
-            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=1),
-            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1),
-        ],
-        dim=1,
-    )
-    away = columns[rows, longest] * (mcmc.PART * gaussians.log_scales[cut, longest].exp())[:, None]
+    axes = rotation_matrices(gaussians.rotations[cut])[rows, :, longest]
+    away = axes * (mcmc.PART * gaussians.log_scales[cut, longest].exp())[:, None]
     faint = (1.0 - (1.0 - opacity) ** (0.5 / mcmc.PART)).clamp(min_opacity, 1.0 - 1e-6)
     gaussians.log_scales[cut, longest] += math.log(mcmc.PART)
     gaussians.logit_opacities[cut] = (faint.log() - torch.log1p(-faint)).float()
