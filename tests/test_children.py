@@ -33,7 +33,7 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtur
 @pytest.mark.parametrize("trap", HOSTILE, indirect=True)
 def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: Path) -> None:
     with pytest.raises(StageError):  # there is no such job, which the child only finds out when it runs
-        run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", 1, SilentReporter())
+        run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", SilentReporter())
     assert "no.json" in (tmp_path / "log").read_text()
     subprocess.run(WATCHER, stderr=subprocess.DEVNULL, check=False)
     subprocess.run([*module_command("cleargs.bench.peak_memory")], stderr=subprocess.DEVNULL, check=False)

@@ -38,12 +38,8 @@ class ChildChannel:
 
     @staticmethod
     def open() -> ChildChannel:
-        """Take standard output for the reports (whatever a library prints there goes to the log instead), and
-        from now on die when the parent does."""
-        reports = os.fdopen(os.dup(1), "w", buffering=1)
-        os.dup2(2, 1)
-        threading.Thread(target=_die_with_parent, daemon=True).start()
-        return ChildChannel(reports)
+        """Take standard output for the reports, and from now on die when the parent does."""
+        return ChildChannel(reports_to_parent())
 
     def phase(self, label: str, total: int | None) -> None:
         self._send({"phase": label, "total": total})
@@ -58,6 +54,15 @@ class ChildChannel:
         self._stream.write(json.dumps(message) + "\n")
 
 
+def reports_to_parent() -> TextIO:
+    """Standard output, for reports alone: whatever a library prints there goes to the log instead. From now
+    on this process dies when its parent does."""
+    reports = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    return reports
+
+
 def _die_with_parent() -> None:
     # Not sys.stdin: its lock, held by this thread, would abort the interpreter's shutdown.
     while os.read(0, 1024):
@@ -65,19 +70,18 @@ def _die_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def run_child(module: str, job: Path, log: Path, threads: int, reporter: Reporter) -> None:
+def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     """Run ``python -P -m module job`` to its end, showing its progress.
 
     Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted;
     StoreError where the disk is full.
     Whatever ends this call early (Ctrl-C above all) kills the child first.
     """
-    # One BLAS thread: sums in COLMAP's and numpy's linear algebra must not depend on the machine.
+    # Sums in COLMAP's and numpy's linear algebra must not depend on threads; features and matches of several
+    # frames at a time are found by threads of COLMAP's own, that many as the job says.
     environment = {
         **os.environ,
-        "OMP_NUM_THREADS": str(threads),
-        "OPENBLAS_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
+        **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     }
     with (
         log.open("w", encoding="utf-8") as errors,

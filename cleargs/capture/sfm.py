@@ -190,7 +190,7 @@ def _run(
             "refine_above": config.refine_above,
         }
         write_json(folder / "job.json", settings)
-        run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", threads, reporter)
+        run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", reporter)
         model = read_model(folder / "model")
     return model
 

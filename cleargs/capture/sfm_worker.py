@@ -5,7 +5,8 @@ killed run left in the database (features, matches) is used again. Frames that m
 second time at half resolution.
 
 Equal for any number of threads: ids are given in frame order before any thread starts, every random choice is
-seeded, and mapping and triangulation (whose least squares sum in thread order) run on one thread.
+seeded, frames are matched by processes, and mapping and triangulation (whose least squares sum in thread
+order) run on one thread.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from numpy.typing import NDArray
 
 from cleargs.capture.child import ChildChannel
 from cleargs.capture.colmap import pycolmap
+from cleargs.capture.matching import match_pairs
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
 from cleargs.capture.sfm_missing import copy_without_features, why_missing
 from cleargs.files import make_folder, sync, sync_tree
 
-_PAIRS_PER_BLOCK = 100
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
 third of its frames: eight of a dozen are a model."""
@@ -190,18 +191,9 @@ def _match(
     effort: _Effort,
     channel: ChildChannel,
 ) -> None:
-    """Match and verify pairs of frames; pairs that were matched before are skipped by COLMAP."""
-    matching = pycolmap.FeatureMatchingOptions(num_threads=job["threads"], use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job["seed"]
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=database.with_name("pairs.txt"))
-    names: list[str] = job["names"]
+    """Match and verify pairs of frames; pairs that were matched before are skipped."""
     channel.phase(f"matching{effort.again}", len(pairs))
-    for start, block in _blocks(pairs, _PAIRS_PER_BLOCK):
-        lines = (f"{names[i]} {names[j]}\n" for i, j in block)
-        Path(pairing.match_list_path).write_text("".join(lines), encoding="utf-8")
-        pycolmap.match_image_pairs(database, matching, pairing, verification)
-        channel.done(start + len(block))
+    match_pairs(database, job["names"], pairs, job["seed"], job["threads"], channel.done)
 
 
 def _pairs(job: dict[str, Any], database: Path, channel: ChildChannel) -> list[tuple[int, int]]:

@@ -32,7 +32,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(module: Path) -> None:
-    run_child(module.stem, module.with_suffix(".json"), module.with_suffix(".log"), 1, SilentReporter())
+    run_child(module.stem, module.with_suffix(".json"), module.with_suffix(".log"), SilentReporter())
 
 
 def test_a_failed_check_becomes_an_error(module: Path) -> None:
@@ -99,7 +99,7 @@ while True:
             "import sys; from pathlib import Path; from cleargs.capture.child import run_child; "
             "from cleargs.progress import SilentReporter; "
             f"note = {str(note)!r}; "
-            f"run_child({module.stem!r}, Path(note), Path(note + '.log'), 1, SilentReporter())",
+            f"run_child({module.stem!r}, Path(note), Path(note + '.log'), SilentReporter())",
         ],
         stderr=subprocess.DEVNULL,
     )

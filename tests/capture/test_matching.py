@@ -1,0 +1,75 @@
+"""Matching by processes: the same matches for any number of them, and nothing lost when they are killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+import pytest
+
+from cleargs.capture import matching
+from cleargs.capture.matching import match_pairs
+from cleargs.capture.pairs import exhaustive_pairs
+
+NAMES = [f"view{index}.png" for index in range(4)]
+PAIRS = exhaustive_pairs(len(NAMES))
+
+
+@pytest.fixture
+def database(images: Path, tmp_path: Path) -> Path:
+    """Features of four frames."""
+    found = tmp_path / "database.db"
+    options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+    options.sift.max_num_features = 256
+    pycolmap.extract_features(found, images, image_names=NAMES, extraction_options=options)
+    return found
+
+
+def matches(database: Path) -> list[Any]:
+    with closing(sqlite3.connect(database)) as opened:
+        return [
+            row
+            for table in ("matches", "two_view_geometries")
+            for row in opened.execute(f"SELECT * FROM {table} ORDER BY pair_id")
+        ]
+
+
+def match(database: Path, processes: int) -> list[int]:
+    through: list[int] = []
+    match_pairs(database, NAMES, PAIRS, 0, processes, through.append)
+    return through
+
+
+def test_any_number_of_processes_finds_the_same(database: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "other.db"
+    copy.write_bytes(database.read_bytes())
+    assert match(database, 1) == [0, 6]
+    assert match(copy, 4) == [0, 2, 4, 6]
+    assert len(matches(database)) == 12 and matches(database) == matches(copy)
+    assert sorted(path.name for path in tmp_path.glob("*share*")) == []
+
+
+def test_matches_of_a_killed_run_are_gathered(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with another number of processes; a damaged share alone is matched again."""
+    whole = database.with_name("whole.db")
+    whole.write_bytes(database.read_bytes())
+    match(whole, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(matching, "_gather", lambda *_: None)  # as if killed before the end
+        match(database, 3)
+    assert not matches(database)
+    (database.with_name("database-share1.db")).write_bytes(b"SQLite format 3\0 no longer")
+    assert match(database, 2) == [4, 5, 6]
+    assert matches(database) == matches(whole)
+
+
+def test_a_process_that_dies_is_told(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    killer = [os.path.realpath("/bin/sh"), "-c", f"kill -{int(signal.SIGKILL)} $$"]
+    monkeypatch.setattr(matching, "module_command", lambda *_: killer)
+    with pytest.raises(ChildProcessError, match="ended with -9"):
+        match(database, 1)
