@@ -299,6 +299,8 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
         table.add_row(evaluation.subject, f"mean of {len(evaluation.images)}", *figures)
     console = Console(highlight=False, soft_wrap=True)
     console.print(table)
+    for evaluation in report.evaluations:
+        console.print(_regions(evaluation), markup=False)
     console.print(_provenance(first), markup=False)
     for metric, reason in first.unavailable.items():
         console.print(f"{metric}: {reason}", markup=False)
@@ -318,6 +320,17 @@ def _provenance(evaluation: Evaluation) -> str:
     if evaluation.options.refine_poses:
         words.append(f"poses refined in {evaluation.options.refine_poses} steps")
     return "; ".join(words)
+
+
+def _regions(evaluation: Evaluation) -> str:
+    """Where scenes fail that look well on average."""
+    parts = {"behind the sparse points": evaluation.far, "clipped in the references": evaluation.clipped}
+    words = (
+        f"{name} {part.share:.1%} of the pixels, {_figure('psnr', part.psnr)} dB"
+        for name, part in parts.items()
+        if part is not None
+    )
+    return f"{evaluation.subject}: {'; '.join(words)}"
 
 
 def _label(metric: str) -> str:

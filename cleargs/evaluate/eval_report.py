@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.regions import Region
 from cleargs.files import disk_error, write_json
 from cleargs.parquet import column, write_table
 from cleargs.record import Record
@@ -21,6 +22,11 @@ from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
 World = Literal["scene", "ingest", "umeyama"]
+
+_REGIONS = {
+    "far": "where the scene shows something behind all sparse points of the view, or nothing",
+    "clipped": "where a channel of the reference is at least 254",
+}
 
 LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """All other metrics are better the higher they are."""
@@ -69,6 +75,12 @@ class ImageResult(_Record):
         None, description="The affine [3, 4] on sRGB that colour alignment applied."
     )
     refinement: Refinement | None = Field(None, description="What pose refinement did.")
+    far: Region | None = Field(
+        None,
+        description="Where the scene shows something behind all sparse points of the view, or nothing; null "
+        "where these are not known.",
+    )
+    clipped: Region | None = Field(None, description="Where a channel of the reference is at least 254.")
 
 
 class Evaluation(_Record):
@@ -82,6 +94,8 @@ class Evaluation(_Record):
     alignment: Alignment
     options: EvalOptions
     means: dict[str, float | None] = Field(description="Metric -> mean over the images.")
+    far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
+    clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
     weights: dict[str, str] = Field(description="Metric -> digest of the weights behind it.")
     trained_on: int | None = Field(
@@ -165,6 +179,11 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column("width", pa.int32(), "px"),
             column("height", pa.int32(), "px"),
             *(column(metric, pa.float64(), meaning(metric), nullable=True) for metric in metrics),
+            *(
+                column(f"{region}_{figure}", pa.float64(), words, nullable=True)
+                for region, where in _REGIONS.items()
+                for figure, words in (("share", f"of the pixels, {where}"), ("psnr", f"dB, {where}"))
+            ),
             column("prediction", pa.string(), "SHA-256 of the evaluated 8-bit pixels"),
             column("reference", pa.string(), "SHA-256 of the reference's 8-bit pixels, and of its mask"),
             column("colour", pa.list_(pa.float64()), "affine 3x4 on sRGB, row by row", nullable=True),
@@ -196,6 +215,8 @@ def _rows(report: Report) -> list[dict[str, Any]]:
             "adjusted": _adjusted(evaluation.options),
             **image.model_dump(include={"name", "width", "height", "prediction", "reference"}),
             **image.values,
+            **_region("far", image.far),
+            **_region("clipped", image.clipped),
             "colour": None if image.colour is None else [x for row in image.colour for x in row],
             "refined_rotation_deg": image.refinement.rotation_deg if image.refinement else None,
             "refined_shift": image.refinement.shift if image.refinement else None,
@@ -203,6 +224,13 @@ def _rows(report: Report) -> list[dict[str, Any]]:
         for evaluation in report.evaluations
         for image in evaluation.images
     ]
+
+
+def _region(name: str, found: Region | None) -> dict[str, float | None]:
+    return {
+        f"{name}_share": None if found is None else found.share,
+        f"{name}_psnr": None if found is None else found.psnr,
+    }
 
 
 def _adjusted(options: EvalOptions) -> str:

@@ -21,6 +21,7 @@ from cleargs.evaluate.metric_set import MetricSet, load_metrics
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, require_match
 from cleargs.evaluate.refinement import refine_pose
+from cleargs.evaluate.regions import clipped_pixels, depth_of_points, far_pixels, pooled, region
 from cleargs.files import disk_error
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
@@ -42,6 +43,8 @@ class _Prediction:
 
     image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
     refinement: Refinement | None = None
+    far: Mask | None = None
+    """Where a scene shows something behind the sparse points; None where these are not known."""
 
 
 Predict = Callable[[ReferenceView, Pixels, Mask | None], _Prediction]
@@ -70,7 +73,7 @@ def evaluate_scene(
             hint="give a scene.ply as `cleargs export` or the Inria code writes it",
         ) from error
     set_threads(threads)
-    renderer = _Renderer(loaded, options.refine_poses)
+    renderer = _Renderer(loaded, options.refine_poses, reference.points)
     predictions = _Predictions(subject or scene.name, file_digest(scene), renderer)
     return _evaluate(predictions, reference, options, threads, reporter, save)
 
@@ -131,18 +134,19 @@ class _Predictions:
 class _Renderer:
     """Renders a scene at references' views, at poses refined by so many steps."""
 
-    def __init__(self, scene: Scene, refine_steps: int) -> None:
+    def __init__(self, scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> None:
         self._scene = scene
         self._engine = Engine(scene.gaussians.device)
         self._steps = refine_steps
+        self._points = points
 
     def __call__(self, view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
-        if not self._steps:
-            return _Prediction(self._render(view.camera))
-        camera, refinement = refine_pose(
-            self._render, view.camera, self._depth(view.camera), target, mask, self._steps
-        )
-        return _Prediction(self._render(camera), refinement)
+        camera, refinement = view.camera, None
+        if self._steps:
+            camera, refinement = refine_pose(
+                self._render, camera, self._depth(camera), target, mask, self._steps
+            )
+        return _Prediction(self._render(camera), refinement, self._far(camera))
 
     def _render(self, camera: Camera) -> NDArray[np.float64]:
         scene = self._scene
@@ -152,15 +156,22 @@ class _Renderer:
         pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
         return pixels
 
+    def _far(self, camera: Camera) -> Mask | None:
+        farthest = None if self._points is None else depth_of_points(self._points, camera)
+        return None if farthest is None else far_pixels(*self._depth_and_alpha(camera), farthest)
+
     def _depth(self, camera: Camera) -> float:
         """Median depth of what the view shows; 1 where it shows nothing."""
+        depth, alpha = self._depth_and_alpha(camera)
+        shown = alpha > 0.5
+        return float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
+
+    def _depth_and_alpha(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         rendered = self._engine.forward(
             self._scene.gaussians, camera, antialias=self._scene.antialias, depth=True
         )
         assert rendered.depth is not None  # asked for
-        alpha = rendered.alpha.numpy()
-        shown = alpha > 0.5
-        return float(np.median(rendered.depth.numpy()[shown] / alpha[shown])) if shown.any() else 1.0
+        return rendered.depth.numpy(), rendered.alpha.numpy()
 
 
 def _evaluate(
@@ -204,6 +215,8 @@ def _evaluate(
         alignment=reference.alignment,
         options=options,
         means=mean_values(images, options.metrics),
+        far=pooled(image.far for image in images),
+        clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),
         weights=dict(metrics.weights),
         versions={**versions(), **{name: version(name) for name in _LIBRARIES}},
@@ -236,6 +249,8 @@ def _measure(
         reference=_digest(target, mask),
         colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
         refinement=prediction.refinement,
+        far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
+        clipped=region(pixels, target, clipped_pixels(target), mask),
     )
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose
 from cleargs.capture.layout import mask_folder
 from cleargs.capture.sources import natural_key
-from cleargs.capture.tables import Frame, load_frames
+from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.capture.world import Similarity
@@ -27,7 +28,7 @@ from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest
-from cleargs.pipeline.manifest import linked_manifest
+from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import view_of
@@ -62,6 +63,8 @@ class Reference:
     views: tuple[ReferenceView, ...]
     poses: PosesFrom
     alignment: Alignment
+    points: NDArray[np.float64] | None = None
+    """The run's sparse points [P, 3], in the scene's world; None where there is no run."""
 
 
 def reference_of(
@@ -89,6 +92,22 @@ def reference_of(
             f"{run_folder} has no finished ingest: nothing is known of its world",
             hint=f"see cleargs explain {run_folder}",
         )
+    found = _in_world(run_folder, manifest, directory, poses, align, reporter)
+    try:
+        return replace(found, points=load_points(ingest).xyz)
+    except StoreError:  # figures of what lies behind them are left out
+        return found
+
+
+def _in_world(
+    run_folder: Path,
+    manifest: Manifest,
+    directory: Path | None,
+    poses: PosesFrom,
+    align: Path | None,
+    reporter: Reporter,
+) -> Reference:
+    ingest = run_folder / "ingest"
     frames = load_frames(ingest)
     if directory is None:
         return _held_out(ingest, frames)
