@@ -37,8 +37,9 @@ env: .venv/demo.stamp
 demo: env demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
 
+# A file's tests stay in one process, so that what they share is made once.
 test: .venv/test.stamp
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -m 'not slow' --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
