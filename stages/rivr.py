@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 19
+VERSION = 20
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),

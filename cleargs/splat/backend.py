@@ -92,12 +92,12 @@ class Backend(Protocol):
         """Add to the gradients those of opacity * mean(opacity) + scale * mean(scale) (3DGS-MCMC)."""
         ...
 
-    def relocate_and_grow(
+    def refine(
         self,
         gaussians: Gaussians,
         moments: Moments,
         *,
-        errors: Tensor | None,
+        errors: Tensor,
         rate: float,
         budget: int,
         min_opacity: float,

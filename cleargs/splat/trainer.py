@@ -195,7 +195,7 @@ class Trainer:
         image = render.image if formed is None else formed.forward(render)
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
-        if config.densify and self._strategy.wants_errors(self._gaussians, self.done + 1):
+        if config.densify and self._strategy.wants_errors(self.done + 1):
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
         if config.densify:

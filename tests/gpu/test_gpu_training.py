@@ -135,83 +135,46 @@ def test_exposure_equals_autograd(device):
     assert (grad_affine - a.grad).abs().max() < 1e-6 * a.grad.abs().max()
 
 
-def test_split_opacity_is_the_strategys(densify):
-    rng = np.random.default_rng(0)
-    opacity, copies = rng.uniform(0.01, 0.99, 200), rng.integers(2, 9, 200)
-    split, factor = densify.split_opacity(torch.from_numpy(opacity), torch.from_numpy(copies))
-    expected = mcmc.split_opacity(opacity, copies)
-    # Alternating binomial sums lose digits with the number of copies: 2e-14 for two, 1e-10 for eight.
-    np.testing.assert_allclose(split.numpy(), expected[0], rtol=1e-12)
-    np.testing.assert_allclose(factor.numpy(), expected[1], rtol=1e-9)
-
-
 def crowd(count, device):
     made = splat_toy.gaussians(count)
     made.logit_opacities[:] = torch.linspace(-8.0, 3.0, count)
     return made.to(device)
 
 
-def test_samples_follow_the_weights(device, densify):
-    weights = torch.tensor([0.0, 0.1, 0.0, 0.3, 0.6, 0.0], device=device)
-    drawn = densify.sample(weights, 20_000, densify.generator_of(3, device))
-    shares = torch.bincount(drawn, minlength=6).double().cpu() / 20_000
-    # The standard deviation of a share is at most 0.0035.
-    assert (shares - weights.double().cpu()).abs().max() < 0.015
-    assert shares[[0, 2, 5]].tolist() == [0.0, 0.0, 0.0]
-
-
-def test_relocation_moves_the_dead_and_keeps_the_sum_of_opacity_plausible(device, densify):
+def test_a_refinement_is_that_of_the_cpu(device, densify):
+    """Two Gaussians have all of the error: there are places for all that they are cut into, and no draws."""
     gaussians = crowd(40, device)
-    opacity = gaussians.logit_opacities.sigmoid()
-    dead = opacity <= 0.01
-    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
-    before = gaussians.clone()
-    moved = densify.relocate(gaussians, moments, min_opacity=0.01, seed=5)
-    assert moved == int(dead.sum()) > 5
-    after = gaussians.logit_opacities.sigmoid()
-    assert (after > 0.00999).all()
-    assert (after[~dead] <= opacity[~dead] + 1e-6).all()
-    # Each dead one lies where a live one lies; what changed has lost its moments, the rest is as it was.
-    same_place = (gaussians.means[dead][:, None] == before.means[~dead][None]).all(dim=2)
-    assert same_place.any(dim=1).all()
-    untouched = (gaussians.logit_opacities == before.logit_opacities) & ~dead
-    assert untouched.any()
-    assert torch.equal(moments[0]["means"][:, 0] == 1, untouched)
-    again = before.clone()
-    densify.relocate(again, [], min_opacity=0.01, seed=5)
-    assert all(
-        torch.equal(a, b) for a, b in zip(again.tensors().values(), gaussians.tensors().values(), strict=True)
-    )
-
-
-def test_growth_stops_at_the_budget(device, densify):
-    gaussians = crowd(40, device)
-    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
-    grown, reset_moments = densify.grow(
-        gaussians, moments, errors=None, rate=0.5, budget=55, min_opacity=0.005, seed=1
-    )
-    assert grown.num == 55
-    assert all(len(tensor) == 55 and not tensor[40:].any() for tensor in reset_moments[0].values())
-    same, _ = densify.grow(grown, reset_moments, errors=None, rate=0.5, budget=55, min_opacity=0.005, seed=1)
-    assert same is grown
-
-
-def test_what_is_cut_is_cut_as_on_the_cpu(device, densify):
-    gaussians = crowd(40, device)
+    dead = int((gaussians.logit_opacities.sigmoid() <= 0.01).sum())
+    assert dead == 13  # 2, 4, and of 8 all but one, which is new; then there is no place left
     errors = torch.zeros(40, device=device)
     errors[[20, 33]] = 2.0
+    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
     arrays = {name: tensor.cpu().numpy().copy() for name, tensor in gaussians.tensors().items()}
-    settings = {"rate": 0.5, "budget": 100, "min_opacity": 0.005}
-    grown, _ = densify.grow(gaussians, [], errors=errors, seed=1, **settings)
-    expected, _ = mcmc.grow(
-        arrays, [], errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
+    running = [{name: np.ones_like(array) for name, array in arrays.items()}]
+    settings = {"rate": 0.5, "budget": 41, "min_opacity": 0.01}
+    grown, (reset,) = densify.refine(gaussians, moments, errors=errors, seed=1, **settings)
+    expected, (emptied,) = mcmc.refine(
+        arrays, running, errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
     )
+    assert grown.num == len(expected["means"]) == 41
     order = np.argsort(grown.means[:, 0].cpu().numpy()), np.argsort(expected["means"][:, 0])
     for name, tensor in grown.tensors().items():
         # float32 on both sides, but for the opacities.
         np.testing.assert_allclose(
             tensor.cpu().numpy()[order[0]], expected[name][order[1]], rtol=1e-5, atol=1e-6
         )
+        assert np.array_equal(reset[name].cpu().numpy()[order[0]], emptied[name][order[1]])
+
+
+def test_a_refinement_repeats_itself_and_keeps_to_the_budget(device, densify):
+    settings = {"rate": 0.5, "budget": 55, "min_opacity": 0.005, "seed": 5}
+    errors = torch.linspace(0.0, 1.0, 40, device=device)
+    once, _ = densify.refine(crowd(40, device), [], errors=errors, **settings)
+    again, _ = densify.refine(crowd(40, device), [], errors=errors, **settings)
+    assert once.num == 55
+    assert all(
+        torch.equal(a, b) for a, b in zip(once.tensors().values(), again.tensors().values(), strict=True)
+    )
 
 
 def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):

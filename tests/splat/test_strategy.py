@@ -1,4 +1,4 @@
-"""Densification: what is copied looks as before, budgets hold, noise goes where it should."""
+"""Densification: what is cut looks as before, budgets hold, noise goes where it should."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import add_position_noise
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.strategy.mcmc import (
-    grow,
-    relocate,
+    refine,
     rotation_matrices,
-    sample,
+    sample_once,
     sigmoid,
-    split_opacity,
 )
 
 OPEN = 0.005
@@ -34,90 +32,74 @@ def arrays(count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     return {name: array.astype(np.float32) for name, array in made.items()}
 
 
-@given(opacity=st.floats(0.006, 0.95), copies=st.integers(1, 12))
-def test_split_gaussians_hold_the_opacity_of_one(opacity: float, copies: int) -> None:
-    split, factor = split_opacity(np.array([opacity]), np.array([copies]))
-    # Stacked at one place they let through what the one let through.
-    assert (1 - split[0]) ** copies == pytest.approx(1 - opacity, rel=1e-9)
-    assert factor[0] <= 1.0 + 1e-9
-    if copies == 1:
-        assert factor[0] == pytest.approx(1.0)
-    # Equation 9 keeps the integral over a line through the centre of the composed alpha.
-    x = np.linspace(-8, 8, 4001)
-    before = opacity * np.exp(-(x**2) / 2)
-    after = 1 - (1 - split[0] * np.exp(-((x / factor[0]) ** 2) / 2)) ** copies
-    assert after.sum() == pytest.approx(before.sum(), rel=1e-4)
-
-
-def test_relocation_moves_the_dead_only() -> None:
-    rng = np.random.default_rng(0)
-    made = arrays(50, rng)
-    dead = np.array([3, 7, 49])
-    made["logit_opacities"][dead] = -9.0
-    made["logit_opacities"][7] = np.nan
-    before = {name: array.copy() for name, array in made.items()}
-    moments = [{name: np.ones_like(array) for name, array in made.items()} for _ in range(2)]
-    assert relocate(made, moments, min_opacity=OPEN, rng=np.random.default_rng(1)) == 3
-    sources = [
-        int(np.flatnonzero((before["means"] == made["means"][index]).all(axis=1))[0]) for index in dead
-    ]
-    assert not set(sources) & set(dead.tolist())
-    touched = np.zeros(50, np.bool_)
-    touched[[*dead, *sources]] = True
-    for name, array in made.items():
-        assert np.array_equal(array[~touched], before[name][~touched]), name
-        assert np.array_equal(array[dead], array[sources]), name
-        for moment in moments:
-            assert (moment[name][touched] == 0).all()
-            assert (moment[name][~touched] == 1).all()
-    assert (made["logit_opacities"][sources] < before["logit_opacities"][sources]).all()
-    assert (sigmoid(made["logit_opacities"]) > OPEN).all()
-
-
-def test_relocation_with_nobody_alive_changes_nothing() -> None:
-    made = arrays(4, np.random.default_rng(0))
-    made["logit_opacities"][:] = -20.0
-    before = made["means"].copy()
-    assert relocate(made, [], min_opacity=OPEN, rng=np.random.default_rng(1)) == 0
-    assert np.array_equal(made["means"], before)
-
-
-@pytest.mark.parametrize(("budget", "expected"), [(1000, 105), (102, 102), (100, 100), (10, 100)])
-def test_growth_stops_at_the_budget(budget: int, expected: int) -> None:
-    made = arrays(100, np.random.default_rng(0))
-    moments = [{name: np.ones_like(array) for name, array in made.items()}]
-    grown, reset_moments = grow(
-        made, moments, errors=None, rate=0.05, budget=budget, min_opacity=OPEN, rng=np.random.default_rng(1)
-    )
-    assert {len(array) for array in grown.values()} == {expected}
-    assert {len(array) for array in reset_moments[0].values()} == {expected}
-    assert (reset_moments[0]["sh"][100:] == 0).all()
-    assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in grown.values())
-
-
-def test_growth_cuts_what_takes_part_in_errors() -> None:
-    made = arrays(100, np.random.default_rng(0))
-    made["logit_opacities"][7] = -9.0  # dead: its error is nobody's
-    before = {name: array.copy() for name, array in made.items()}
-    moments = [{name: np.ones_like(array) for name, array in made.items()}]
-    errors = np.zeros(100)
-    errors[[3, 7, 20]] = 1.0
-    grown, (running,) = grow(
+def refined(
+    made: dict[str, np.ndarray], errors: np.ndarray, *, rate: float = 0.05, budget: int = 1000
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The arrays after a refinement, and their moments, which were 1."""
+    grown, (moments,) = refine(
         made,
-        moments,
+        [{name: np.ones_like(array) for name, array in made.items()}],
         errors=errors,
-        rate=0.05,
-        budget=1000,
+        rate=rate,
+        budget=budget,
         min_opacity=OPEN,
         rng=np.random.default_rng(1),
     )
-    assert len(grown["means"]) == 102
-    touched = [3, 20]
-    same = np.setdiff1d(np.arange(100), touched)
+    return grown, moments
+
+
+def test_the_dead_become_halves_of_what_takes_part_in_errors() -> None:
+    made = arrays(50, np.random.default_rng(0))
+    dead = [3, 7, 49]
+    made["logit_opacities"][dead] = -9.0
+    made["logit_opacities"][7] = np.nan
+    before = {name: array.copy() for name, array in made.items()}
+    errors = np.zeros(50)
+    errors[[*dead, 10, 20, 30]] = 1.0  # that of the dead is nobody's
+    grown, moments = refined(made, errors, rate=0.0)
+    touched = [*dead, 10, 20, 30]
+    same = np.setdiff1d(np.arange(50), touched)
     for name, array in grown.items():
         assert np.array_equal(array[same], before[name][same]), name
-        assert (running[name][same] == 1).all() and not running[name][[*touched, 100, 101]].any(), name
-    assert np.array_equal(np.sort(grown["sh"][100:], axis=0), np.sort(before["sh"][touched], axis=0))
+        assert (moments[name][same] == 1).all() and not moments[name][touched].any(), name
+    sh = grown["sh"][touched]
+    assert {tuple(row.ravel()) for row in sh} == {tuple(row.ravel()) for row in before["sh"][[10, 20, 30]]}
+    assert (sigmoid(grown["logit_opacities"]) > OPEN).all()
+    assert (grown["logit_opacities"][[10, 20, 30]] < before["logit_opacities"][[10, 20, 30]]).all()
+
+
+@pytest.mark.parametrize("nobody", ["is alive", "takes part in errors"])
+def test_nothing_is_changed_where_nobody(nobody: str) -> None:
+    made = arrays(4, np.random.default_rng(0))
+    if nobody == "is alive":
+        made["logit_opacities"][:] = -20.0
+    before = made["means"].copy()
+    grown, moments = refined(made, np.full(4, float(nobody == "is alive")), rate=1.0)
+    assert np.array_equal(grown["means"], before) and (moments["means"] == 1).all()
+
+
+@pytest.mark.parametrize(("budget", "expected"), [(1000, 104), (102, 102), (100, 100), (10, 100)])
+def test_growth_stops_at_the_budget(budget: int, expected: int) -> None:
+    made = arrays(100, np.random.default_rng(0))
+    grown, moments = refined(made, np.ones(100), budget=budget)  # 1.25 % in each of four rounds
+    assert (
+        {len(array) for array in grown.values()} == {len(array) for array in moments.values()} == {expected}
+    )
+    assert (moments["sh"][100:] == 0).all()
+    assert all(array.dtype == np.float32 and array.flags.c_contiguous for array in grown.values())
+
+
+def test_what_has_most_of_the_error_is_cut_again_and_again() -> None:
+    """One with all of the error is two after the first round, four after the second, sixteen in the end."""
+    made = arrays(200, np.random.default_rng(0))
+    made["log_scales"][5] = 1.0
+    before = {name: array.copy() for name, array in made.items()}
+    grown, _ = refined(made, np.eye(200)[5], rate=0.2)
+    assert len(grown["means"]) == 200 + 15
+    parts = np.flatnonzero((grown["sh"] == before["sh"][5]).all(axis=(1, 2)))
+    assert len(parts) == 16 and 5 in parts
+    np.testing.assert_allclose(grown["means"][parts].mean(axis=0), before["means"][5], atol=1e-4)
+    assert np.exp(grown["log_scales"][parts]).prod(axis=1).max() < 0.3 * np.exp(3.0)  # of its volume
 
 
 @given(opacity=st.floats(0.02, 0.99), seed=st.integers(0, 99))
@@ -125,9 +107,7 @@ def test_two_halves_look_like_the_whole(opacity: float, seed: int) -> None:
     made = arrays(1, np.random.default_rng(seed))
     made["logit_opacities"][0] = np.log(opacity / (1 - opacity))
     whole = {name: array[0].astype(np.float64) for name, array in made.items()}
-    grown, _ = grow(
-        made, [], errors=np.ones(1), rate=1.0, budget=2, min_opacity=OPEN, rng=np.random.default_rng(1)
-    )
+    grown, _ = refined(made, np.ones(1), rate=4.0, budget=2)
     # They lie on either side of it, along its longest axis.
     np.testing.assert_allclose(grown["means"].mean(axis=0), whole["means"], atol=1e-6)
     longest = whole["log_scales"].argmax()
@@ -147,11 +127,13 @@ def test_two_halves_look_like_the_whole(opacity: float, seed: int) -> None:
 
 
 def test_samples_follow_the_weights() -> None:
-    drawn = sample(np.array([0.0, 1.0, 3.0, 0.0]), 40_000, np.random.default_rng(0))
-    counts = np.bincount(drawn, minlength=4)
+    weights, rng = np.array([0.0, 1.0, 3.0, 0.0]), np.random.default_rng(0)
+    first = np.array([sample_once(weights, 1, rng)[0] for _ in range(10_000)])
+    counts = np.bincount(first, minlength=4)
     assert counts[0] == counts[3] == 0
-    # Standard deviation of the count is sqrt(40000 * 1/4 * 3/4) = 87; five of them.
-    assert abs(counts[1] - 10_000) < 435
+    # Standard deviation of the count is sqrt(10000 * 1/4 * 3/4) = 43; five of them.
+    assert abs(counts[1] - 2_500) < 217
+    assert set(sample_once(weights, 2, rng)) == {1, 2}
 
 
 COUNT = 20_000

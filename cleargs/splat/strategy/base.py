@@ -24,7 +24,7 @@ class Strategy:
     def observe(self, engine: Engine, camera: Camera) -> None:
         """Called after every backward pass: ``engine`` knows the radii and gradients on the screen."""
 
-    def wants_errors(self, gaussians: Gaussians, step: int) -> bool:
+    def wants_errors(self, step: int) -> bool:
         """Whether `add_errors` is to be called in this step, which costs it another backward pass."""
         return False
 

@@ -1,14 +1,14 @@
 """Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
-As gsplat's MCMCStrategy does it, dead Gaussians move onto live ones, the number grows to a hard budget, and
-noise that only transparent Gaussians feel is added to the means. But growth follows the error: what takes
-part in pixels that are far from their frames (Rota Bulò et al., "Revising densification in Gaussian
-splatting", 2024) is cut in two along its longest axis (Deng et al., "Efficient density control", 2024). Drawn
-by opacity, copies at one place take long to part, and what lies in the dark or behind the sparse points gets
-none.
+As there, dead Gaussians move, the number grows to a hard budget, and noise that only transparent Gaussians
+feel is added to the means. But the error says where, not opacity: what takes part in pixels that are far from
+their frames (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024) is cut in two along its
+longest axis (Deng et al., "Efficient density control", 2024); the dead become halves, as the new ones are.
+Drawn by opacity, copies at one place take long to part, and what lies in the dark or behind the sparse points
+gets none.
 
-Relocation and growth are pure functions on numpy arrays: one thread, so the results depend on no thread
-count. The noise, of every step, is a kernel. A GPU has the same rules, and draws other random numbers.
+A refinement is a pure function on numpy arrays: one thread, so the results depend on no thread count. The
+noise, of every step, is a kernel. A GPU has the same rules, and draws other random numbers.
 """
 
 from __future__ import annotations
@@ -35,9 +35,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Arrays = dict[str, F32]
 
-MAX_COPIES = 51
-"""Most copies that equation 9 is evaluated for, as in gsplat (its sum over binomials loses digits beyond)."""
-
 NOISE_CUT = 0.15
 """Opacity above which the noise factor is under 1e-6, and is left out."""
 
@@ -45,6 +42,10 @@ NOISE_CUT = 0.15
 LOOKS = 5
 """Steps before a refinement whose errors say what is to grow, one frame each. Where refinements follow each
 other within eight times as many steps there are fewer, since each costs a backward pass."""
+
+ROUNDS = 4
+"""Rounds of a refinement, each with its share of the growth: a Gaussian with much of the error, such as a
+smear over half of a frame, is cut into up to sixteen."""
 
 PART = 0.7
 """How far the halves of a Gaussian lie from its middle, and their scale, as shares of its scale along its
@@ -60,14 +61,13 @@ class MCMC(Strategy):
         self._seed = tuple(seed)
         self._errors: Tensor | None = None  # [N]
 
-    def wants_errors(self, gaussians: Gaussians, step: int) -> bool:
-        """In the last steps up to a refinement at which there is room to grow."""
+    def wants_errors(self, step: int) -> bool:
+        """In the last steps up to a refinement."""
         config = self._config
         interval = config.refine_interval
         refined = -(-step // interval) * interval
         return (
-            gaussians.num < self._budget
-            and refined - step < min(LOOKS, max(1, interval // 8))
+            refined - step < min(LOOKS, max(1, interval // 8))
             and config.refine_start * config.length <= refined <= config.refine_stop * config.length
         )
 
@@ -76,9 +76,11 @@ class MCMC(Strategy):
         self._errors = errors.clone() if self._errors is None else self._errors + errors
 
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
-        """Relocate the dead and grow."""
+        """Cut what takes part in errors; without any there is nothing to do."""
         errors, self._errors = self._errors, None
-        return backend_for(gaussians.device).relocate_and_grow(
+        if errors is None:
+            return gaussians, moments
+        return backend_for(gaussians.device).refine(
             gaussians,
             moments,
             errors=errors,
@@ -108,90 +110,53 @@ class MCMC(Strategy):
         self._errors = state.get("errors")
 
 
-def sample(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``count`` indices with replacement, in proportion to ``weights`` [N] >= 0 (sum > 0)."""
-    cumulative = np.cumsum(weights, dtype=np.float64)
-    drawn = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
-    indices: NDArray[np.int64] = np.minimum(drawn, len(weights) - 1)
-    return indices
-
-
-def split_opacity(opacity: F64, copies: NDArray[np.int64]) -> tuple[F64, F64]:
-    """Opacity and scale factor with which ``copies`` [M] Gaussians at one place look like the one before.
-
-    Equation 9 of the paper: (opacities [M], factors on the scales [M]) from ``opacity`` [M] in (0, 1).
-    """
-    copies = np.minimum(copies, MAX_COPIES)
-    split = 1.0 - (1.0 - opacity) ** (1.0 / copies)
-    denominator = np.zeros_like(split)
-    for i in range(1, int(copies.max(initial=0)) + 1):
-        terms = sum(
-            math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1.0) * split ** (k + 1) for k in range(i)
-        )
-        denominator += np.where(i <= copies, terms, 0.0)
-    return split, opacity / denominator
-
-
-def relocate(
-    arrays: Arrays, moments: Sequence[Arrays], *, min_opacity: float, rng: np.random.Generator
-) -> int:
-    """Move dead Gaussians onto live ones drawn by opacity, in place; returns how many moved.
-
-    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
-    become 0 for every Gaussian that changed.
-    """
-    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
-    dead = np.flatnonzero(~(opacity > min_opacity))
-    alive = np.flatnonzero(opacity > min_opacity)
-    if not len(dead) or not len(alive):
-        return 0
-    sources = alive[sample(opacity[alive], len(dead), rng)]
-    changed = _split(arrays, sources, min_opacity)
-    for array in arrays.values():
-        array[dead] = array[sources]
-    for moment in moments:
-        for array in moment.values():
-            array[changed] = 0
-            array[dead] = 0
-    return len(dead)
-
-
-def grow(
+def refine(
     arrays: Arrays,
     moments: Sequence[Arrays],
     *,
-    errors: F64 | None,  # [N] >= 0
+    errors: F64,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
     rng: np.random.Generator,
 ) -> tuple[Arrays, list[Arrays]]:
-    """Cut Gaussians in two, drawn in proportion to ``errors`` (None: to their opacities): at most a share
-    ``rate``, never beyond ``budget``.
+    """Cut live Gaussians in two, drawn in proportion to ``errors``, in `ROUNDS` rounds. The other halves take
+    the places of the dead, and new ones: at most a share ``rate``, never beyond ``budget``.
 
-    Returns new arrays and moments. ``arrays`` and ``moments`` as in `relocate`; those given are changed and
-    must not be used again. The moments of both halves are 0.
+    ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
+    become 0 for both halves. Returns new ones; those given are changed and must not be used again.
     """
-    opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
-    weights = np.where(opacity > min_opacity, opacity if errors is None else errors, 0.0)
-    count = len(opacity)
-    extra = min(min(budget, int((1.0 + rate) * count)) - count, int((weights > 0.0).sum()))
-    if extra <= 0:
-        return arrays, list(moments)
-    cut = sample_once(weights, extra, rng)
-    others = _halves(arrays, cut, opacity[cut], min_opacity)
-    grown = {name: np.concatenate([array, others[name]]) for name, array in arrays.items()}
-    reset_moments = []
-    for moment in moments:
-        for array in moment.values():
-            array[cut] = 0
-        reset_moments.append(
-            {
-                name: np.concatenate([array, np.zeros((extra, *array.shape[1:]), array.dtype)])
-                for name, array in moment.items()
-            }
-        )
-    return grown, reset_moments
+    running = list(moments)
+    for _ in range(ROUNDS):
+        opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
+        alive = opacity > min_opacity  # not so is NaN
+        weights, dead = np.where(alive, errors, 0.0), np.flatnonzero(~alive)
+        count = len(opacity)
+        room = max(0, min(budget, int((1.0 + rate / ROUNDS) * count)) - count)
+        cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
+        others = _halves(arrays, cut, opacity[cut], min_opacity)
+        errors = np.concatenate([errors, np.zeros(max(0, len(cut) - len(dead)))])
+        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(cut)]
+        errors[cut] /= 2
+        errors[places] = errors[cut]
+        arrays = {name: _placed(array, places, others[name]) for name, array in arrays.items()}
+        for moment in running:
+            for array in moment.values():
+                array[cut] = 0
+        running = [
+            {name: _placed(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
+            for moment in running
+        ]
+    return arrays, running
+
+
+def _placed(array: F32, places: NDArray[np.int64], rows: F32) -> F32:
+    """``array`` with ``rows`` at ``places``, made longer where these lie behind its end."""
+    longer = max(len(array), 1 + int(places.max(initial=-1)))
+    if longer > len(array):
+        array = np.concatenate([array, np.zeros((longer - len(array), *array.shape[1:]), array.dtype)])
+    array[places] = rows
+    return array
 
 
 def sample_once(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -220,20 +185,6 @@ def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: F64, min_opacity: f
     arrays["means"][cut] -= away
     others["means"] += away
     return others
-
-
-def _split(arrays: Arrays, sources: NDArray[np.int64], min_opacity: float) -> NDArray[np.int64]:
-    """Give every Gaussian that ``sources`` names, once a copy, its share of opacity and scale, in place.
-
-    Returns their indices without repetition.
-    """
-    unique, counts = np.unique(sources, return_counts=True)
-    opacity = sigmoid(arrays["logit_opacities"][unique].astype(np.float64))
-    split, factor = split_opacity(opacity, counts + 1)
-    split = np.clip(split, min_opacity, 1.0 - 1e-7)
-    arrays["log_scales"][unique] += np.log(factor)[:, None].astype(np.float32)
-    arrays["logit_opacities"][unique] = np.log(split) - np.log1p(-split)
-    return unique
 
 
 def rotation_matrices(quaternions: F32) -> F32:

@@ -149,25 +149,28 @@ def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, sc
 # -- densification -----------------------------------------------------------------------------------------
 
 
-def relocate_and_grow(
+def refine(
     gaussians: Gaussians,
     moments: Moments,
     *,
-    errors: Tensor | None,
+    errors: Tensor,
     rate: float,
     budget: int,
     min_opacity: float,
     seed: Sequence[int],
 ) -> tuple[Gaussians, Moments]:
-    rng = np.random.default_rng([*seed])
     arrays = {name: tensor.numpy() for name, tensor in gaussians.tensors().items()}
     running = [
         {name: tensor.numpy() for name, tensor in group.items()} for group in (moments.first, moments.second)
     ]
-    mcmc.relocate(arrays, running, min_opacity=min_opacity, rng=rng)
-    weights = None if errors is None else errors.double().numpy()
-    arrays, running = mcmc.grow(
-        arrays, running, errors=weights, rate=rate, budget=budget, min_opacity=min_opacity, rng=rng
+    arrays, running = mcmc.refine(
+        arrays,
+        running,
+        errors=errors.double().numpy(),
+        rate=rate,
+        budget=budget,
+        min_opacity=min_opacity,
+        rng=np.random.default_rng([*seed]),
     )
     grown, first, second = (
         {name: torch.from_numpy(array) for name, array in group.items()} for group in (arrays, *running)

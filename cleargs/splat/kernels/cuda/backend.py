@@ -84,27 +84,24 @@ def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, sc
         gradients.log_scales += scale / gaussians.log_scales.numel() * gaussians.log_scales.exp()
 
 
-def relocate_and_grow(
+def refine(
     gaussians: Gaussians,
     moments: Moments,
     *,
-    errors: Tensor | None,
+    errors: Tensor,
     rate: float,
     budget: int,
     min_opacity: float,
     seed: Sequence[int],
 ) -> tuple[Gaussians, Moments]:
-    running = [moments.first, moments.second]
-    seeds = [densify.seed_of(*seed, part) for part in (0, 1)]
-    densify.relocate(gaussians, running, min_opacity=min_opacity, seed=seeds[0])
-    gaussians, running = densify.grow(
+    gaussians, running = densify.refine(
         gaussians,
-        running,
+        [moments.first, moments.second],
         errors=errors,
         rate=rate,
         budget=budget,
         min_opacity=min_opacity,
-        seed=seeds[1],
+        seed=densify.seed_of(*seed),
     )
     return gaussians, Moments(*running)
 

@@ -1,8 +1,7 @@
-"""Relocation, growth and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.mcmc``.
+"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.mcmc``.
 
-Relocation and growth happen every so many steps and are torch operations; the noise of every step is one
-kernel. Draws come from Philox counters keyed by the step's seed. Gaussians are drawn through integer prefix
-sums, whose order of addition does not matter: the same device draws the same Gaussians each time.
+A refinement happens every so many steps and is made of torch operations; the noise of every step is one
+kernel. Draws come from Philox counters keyed by the step's seed: the same device draws the same each time.
 """
 
 from __future__ import annotations
@@ -22,8 +21,6 @@ from cleargs.splat.kernels.reference import rotation_matrices
 from cleargs.splat.strategy import mcmc
 
 BLOCK = 256
-WEIGHT_BITS = 32
-"""Opacities are drawn from in units of 2^-32; twenty million of them stay below 2^63."""
 
 
 def seed_of(*numbers: int) -> int:
@@ -36,100 +33,52 @@ def generator_of(seed: int, device: torch.device) -> torch.Generator:
     return torch.Generator(device).manual_seed(seed)
 
 
-def sample(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` indices with replacement, in proportion to ``weights`` [N] in [0, 1], not all 0."""
-    cumulative = (weights.double() * 2.0**WEIGHT_BITS).long().cumsum(0)
-    draws = torch.rand(count, generator=generator, dtype=torch.float64, device=weights.device)
-    return torch.searchsorted(cumulative, (draws * cumulative[-1]).long(), right=True).clamp_max(
-        len(weights) - 1
-    )
-
-
-def split_opacity(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """``mcmc.split_opacity`` on float64 tensors [M].
-
-    The double sum of the paper's equation 9 is one sum here, as C(0, k) + ... + C(c - 1, k) = C(c, k + 1).
-    """
-    most = mcmc.MAX_COPIES
-    table = torch.tensor(
-        [
-            [(-1.0) ** k / math.sqrt(k + 1.0) * math.comb(c, k + 1) for k in range(most)]
-            for c in range(most + 1)
-        ],
-        dtype=torch.float64,
-        device=opacity.device,
-    )
-    copies = copies.clamp_max(most)
-    split = 1.0 - (1.0 - opacity) ** (1.0 / copies.double())
-    denominator = torch.zeros_like(split)
-    power = split.clone()
-    for k in range(most):
-        denominator += table[copies, k] * power
-        power *= split
-    return split, opacity / denominator
-
-
-def relocate(
-    gaussians: Gaussians, moments: Sequence[dict[str, Tensor]], *, min_opacity: float, seed: int
-) -> int:
-    """Move dead Gaussians onto live ones drawn by opacity, in place; returns how many moved.
-
-    ``moments`` are the optimiser's running means by parameter; those of every Gaussian that changed become 0.
-    """
-    opacity = gaussians.logit_opacities.double().sigmoid()
-    alive = opacity > min_opacity
-    dead = torch.nonzero(~alive).squeeze(1)
-    if len(dead) in (0, gaussians.num):
-        return 0
-    generator = generator_of(seed, gaussians.device)
-    sources = sample(torch.where(alive, opacity, 0.0), len(dead), generator)
-    changed = _split(gaussians, sources, min_opacity)
-    for tensor in gaussians.tensors().values():
-        tensor[dead] = tensor[sources]
-    for moment in moments:
-        for tensor in moment.values():
-            tensor[changed] = 0
-            tensor[dead] = 0
-    return len(dead)
-
-
-def grow(
+def refine(
     gaussians: Gaussians,
     moments: Sequence[dict[str, Tensor]],
     *,
-    errors: Tensor | None,  # [N] >= 0
+    errors: Tensor,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
     seed: int,
 ) -> tuple[Gaussians, list[dict[str, Tensor]]]:
-    """Cut Gaussians in two, drawn in proportion to ``errors`` (None: to their opacities): at most a share
-    ``rate``, never beyond ``budget``.
-
-    Returns new Gaussians and moments; those given are changed and must not be used again.
-    """
-    opacity = gaussians.logit_opacities.double().sigmoid()
-    weights = torch.where(opacity > min_opacity, opacity if errors is None else errors.double(), 0.0)
-    count = gaussians.num
-    extra = min(min(budget, int((1.0 + rate) * count)) - count, int((weights > 0.0).sum()))
-    if extra <= 0:
-        return gaussians, list(moments)
-    cut = sample_once(weights, extra, generator_of(seed, gaussians.device))
-    others = _halves(gaussians, cut, opacity[cut], min_opacity)
-    grown = Gaussians(
-        **{name: torch.cat([tensor, others[name]]) for name, tensor in gaussians.tensors().items()}
-    )
-    reset_moments = []
-    for moment in moments:
-        for tensor in moment.values():
-            tensor[cut] = 0
-        reset_moments.append(
-            {
-                name: torch.cat([tensor, tensor.new_zeros(extra, *tensor.shape[1:])])
-                for name, tensor in moment.items()
-            }
+    """``mcmc.refine``. What is given is changed and must not be used again."""
+    running, generator = list(moments), generator_of(seed, gaussians.device)
+    errors = errors.double()
+    for _ in range(mcmc.ROUNDS):
+        opacity = gaussians.logit_opacities.double().sigmoid()
+        alive = opacity > min_opacity
+        weights, dead = torch.where(alive, errors, 0.0), torch.nonzero(~alive).squeeze(1)
+        count = gaussians.num
+        room = max(0, min(budget, int((1.0 + rate / mcmc.ROUNDS) * count)) - count)
+        cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), generator)
+        others = _halves(gaussians, cut, opacity[cut], min_opacity)
+        errors = torch.cat([errors, errors.new_zeros(max(0, len(cut) - len(dead)))])
+        new = torch.arange(count, len(errors), device=dead.device)
+        places = torch.cat([dead, new])[: len(cut)]
+        errors[cut] /= 2
+        errors[places] = errors[cut]
+        gaussians = Gaussians(
+            **{name: _placed(tensor, places, others[name]) for name, tensor in gaussians.tensors().items()}
         )
-    return grown, reset_moments
+        for moment in running:
+            for tensor in moment.values():
+                tensor[cut] = 0
+        running = [
+            {name: _placed(tensor, places, torch.zeros_like(others[name])) for name, tensor in moment.items()}
+            for moment in running
+        ]
+    return gaussians, running
+
+
+def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
+    """``mcmc._placed``."""
+    longer = max(len(tensor), 1 + int(places.max())) if len(places) else len(tensor)
+    if longer > len(tensor):
+        tensor = torch.cat([tensor, tensor.new_zeros(longer - len(tensor), *tensor.shape[1:])])
+    tensor[places] = rows
+    return tensor
 
 
 def sample_once(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -151,22 +100,6 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
     gaussians.means[cut] -= away
     others["means"] += away
     return others
-
-
-def _split(gaussians: Gaussians, sources: Tensor, min_opacity: float) -> Tensor:
-    """Give every Gaussian that ``sources`` names, once a copy, its share of opacity and scale, in place.
-
-    Returns their indices without repetition.
-    """
-    counts = torch.zeros(gaussians.num, dtype=torch.int64, device=gaussians.device)
-    counts.scatter_add_(0, sources, torch.ones_like(sources))
-    unique = torch.nonzero(counts).squeeze(1)
-    opacity = gaussians.logit_opacities[unique].double().sigmoid()
-    split, factor = split_opacity(opacity, counts[unique] + 1)
-    split = split.clamp(min_opacity, 1.0 - 1e-7)
-    gaussians.log_scales[unique] += factor.log().float()[:, None]
-    gaussians.logit_opacities[unique] = (split.log() - torch.log1p(-split)).float()
-    return unique
 
 
 @triton.jit(do_not_specialize=["n", "seed"])
