@@ -103,8 +103,8 @@ class TrainConfig(BaseModel):
     strategy: str = Field(
         "mcmc",
         json_schema_extra={"plugin": "strategies"},
-        description="how the Gaussians change; mcmc: cut where the error is, up to the budget; adaptive: cloned and "
-        "split by their gradients on the screen, as in 3DGS; or one that another package brings",
+        description="how the Gaussians change; mcmc: cut where the error is, up to the budget; adaptive: "
+        "cloned and split by their gradients on the screen, as in 3DGS; or one that another package brings",
     )
     adaptive: AdaptiveConfig = Field(AdaptiveConfig(), description="the strategy adaptive")
     budget: int | None = Field(

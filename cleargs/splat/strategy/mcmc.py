@@ -126,13 +126,14 @@ def refine(
     ``arrays`` are the parameters by name (first axis N), ``moments`` the optimiser's running means, which
     become 0 for both halves. Returns new ones; those given are changed and must not be used again.
     """
-    running = list(moments)
-    for _ in range(ROUNDS):
+    running, start = list(moments), len(errors)
+    growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
+    for done in range(1, ROUNDS + 1):
         opacity = sigmoid(arrays["logit_opacities"].astype(np.float64))
         alive = opacity > min_opacity  # not so is NaN
         weights, dead = np.where(alive, errors, 0.0), np.flatnonzero(~alive)
         count = len(opacity)
-        room = max(0, min(budget, int((1.0 + rate / ROUNDS) * count)) - count)
+        room = max(0, start + growth * done // ROUNDS - count)
         cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
         others = _halves(arrays, cut, opacity[cut], min_opacity)
         errors = np.concatenate([errors, np.zeros(max(0, len(cut) - len(dead)))])

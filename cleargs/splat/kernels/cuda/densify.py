@@ -45,13 +45,14 @@ def refine(
 ) -> tuple[Gaussians, list[dict[str, Tensor]]]:
     """``mcmc.refine``. What is given is changed and must not be used again."""
     running, generator = list(moments), generator_of(seed, gaussians.device)
-    errors = errors.double()
-    for _ in range(mcmc.ROUNDS):
+    errors, start = errors.double(), gaussians.num
+    growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
+    for done in range(1, mcmc.ROUNDS + 1):
         opacity = gaussians.logit_opacities.double().sigmoid()
         alive = opacity > min_opacity
         weights, dead = torch.where(alive, errors, 0.0), torch.nonzero(~alive).squeeze(1)
         count = gaussians.num
-        room = max(0, min(budget, int((1.0 + rate / mcmc.ROUNDS) * count)) - count)
+        room = max(0, start + growth * done // mcmc.ROUNDS - count)
         cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), generator)
         others = _halves(gaussians, cut, opacity[cut], min_opacity)
         errors = torch.cat([errors, errors.new_zeros(max(0, len(cut) - len(dead)))])
