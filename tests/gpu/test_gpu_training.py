@@ -145,18 +145,18 @@ def test_a_refinement_is_that_of_the_cpu(device, densify):
     """Two Gaussians have all of the error: there are places for all that they are cut into, and no draws."""
     gaussians = crowd(40, device)
     dead = int((gaussians.logit_opacities.sigmoid() <= 0.01).sum())
-    assert dead == 13  # 2, 4, and of 8 all but one, which is new; then there is no place left
+    assert dead == 13  # 2, 4, and of 8 all but one, which is new, as 16 more are
     errors = torch.zeros(40, device=device)
     errors[[20, 33]] = 2.0
     moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
     arrays = {name: tensor.cpu().numpy().copy() for name, tensor in gaussians.tensors().items()}
     running = [{name: np.ones_like(array) for name, array in arrays.items()}]
-    settings = {"rate": 0.5, "budget": 41, "min_opacity": 0.01}
+    settings = {"rate": 0.5, "budget": 57, "min_opacity": 0.01}
     grown, (reset,) = densify.refine(gaussians, moments, errors=errors, seed=1, **settings)
     expected, (emptied,) = mcmc.refine(
         arrays, running, errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
     )
-    assert grown.num == len(expected["means"]) == 41
+    assert grown.num == len(expected["means"]) == 57
     order = np.argsort(grown.means[:, 0].cpu().numpy()), np.argsort(expected["means"][:, 0])
     for name, tensor in grown.tensors().items():
         # float32 on both sides, but for the opacities.
