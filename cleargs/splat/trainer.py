@@ -348,7 +348,7 @@ class Trainer:
         config = self._config
         between = config.refine_start * self.length <= self.done <= config.refine_stop * self.length
         if between and self.done % config.refine_interval == 0:
-            self.check_finite()  # relocation takes a Gaussian whose opacity is NaN for dead, and hides it
+            self.check_finite()  # a refinement takes one whose opacity is NaN for dead, and hides it
             self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, self.done)
         self._strategy.after_step(self._gaussians, self._rates.means(self.done), self.done)
 
