@@ -96,8 +96,10 @@ while True:
         [
             sys.executable,
             "-c",
-            "import sys; from pathlib import Path; from cleargs.capture.child import run_child; "
+            "import signal, sys; from pathlib import Path; from cleargs.capture.child import run_child; "
             "from cleargs.progress import SilentReporter; "
+            # Tests in the background of a shell inherit that it is ignored.
+            "signal.signal(signal.SIGINT, signal.default_int_handler); "
             f"note = {str(note)!r}; "
             f"run_child({module.stem!r}, Path(note), Path(note + '.log'), SilentReporter())",
         ],
