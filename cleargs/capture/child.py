@@ -77,8 +77,8 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
     StoreError where the disk is full.
     Whatever ends this call early (Ctrl-C above all) kills the child first.
     """
-    # Sums in COLMAP's and numpy's linear algebra must not depend on threads; features and matches of several
-    # frames at a time are found by threads of COLMAP's own, that many as the job says.
+    # Sums in COLMAP's and numpy's linear algebra must not depend on threads. Features of several frames at a
+    # time are found by threads of COLMAP's own, matches by processes, as many as the job says.
     environment = {
         **os.environ,
         **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),

@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 from cleargs.capture.child import reports_to_parent
@@ -36,10 +36,12 @@ def match_pairs(
     """Match and verify the pairs of frames (numbers in ``names``) that ``database`` has no matches of yet.
 
     Equal for any number of processes. ``done`` is told how many pairs are through, from any thread. Raises
-    ChildProcessError when a process fails.
+    ChildProcessError when a process fails, sqlite3.DatabaseError when its matches cannot be gathered.
     """
     for leftover in sorted(database.parent.glob(f"{database.stem}-share*.db")):
-        _gather(database, leftover)
+        with suppress(sqlite3.DatabaseError):  # damaged by whatever killed it: matched again
+            _gather(database, leftover)
+        _remove(leftover)
     with pycolmap.Database.open(database) as opened:
         todo = [pair for pair in pairs if not opened.exists_matches(pair[0] + 1, pair[1] + 1)]
     through = len(pairs) - len(todo)
@@ -64,6 +66,7 @@ def match_pairs(
         list(pool.map(lambda share: _in_a_process(share, seed, count), shares))
     for share in shares:
         _gather(database, share)
+        _remove(share)
 
 
 def _in_a_process(share: Path, seed: int, count: Callable[[int], None]) -> None:
@@ -78,16 +81,18 @@ def _in_a_process(share: Path, seed: int, count: Callable[[int], None]) -> None:
 
 
 def _gather(database: Path, share: Path) -> None:
-    """Move the matches in ``share`` to ``database``; those in a damaged file are lost."""
+    """Copy the matches in ``share`` to ``database``. Raises sqlite3.DatabaseError, and copies none, where one
+    cannot be read or the other not be written."""
     with closing(sqlite3.connect(database)) as opened:
-        try:
-            opened.execute("ATTACH ? AS share", (str(share),))
-            if opened.execute("PRAGMA share.integrity_check").fetchone() == ("ok",):
-                for table in ("matches", "two_view_geometries"):
-                    opened.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table}")
-                opened.commit()
-        except sqlite3.DatabaseError:
-            opened.rollback()
+        opened.execute("ATTACH ? AS share", (str(share),))
+        if opened.execute("PRAGMA share.integrity_check").fetchone() != ("ok",):
+            raise sqlite3.DatabaseError(f"{share} is damaged")
+        for table in ("matches", "two_view_geometries"):
+            opened.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table}")
+        opened.commit()
+
+
+def _remove(share: Path) -> None:
     for leftover in share.parent.glob(f"{share.stem}.*"):
         leftover.unlink()
 

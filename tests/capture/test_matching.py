@@ -60,7 +60,8 @@ def test_matches_of_a_killed_run_are_gathered(database: Path, monkeypatch: pytes
     whole.write_bytes(database.read_bytes())
     match(whole, 1)
     with monkeypatch.context() as patch:
-        patch.setattr(matching, "_gather", lambda *_: None)  # as if killed before the end
+        for last in ("_gather", "_remove"):  # as if killed before the end
+            patch.setattr(matching, last, lambda *_: None)
         match(database, 3)
     assert not matches(database)
     (database.with_name("database-share1.db")).write_bytes(b"SQLite format 3\0 no longer")
@@ -72,4 +73,13 @@ def test_a_process_that_dies_is_told(database: Path, monkeypatch: pytest.MonkeyP
     killer = [os.path.realpath("/bin/sh"), "-c", f"kill -{int(signal.SIGKILL)} $$"]
     monkeypatch.setattr(matching, "module_command", lambda *_: killer)
     with pytest.raises(ChildProcessError, match="ended with -9"):
+        match(database, 1)
+
+
+def test_matches_that_cannot_be_gathered_are_not_passed_over(
+    database: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk, say: SfM with a part of the matches would be taken for done."""
+    monkeypatch.setattr(matching, "_in_a_process", lambda share, *_: share.write_bytes(b"no database"))
+    with pytest.raises(sqlite3.DatabaseError):
         match(database, 1)
