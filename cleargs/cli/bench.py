@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import click
 
 from cleargs.cli.common import json_option, output_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.session import resolve_device
+from cleargs.splat.effort import Quality
 
 
 @click.group()
@@ -189,6 +190,69 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
         write_json(out / "formation.json", values)
         plot_formation(out / "formation.png", benchmark)
     _tell(text, values, out and out / "formation.md", as_json)
+
+
+@bench.command(
+    epilog="""\b
+Examples:
+  cleargs bench quality fox bonsai -o bench                draft and standard
+  cleargs bench quality fox -o bench --quality high        one of them
+  cleargs bench quality fox -o bench --until g0 --set ingest.max_size=473
+"""
+)
+@click.argument(
+    "captures", metavar="INPUT...", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)
+)
+@output_option("Folder to fill; what is finished there is not made again.", "out")
+@click.option(
+    "--quality",
+    "qualities",
+    multiple=True,
+    type=click.Choice(get_args(Quality)),
+    default=("draft", "standard"),
+    show_default=True,
+    help="What trainings may cost; give it several times.",
+)
+@click.option("--until", default="consolidate", show_default=True, help="The stage whose scene is judged.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="STAGE.FIELD=VALUE",
+    help="Change one setting of all runs (cleargs settings lists them).",
+)
+@click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
+@json_option
+@quiet_option
+def quality(
+    captures: tuple[Path, ...],
+    out: Path,
+    qualities: tuple[Quality, ...],
+    until: str,
+    overrides: tuple[str, ...],
+    threads: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """What each --quality takes on real captures, and what it reaches on frames kept apart.
+
+    Runs every capture at every quality, every eighth frame held out; the folder gets quality.md, quality.json
+    and quality.png beside the runs. Minutes are those of a machine with nothing else to do.
+    """
+    from cleargs.bench.quality_cost import QualityPlan, run
+    from cleargs.bench.quality_report import plot_quality, quality_markdown
+    from cleargs.files import write_bytes, write_json
+    from cleargs.pipeline.config import named_value
+    from cleargs.splat.kernels.runtime import warm_up
+
+    plan = QualityPlan(captures, qualities, dict(map(named_value, overrides)), until, threads_or_all(threads))
+    warm_up()
+    benchmark = run(plan, out, make_reporter(quiet))
+    text, values = quality_markdown(benchmark), benchmark.as_json()
+    write_bytes(out / "quality.md", text.encode())
+    write_json(out / "quality.json", values)
+    plot_quality(out / "quality.png", benchmark)
+    _tell(text, values, out / "quality.md", as_json)
 
 
 def _tell(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
