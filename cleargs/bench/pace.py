@@ -45,7 +45,7 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
     pace = remembered_pace()
     if pace is not None or say is None:
         return 1.0 if pace is None else pace
-    say("measuring the pace of this machine, once")
+    say("measuring the pace of this machine (once; kernels may have to be compiled for it)")
     milliseconds = _measured()
     if milliseconds is None:
         return 1.0
