@@ -18,6 +18,16 @@ OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images",
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy")
 
+# Wall seconds on two cores: a frame's features, fixed and a megapixel; a pair's matches, fixed and a square
+# megapixel, since each feature is compared with each; of at most so many features a megapixel.
+_FEATURES_S, _FEATURES_S_PER_MEGAPIXEL = 0.015, 0.7
+_PAIR_S, _PAIR_S_PER_SQUARE_MEGAPIXEL = 0.0025, 0.15
+_FEATURES_A_MEGAPIXEL = 7000
+# And of one core: until COLMAP's process is there; then a megapixel of a frame, to read and undistort it, to
+# map it without and with a pose.
+_START_S = 1.0
+_FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 0.85, 0.2
+
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
     """The files and folders of the capture that are read."""
@@ -29,7 +39,8 @@ def preflight(config: IngestConfig) -> None:
 
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
-    """From the number of frames, their size, and the number of pairs to match (measured on two cores)."""
+    """From the number of frames, their size, and the number of pairs to match."""
+    from cleargs.capture.cost import pace
     from cleargs.capture.prepare import reduced_size
     from cleargs.capture.sources import frame_size, open_capture
 
@@ -45,10 +56,15 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
     pairs = count * (count - 1) / 2 if count < config.exhaustive_below else distant
     megapixels = megapixels_at(max(config.feature_size, config.max_size))
     found_anew = capture.model is None
-    # Seconds of one core: a frame's features, a pair's matches, a frame's share of the mapping.
-    parallel = (2.0 * megapixels * count + 0.07 * pairs) if found_anew else 0.0
-    alone = count * (0.4 * megapixels + (0.0 if capture.posed else 0.5))
-    seconds = parallel / max(1, context.threads) + alone
+    alone = _FRAME_S * megapixels * count
+    parallel = 0.0
+    if found_anew:
+        alone += _START_S
+        parallel += count * (_FEATURES_S + _FEATURES_S_PER_MEGAPIXEL * megapixels)
+        matched = min(megapixels, config.max_features / _FEATURES_A_MEGAPIXEL)
+        parallel += pairs * (_PAIR_S + _PAIR_S_PER_SQUARE_MEGAPIXEL * matched**2)
+        alone += (_TRIANGULATION_S if capture.posed else _MAPPING_S) * megapixels * count
+    seconds = parallel * pace(context.threads) + alone
     disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if found_anew else 0.0)
     return Estimate(
         minutes=seconds / 60,

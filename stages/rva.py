@@ -17,7 +17,7 @@ OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
 
-_FRAMES_PER_MINUTE = 600  # frames of about 1 MP on one core, decoding included
+_SECONDS_A_MEGAPIXEL = 0.1  # on one core, decoding included
 _REPLIES_PER_MINUTE = 20  # of a vision-language model, one at a time: a guess, since the server is unknown
 
 
@@ -38,13 +38,13 @@ def preflight(config: RvaConfig) -> None:
 
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
     """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
+    from cleargs.capture.cost import capture_size
+
     config = context.config
-    if "ingest" in context.inputs:
-        frames = sum(1 for _ in (context.inputs["ingest"] / "images").iterdir())
-    else:
-        frames = context.expected["ingest"].frames
+    frames, megapixels = capture_size(context)
     if config.evaluator != "qwen3-vl":
-        return Estimate(minutes=frames / (_FRAMES_PER_MINUTE * context.threads), memory_gb=0.3, disk_gb=0.001)
+        seconds = _SECONDS_A_MEGAPIXEL * megapixels * frames / context.threads
+        return Estimate(minutes=seconds / 60, memory_gb=0.3, disk_gb=0.001)
     at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
     folders = externals(config, context.source).values()
     weights = sum(file.stat().st_size for folder in folders for file in folder.glob("*"))

@@ -6,13 +6,13 @@ import os
 import platform
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import cleargs
 from cleargs.bench.benchmark_plan import Case
 from cleargs.bench.oracle import Accuracy
 from cleargs.bench.peaks import Peaks
+from cleargs.bench.processor import processor_name
 from cleargs.bench.roofline import Roof
 from cleargs.bench.timing import Quartiles
 from cleargs.bench.work import Size
@@ -106,7 +106,7 @@ def named(items: list[tuple[str, Any]]) -> dict[str, Any]:
 def describe_machine(load_before: float) -> Machine:
     """This machine, at the end of the measurements."""
     return Machine(
-        processor=_processor(),
+        processor=processor_name(),
         cores=len(os.sched_getaffinity(0)),
         versions={
             "cleargs": cleargs.__version__,
@@ -116,12 +116,3 @@ def describe_machine(load_before: float) -> Machine:
         load_before=load_before,
         load_after=os.getloadavg()[0],
     )
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()

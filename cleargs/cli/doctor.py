@@ -14,6 +14,7 @@ from typing import Literal
 import click
 
 import cleargs
+from cleargs.bench.pace import remembered_pace
 from cleargs.cli.common import json_option, print_json
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 
@@ -56,6 +57,7 @@ def doctor(folder: Path, as_json: bool) -> int:
         _memory(),
         _disk(folder),
         _device(),
+        _pace(),
         _writable("runs", folder),
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
         _writable("temporary files", Path(tempfile.gettempdir())),
@@ -99,6 +101,12 @@ def _device() -> Finding:
     if obstacle is None:
         return Finding("device", "note", f"cpu; {UNUSED_GPU}")
     return Finding("device", "ok", f"cpu ({obstacle})")
+
+
+def _pace() -> Finding:
+    pace = remembered_pace()
+    text = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
+    return Finding("pace", "ok", text)
 
 
 def _writable(what: str, folder: Path) -> Finding:

@@ -10,6 +10,12 @@ from typing import cast
 from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
 
+Say = Callable[[str], None]
+
+
+def _same_pace(say: Say | None) -> float:
+    return 1.0
+
 
 @dataclass(frozen=True)
 class Dag:
@@ -17,6 +23,9 @@ class Dag:
 
     names: tuple[str, ...]
     load: Callable[[str], Stage]
+    pace: Callable[[Say | None], float] = _same_pace
+    """This machine's time over what the stages' estimates were made for. It may take seconds to measure, and
+    is measured only where somebody is told (``say``)."""
 
     def check(self, name: str) -> str:
         """``name``, when there is such a stage. Raises InputError with the nearest name otherwise."""
@@ -34,7 +43,8 @@ class Dag:
 
 def installed() -> Dag:
     """The stages of the package ``cleargs.stages``. Each module is loaded when it is first asked for."""
-    return Dag(tuple(import_module("cleargs.stages").STAGES), load_stage)
+    package = import_module("cleargs.stages")
+    return Dag(tuple(package.STAGES), load_stage, package.pace)
 
 
 def load_stage(name: str) -> Stage:

@@ -22,6 +22,9 @@ from cleargs.progress import Reporter
 MIN_ADDRESS_SPACE_GB = 2.0
 """What the libraries reserve before any work is done."""
 
+WORTH_MEASURING_MIN = 2.0
+"""Minutes of expected work from which it is worth seconds to measure how fast this machine is."""
+
 NOT_MADE = "not made yet"
 """Why the results of a stage are not there that the run never had."""
 
@@ -80,6 +83,7 @@ class Planner:
     store: Store
     threads: int
     reporter: Reporter
+    _pace: float | None = field(default=None, repr=False)
     _estimates: dict[tuple[str, tuple[str, ...] | None], Estimate] = field(default_factory=dict, repr=False)
 
     def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
@@ -158,9 +162,34 @@ class Planner:
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
+    @property
+    def pace(self) -> float:
+        """By which estimates are multiplied: this machine's time over that of the one they were made on."""
+        if self._pace is None:
+            self._pace = self.dag.pace(None)
+        return self._pace
+
+    def at_measured_pace(self, plans: list[StagePlan]) -> list[StagePlan]:
+        """``plans`` with the costs on this machine, whose pace is measured now unless it is known.
+
+        Short work is over before a better estimate of it is worth anything; of a GPU's nothing is measured.
+        """
+        costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
+        if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
+            return plans
+        before, self._pace = self.pace, self.dag.pace(self.reporter.info)
+        factor = self._pace / before
+        return [
+            plan if plan.estimate is None else replace(plan, estimate=plan.estimate.at_pace(factor))
+            for plan in plans
+        ]
+
     def estimate(self, name: str, done: Mapping[str, Manifest] | None = None) -> Estimate:
-        """Rough cost of ``name``, from its settings, the finished stages before it (without ``done``: those
-        that the run shows), and what the others expect."""
+        """Rough cost of ``name`` on this machine, from its settings, the finished stages before it (without
+        ``done``: those that the run shows), and what the others expect."""
+        return self._estimate(name, done).at_pace(self.pace)
+
+    def _estimate(self, name: str, done: Mapping[str, Manifest] | None) -> Estimate:
         known = (name, None if done is None else tuple(done))
         if known in self._estimates:
             return self._estimates[known]
@@ -172,7 +201,7 @@ class Planner:
             elif done is None and linked_manifest(self.run.folder, upstream) is not None:
                 inputs[upstream] = (self.run.folder / upstream).resolve()
             else:
-                expected[upstream] = self.estimate(upstream, done)
+                expected[upstream] = self._estimate(upstream, done)
         nowhere = self.store.root / "work" / "estimate"
         out, checkpoints = nowhere / "out", nowhere / "checkpoints"
         context = self.context(name, inputs, self._externals(name), out, checkpoints)

@@ -77,6 +77,7 @@ class Runner:
             if plan.state != "hit":
                 self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
+        plans = self.planner.at_measured_pace(plans)
         for line in (*redo_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
@@ -65,6 +65,10 @@ class Estimate:
     """Frames that the stage will publish; 0 where it publishes none."""
     megapixels: float = 0.0
     """Of one of them."""
+
+    def at_pace(self, pace: float) -> Estimate:
+        """Where all takes ``pace`` times as long."""
+        return replace(self, minutes=pace * self.minutes)
 
 
 class Stage(Protocol):

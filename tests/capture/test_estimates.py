@@ -49,6 +49,16 @@ def test_size_and_number_of_frames_come_from_the_files(photos: Path) -> None:
     assert few["ingest"].frames == 10 and few["rivr"].minutes < plain["rivr"].minutes
 
 
+def test_scoring_and_the_first_scene_follow_the_capture_too(photos: Path) -> None:
+    plain, small = costs(photos), costs(photos, "ingest.max_size=400")
+    assert small["rva"].minutes == pytest.approx(plain["rva"].minutes / 4)
+    # A scene starts from the sparse points, of which frames leave many before anything is known of them.
+    least = {
+        points: costs(photos, "g0.budget=90_000", f"g0.min_points={points}") for points in (1, 3000, 10_000)
+    }
+    assert least[1]["g0"].minutes == least[3000]["g0"].minutes < least[10_000]["g0"].minutes
+
+
 def test_threads_count(photos: Path) -> None:
     one, two, eight = (costs(photos, threads=threads) for threads in (1, 2, 8))
     for stage in ("ingest", "g0", "rivr", "consolidate"):

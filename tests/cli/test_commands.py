@@ -505,6 +505,16 @@ def test_the_doctor_notes_a_gpu_that_is_not_used(
         assert found["state"] == state and words in found["text"]
 
 
+def test_the_doctor_tells_the_pace(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for pace, words in ((None, "not measured yet"), (0.934, "takes 0.93 of the reference machine's time")):
+        monkeypatch.setattr("cleargs.cli.doctor.remembered_pace", lambda pace=pace: pace)
+        invoke(["doctor", "--json"])
+        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "pace")
+        assert found == {"what": "pace", "state": "ok", "text": words}
+
+
 def test_elsewhere_than_on_linux_it_says_so() -> None:
     script = "import sys; sys.platform = 'darwin'; from cleargs.cli.entry import main; main()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

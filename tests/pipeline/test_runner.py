@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,13 @@ from toy import Bench
 
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.manifest import read_manifest, write_manifest
+from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.stage import Estimate
+from cleargs.pipeline.store import Store
 
 
 def stages_run(bench: Bench) -> list[str]:
@@ -225,9 +229,7 @@ def test_stage_that_forgets_an_output_fails(bench: Bench) -> None:
 
 
 def test_single_stage_needs_those_before_it(bench: Bench) -> None:
-    from cleargs.pipeline.digest import DigestMemo
     from cleargs.pipeline.runner import Runner
-    from cleargs.pipeline.store import Store
 
     bench.run(until="count")
     bench.work_done()
@@ -253,9 +255,58 @@ def test_full_disk_is_noticed_before_work(bench: Bench) -> None:
     assert bench.work_done() == [] and not bench.folder.exists()
 
 
+@dataclass
+class Machine:
+    """Where all takes twice as long, once that is measured."""
+
+    measured: int = 0
+
+    def pace(self, say: Callable[[str], None] | None) -> float:
+        if say is not None:
+            self.measured += 1
+        return 2.0 if self.measured else 1.0
+
+    def under(self, bench: Bench) -> Bench:
+        return replace(bench, dag=replace(bench.dag, pace=self.pace))
+
+
+def expected(bench: Bench) -> list[str]:
+    return [line.partition(":")[0] for line in bench.remarks.lines if "expected about" in line]
+
+
+def test_long_work_is_told_at_the_pace_of_this_machine(bench: Bench) -> None:
+    machine = Machine()
+    machine.under(bench).run("count.limit=3")
+    assert machine.measured == 1
+    assert expected(bench) == ["expected about 12.8 min", "now expected about 6.6 min"]
+    known = machine.under(bench).plan("square.power=3", "count.mode=padded")
+    costs = [plan.estimate.minutes for plan in known.values() if plan.estimate is not None]
+    assert costs == pytest.approx([0.2, 12.0, 0.6]), "also where it is only remembered"
+
+
+def test_short_work_and_that_of_a_gpu_is_not_worth_a_measurement(bench: Bench) -> None:
+    machine = Machine()
+    slow = machine.under(bench)
+    slow.run(until="count")
+    slow.plan()
+    slow.run()
+    assert machine.measured == 1 and slow.run() and machine.measured == 1
+    on_gpu = replace(bench.settings(["square.power=3"]), device="cuda")
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        planner = Planner(slow.dag, on_gpu, Store(on_gpu.store, memo), 1, bench.remarks)
+        assert planner.at_measured_pace(plans := planner.plan()) == plans
+    assert machine.measured == 1
+
+
+def test_the_pace_changes_no_key_and_no_result(bench: Bench) -> None:
+    before = [(outcome.manifest.key, outcome.manifest.digest) for outcome in bench.run()]
+    machine = Machine()
+    after = machine.under(bench).run(force=("count", "square", "total"))
+    assert machine.measured == 1 and {outcome.how for outcome in after} == {"made"}
+    assert [(outcome.manifest.key, outcome.manifest.digest) for outcome in after] == before
+
+
 def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:
-    from cleargs.pipeline.digest import DigestMemo
-    from cleargs.pipeline.store import Store
 
     bench.run()
     other = tmp_path / "other"
@@ -270,9 +321,7 @@ def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_pat
 
 def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     inside = replace(bench.settings(), folder=bench.capture / "run")
-    from cleargs.pipeline.digest import DigestMemo
     from cleargs.pipeline.plan import Planner
-    from cleargs.pipeline.store import Store
 
     store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
     with pytest.raises(InputError, match="lies inside the input"):

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,7 @@ from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
-from cleargs.progress import SilentReporter
+from cleargs.progress import SilentReporter, SilentTask, Task
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
@@ -183,3 +187,46 @@ def test_the_budget_is_a_maximum_from_the_first_step(capture: Path, tmp_path: Pa
     summary = dict(result.summary)
     assert summary["gaussians_start"] == budget
     assert summary["gaussians"] == read_ply(tmp_path / "out" / "scene.ply").gaussians.num == budget
+
+
+def compiled() -> set[str]:
+    """Kernels of this process, each with the types for which it is compiled or loaded."""
+    from numba.core.dispatcher import Dispatcher
+
+    modules = [name for name in sys.modules if name.startswith("cleargs.splat.kernels.cpu.")]
+    return {
+        f"{name}.{kernel}{signature}"
+        for name in modules
+        for kernel, found in vars(sys.modules[name]).items()
+        if isinstance(found, Dispatcher) and found.__module__ == name
+        for signature in found.signatures
+    }
+
+
+class CompiledWithin(SilentReporter):
+    """A reporter that looks for what is compiled while a task is open."""
+
+    def __init__(self) -> None:
+        self.before: set[str] = set()
+        self.found: set[str] = set()
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        self.before = compiled()
+        yield SilentTask()
+        self.found |= compiled() - self.before
+
+
+def test_nothing_is_compiled_once_the_time_left_is_told(capture: Path, tmp_path: Path) -> None:
+    """In a process of its own, since kernels that another test compiled are there already."""
+    program = (
+        "import sys; from dataclasses import replace; from pathlib import Path\n"
+        "from test_g0 import CompiledWithin, context, g0\n"
+        "watch = CompiledWithin()\n"
+        "g0.run(replace(context(Path(sys.argv[1]), Path(sys.argv[2])), reporter=watch))\n"
+        "assert any('normal_equations' in kernel for kernel in watch.before)\n"
+        "print(sorted(watch.found))\n"
+    )
+    command = [sys.executable, "-c", program, str(capture), str(tmp_path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=Path(__file__).parent)
+    assert done.stdout == "[]\n"
