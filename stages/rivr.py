@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 20
+VERSION = 21
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),

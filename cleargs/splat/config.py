@@ -75,8 +75,9 @@ class TrainConfig(BaseModel):
     """How a scene is optimised.
 
     Rates hold for 30,000 steps; a shorter training learns faster by ``rate_factor``. They are those of 3DGS
-    and gsplat but for the scales, which get twice theirs, and the means, which get 2.5 times theirs; their
-    noise is gsplat's at 3,200 steps. docs/training.md has what that is worth.
+    and gsplat but for the scales, which get twice theirs, the means, which get 2.5 times theirs (their noise
+    is gsplat's at 3,200 steps), and the SH terms above the constant, which get four times theirs.
+    docs/training.md has what that is worth.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -150,7 +151,7 @@ class TrainConfig(BaseModel):
     lr_scales: float = Field(1e-2, ge=0, description="rate of the log scales (3DGS: 5e-3)")
     lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
     lr_opacities: float = Field(5e-2, ge=0, description="rate of the opacity logits")
-    lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a twentieth")
+    lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a fifth")
     lr_exposure: float = Field(1e-3, ge=0, description="rate of the exposure affines, where they are on")
     sh_every: float = Field(
         5 / 32,

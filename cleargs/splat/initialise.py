@@ -76,11 +76,11 @@ def starting_gaussians(
 
 
 def sh_degree_from_views(count: int) -> int:
-    """Largest SH degree that pays with ``count`` active frames: 0 below 12, then 1, and 2 from 60 on.
+    """Largest SH degree that pays with ``count`` active frames: 0 below 12, 1 below 40, 2 below 100, then 3.
 
     Few directions fix few terms: the others learn to explain the frames one by one, and cost time.
     """
-    return 0 if count < 12 else 1 if count < 60 else 2
+    return 0 if count < 12 else 1 if count < 40 else 2 if count < 100 else 3
 
 
 def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init_opacity: float) -> Gaussians:

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from cleargs.splat.config import TrainConfig
 
-SH_REST_DIVISOR = 20.0
-"""The SH terms above the constant learn this much slower (Inria)."""
+SH_REST_DIVISOR = 5.0
+"""The SH terms above the constant learn this much slower. (Inria: 20, at which highlights take more steps
+than a CPU has.)"""
 INRIA_STEPS = 30_000
 """Steps of the training that the rates of 3DGS are made for."""
 MAX_RATE_FACTOR = 6.0
