@@ -13,6 +13,7 @@ from cleargs.api import run as run_capture
 from cleargs.bench.benchmark_results import Machine, describe_machine
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
+from cleargs.pipeline.dag import installed
 from cleargs.progress import Reporter
 from cleargs.splat.effort import Quality
 
@@ -106,7 +107,8 @@ def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, repor
     )
     options = EvalOptions(lpips=("alex",), scorers=())
     found = evaluate_scene(done, stage=plan.until, options=options, threads=plan.threads, progress=reporter)
-    manifests = [done[stage].manifest for stage in done.stages]
+    stages = installed().until(plan.until)  # what an earlier call went on to is no part of it
+    manifests = [done[stage].manifest for stage in stages]
     logs = [done[m.stage].table("train") for m in manifests if "train.parquet" in m.files]
     return QualityRow(
         capture.stem,

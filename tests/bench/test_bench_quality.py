@@ -66,5 +66,7 @@ def test_the_command_runs_each_quality_once(tmp_path: Path, capsys: pytest.Captu
     assert draft["seconds"]["ingest"] == standard["seconds"]["ingest"]  # made once, counted twice
     assert draft["means"]["psnr"] > 10
     assert json.loads((tmp_path / "out" / "quality.json").read_text()) == values
+    # Nothing is made again, and what another call went on to is not counted.
+    call(*words, "--until", "rivr", "--set", "rivr.distil.steps=5", "--quality", "draft")
     again = json.loads(call(*words))
     assert [row["seconds"] for row in again["rows"]] == [row["seconds"] for row in values["rows"]]

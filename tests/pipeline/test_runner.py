@@ -307,7 +307,6 @@ def test_the_pace_changes_no_key_and_no_result(bench: Bench) -> None:
 
 
 def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_path: Path) -> None:
-
     bench.run()
     other = tmp_path / "other"
     shutil.copytree(bench.capture, other)
@@ -321,8 +320,6 @@ def test_another_capture_in_the_same_run_folder_is_refused(bench: Bench, tmp_pat
 
 def test_run_inside_its_input_is_refused(bench: Bench) -> None:
     inside = replace(bench.settings(), folder=bench.capture / "run")
-    from cleargs.pipeline.plan import Planner
-
     store = Store(bench.store, DigestMemo(bench.store / "digests.sqlite"))
     with pytest.raises(InputError, match="lies inside the input"):
         Planner(bench.dag, inside, store, 1, bench.remarks).plan()
