@@ -58,6 +58,10 @@ class Backend(Protocol):
         """Raises InputError where the device cannot be used."""
         ...
 
+    def warm_up(self) -> None:
+        """Compile what would otherwise be compiled within the first steps of a training."""
+        ...
+
     def photometric_loss(
         self,
         image: Tensor,

@@ -32,7 +32,6 @@ from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.kernels.runtime import warm_up
 from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.rates import Rates
@@ -101,8 +100,7 @@ def train(
     elif saved is not None:
         trainer.restore(saved)
         reporter.info(f"{label}: resuming from step {trainer.done} of {trainer.length}")
-    if device == "cpu":
-        warm_up()  # before the bar, or half a minute of compiling would count as pace
+    backend_for(device).warm_up()  # before the bar, or half a minute of compiling would count as pace
     with support.memory_errors(), reporter.task(label, total=trainer.length) as task:
         progress = _Progress(task, trainer)
         while trainer.done < trainer.length:

@@ -15,6 +15,7 @@ from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import adam, affine_colour, frame_warp, launch, loss, position_noise
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
+from cleargs.splat.kernels.runtime import warm_up as warm_up
 from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 from cleargs.splat.losses import PhotometricLoss
 from cleargs.splat.strategy import mcmc

@@ -29,6 +29,10 @@ def rasteriser(device: torch.device) -> CudaRasteriser:
     return CudaRasteriser(device)
 
 
+def warm_up() -> None:
+    """Nothing: Triton compiles a kernel for the types and sizes of its first call."""
+
+
 def photometric_loss(
     image: Tensor,
     target: Tensor,
