@@ -237,8 +237,9 @@ def restore(image: Image, *, expert: str = "embedded", threads: int | None = Non
 def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | None:
     """A raw frame without the motion, rolling shutter and defocus that the scene of ``stage`` explains.
 
-    The result has ``image`` [H, W, 3] float32, and ``formation``, what was undone; None where nothing
-    explains the frame better than the render as it is. Raises InputError for a frame without a pose.
+    A rolling shutter is undone only where the training found that the capture's shutter rolls. The result
+    has ``image`` [H, W, 3] float32, and ``formation``, what was undone; None where nothing explains the frame
+    better than the render as it is. Raises InputError for a frame without a pose.
     """
     from cleargs.rivr.distillation import Snapshot
     from cleargs.splat.views import view_of

@@ -1,6 +1,11 @@
 """What settings, manifests and reports are made of: models whose values are checked and never change."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+"""A number in [0, 1]."""
 
 
 class Record(BaseModel):

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from cleargs.errors import InputError
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 19
+VERSION = 20
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -100,6 +101,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = read_selection(rivr / "selection.parquet")
+    _require_untouched(supervision.held_back, {row.frame_id for row in rows})
     repairs, kept = latest_accepted(rows), kept_raw(rows)
     write_repairs(context.out / "repairs.parquet", repairs)
 
@@ -145,3 +147,12 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     )
     figures = consolidation_summary(repairs, len(kept), scorer.name, verdict)
     return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})
+
+
+def _require_untouched(held_back: Collection[int], repaired: Collection[int]) -> None:
+    """Raise InputError where frames that are to judge the scene were repaired."""
+    if both := set(held_back) & set(repaired):
+        raise InputError(
+            f"{len(both)} of the frames that consolidate.harm.held_back keeps from repair have been repaired",
+            hint="set rivr.harm.held_back and consolidate.harm.held_back alike",
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 19
+VERSION = 20
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
@@ -124,20 +125,18 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
 
 
-def _exposure(
-    config: G0Config, views: list[View], sparse: SparsePoints
-) -> tuple[Exposure | None, float | None]:
+def _exposure(config: G0Config, views: list[View], sparse: SparsePoints) -> tuple[Exposure | None, float]:
     """Affines to learn, or None; and the measured spread of the frames' gains."""
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
 
-    if config.exposure == "off":
-        return None, None
     gains = frame_gains(views, sparse)
     spread = gain_spread(gains)
-    if config.exposure == "auto" and spread <= config.exposure_threshold:
+    if config.exposure == "off" or (config.exposure == "auto" and spread <= config.exposure_threshold):
         return None, spread
     return Exposure.from_gains([view.frame_id for view in views], gains), spread
 
 
 def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
+    """Of the finite ones: a frame of which no pixel counts has an infinite PSNR."""
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None

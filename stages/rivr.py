@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import RivrConfig
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 21
+VERSION = 22
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -81,20 +83,34 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     config = context.config
     frames, megapixels = capture_size(context)
+    targets = frames if config.which_targets == "all" else _degraded(context, frames)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
-    seconds = megapixels * frames * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
+    seconds = megapixels * targets * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
     distilling, memory = training_cost(config.distil, frames, megapixels)
     seconds += config.rounds * distilling
     scene = context.inputs.get("g0", Path()) / "scene.ply"
-    groups = 1 if config.group is None else -(-frames // config.group)
+    groups = 1 if config.group is None else -(-targets // config.group)
     scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
         memory_gb=1.0 + memory + config.distil.cache_mb / 1024.0,
-        disk_gb=0.02 * megapixels * frames * (config.rounds + 1) + scenes,
+        disk_gb=0.02 * megapixels * targets * (config.rounds + 1) + scenes,
     )
+
+
+def _degraded(context: StageContext[RivrConfig], frames: int) -> int:
+    """How many frames RVA does not call strong; half of them before it has run."""
+    from cleargs.parquet import read_table
+    from cleargs.rva.tables import FRAMES
+
+    if "rva" not in context.inputs:
+        return frames // 2
+    with suppress(StoreError):
+        roles = read_table(context.inputs["rva"] / "frames.parquet", FRAMES).column("role").to_pylist()
+        return sum(role != "strong" for role in roles)
+    return frames // 2
 
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
@@ -116,7 +132,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
-    targets = supervision.targets(config.targets)
+    targets = supervision.targets(config.which_targets)
     forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)

@@ -12,6 +12,7 @@ from cleargs.api import evaluate_scene
 from cleargs.api import run as run_capture
 from cleargs.bench.benchmark_results import Machine, describe_machine
 from cleargs.errors import InputError
+from cleargs.evaluate.comparison import capture_name
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.dag import installed
 from cleargs.progress import Reporter
@@ -81,7 +82,7 @@ def run(plan: QualityPlan, folder: Path, reporter: Reporter) -> QualityBenchmark
 
     Raises InputError where two captures have one name, or what `cleargs.run` raises.
     """
-    names = [capture.stem for capture in plan.captures]
+    names = [capture_name(capture) for capture in plan.captures]
     if len(set(names)) < len(names):
         raise InputError("two captures have the same name", hint="rename one, or measure them apart")
     load = os.getloadavg()[0]
@@ -94,10 +95,11 @@ def run(plan: QualityPlan, folder: Path, reporter: Reporter) -> QualityBenchmark
 
 
 def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, reporter: Reporter) -> QualityRow:
-    reporter.info(f"{capture.stem}, {quality}")
+    reporter.info(f"{capture_name(capture)}, {quality}")
     done = run_capture(
         capture,
-        folder / f"{capture.stem}-{quality}",
+        folder / f"{capture_name(capture)}-{quality}",
+        workflow="default",  # or an earlier call's settings would stay
         quality=quality,
         set={"ingest.holdout": HOLDOUT, **plan.settings},
         until=plan.until,
@@ -111,7 +113,7 @@ def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, repor
     manifests = [done[stage].manifest for stage in stages]
     logs = [done[m.stage].table("train") for m in manifests if "train.parquet" in m.files]
     return QualityRow(
-        capture.stem,
+        capture_name(capture),
         quality,
         seconds={m.stage: m.seconds for m in manifests},
         cpu_seconds=_sum([m.cpu_seconds for m in manifests]),

@@ -31,7 +31,7 @@ from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from cleargs.evaluate.comparison import Made, Recipe, Sample
+    from cleargs.evaluate.comparison import Made, Recipe
     from cleargs.evaluate.variants import Variant
 
 
@@ -152,10 +152,11 @@ def compare(
     recipe = Recipe(dag, workflow, (*quality, *overrides), place, threads_or_all(threads), options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
+            _check_names([run.resolve().name for run in runs], "runs")
             made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])
         else:
             samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
-            _check_names(samples)
+            _check_names([sample.name for sample in samples], "captures")
             made = make_scenes(out, samples, chosen, recipe, store, reporter)
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels
@@ -209,12 +210,8 @@ def _settings(variant: Variant) -> str:
     return f"{', '.join((recipe, *variant.overrides))}; the scene of {variant.stage}"
 
 
-def _check_names(samples: Sequence[Sample]) -> None:
-    """Two captures of one name would share a run folder."""
-    names = [sample.name for sample in samples]
+def _check_names(names: Sequence[str], what: str) -> None:
+    """Two captures of one name would share a run folder, two runs a row of the tables."""
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(
-            f"two captures are called {twice[0].rsplit('-', 1)[0]}",
-            hint="give the captures distinct folder names",
-        )
+        raise InputError(f"two {what} are called {twice[0]}", hint=f"give the {what} distinct folder names")

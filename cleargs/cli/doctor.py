@@ -16,6 +16,7 @@ import click
 import cleargs
 from cleargs.bench.pace import remembered_pace
 from cleargs.cli.common import json_option, print_json
+from cleargs.pipeline.keys import installed_onnxruntimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 
 LIBRARIES = (
@@ -71,6 +72,8 @@ def doctor(folder: Path, as_json: bool) -> int:
 
 
 def _library(name: str) -> Finding:
+    if name == "onnxruntime" and (found := installed_onnxruntimes()):  # under any of its names
+        return Finding(name, "ok", ", ".join(found))
     try:
         return Finding(name, "ok", version(name))
     except PackageNotFoundError:

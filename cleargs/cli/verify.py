@@ -45,8 +45,8 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     with opened_store(settings.store) as opened:
         for name in dag.names:
             folder = settings.folder / name
-            if not folder.is_symlink():
-                continue
+            if not folder.is_symlink() and not folder.exists():
+                continue  # not made yet; a copy of a run has folders in place of links
             stages.append(name)
             try:
                 manifest = read_manifest(folder)
@@ -59,6 +59,8 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
             for line in damages(place, manifest, manifest.files, opened.memo, afresh=True):
                 faults.append(("damaged", name, line))
             faults += _changed_inputs(dag, settings, opened, manifest)
+    if not stages:
+        raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
     if as_json:
         names = ("kind", "stage", "what")
         faults_json = [dict(zip(names, fault, strict=True)) for fault in faults]

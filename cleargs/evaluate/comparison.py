@@ -37,6 +37,12 @@ EVALUATION_VERSION = 2
 """Raised when an evaluation of equal inputs would give other figures."""
 
 
+def capture_name(capture: Path) -> str:
+    """The name of a folder, dots and all, or of a video without its suffix."""
+    place = capture.resolve()
+    return place.name if place.is_dir() else place.stem
+
+
 @dataclass(frozen=True)
 class Sample:
     """A capture and a seed: what all variants are made from."""
@@ -57,7 +63,7 @@ class Sample:
             note = read_json(self.capture / "truth" / "capture.json")
             return str(note["protocol"])
         except (OSError, ValueError, KeyError, TypeError):
-            return self.capture.resolve().stem
+            return capture_name(self.capture)
 
 
 @dataclass(frozen=True)
@@ -115,8 +121,11 @@ def make_scenes(
 ) -> Iterator[Made | str]:
     """Each scene as soon as it is there, or the line that says why it could not be made.
 
-    A variant that fails ends neither its sample nor the others.
+    A variant that fails ends neither its sample nor the others. Raises InputError, before anything is made,
+    for a sample that nothing could be compared with.
     """
+    for sample in samples:
+        _require_reference(sample, load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed))
     for sample in samples:
         ledger, work = Ledger(), None
         for variant in variants:
@@ -234,8 +243,20 @@ def view_sets(made: Made) -> list[Views]:
         return sets
     if read_toml(made.run / RUN_FILE)["ingest"].get("holdout", "none") != "none":
         return [Views("held-out", None)]
-    raise InputError(
-        f"{made.sample.capture} has no sharp truth to compare with",
+    raise _without_reference(made.sample)
+
+
+def _require_reference(sample: Sample, config: Config) -> None:
+    """Raise InputError where `view_sets` would find nothing, before there is a run."""
+    ingest: Any = config.sections["ingest"]
+    truth = sample.capture / "truth" / "observed" / "transforms.json"
+    if sample.reference is None and ingest.holdout == "none" and not truth.is_file():
+        raise _without_reference(sample)
+
+
+def _without_reference(sample: Sample) -> InputError:
+    return InputError(
+        f"{sample.capture} has no sharp truth to compare with",
         hint="give --reference DIR, or hold frames out: --set ingest.holdout=sharpest:8",
     )
 

@@ -26,6 +26,7 @@ from cleargs.files import disk_error
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.pipeline.digest import file_digest
+from cleargs.pipeline.keys import installed_onnxruntimes
 from cleargs.pipeline.manifest import versions
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
@@ -34,7 +35,7 @@ from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 
-_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "onnxruntime")
+_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +220,11 @@ def _evaluate(
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),
         weights=dict(metrics.weights),
-        versions={**versions(), **{name: version(name) for name in _LIBRARIES}},
+        versions={
+            **versions(),
+            **{name: version(name) for name in _LIBRARIES},
+            "onnxruntime": ", ".join(installed_onnxruntimes()),
+        },
         images=tuple(images),
     )
 

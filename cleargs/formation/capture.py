@@ -120,8 +120,8 @@ class CaptureFormation:
         camera = view.camera.scaled(factor)
         affines = self._affines
         affine = None if affines is None else affines.affine(view.frame_id)
-        begun = self._config.enabled and progress >= self._config.start
-        searched = begun and view.kind == "real"
+        begun = progress >= self._config.start
+        searched = begun and self._config.enabled and view.kind == "real"
         if searched and self._due(view.frame_id):
             self._fit(view.frame_id, factor, camera, affine, target, mask, render)
         weight = view.weight

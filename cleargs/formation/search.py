@@ -117,7 +117,7 @@ def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Expla
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
     """
-    levels = _levels(sight)
+    levels = [_Level(sight, scale) for scale in _scales(sight)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -137,7 +137,7 @@ def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Expla
 
 def refine(sight: Sight, model: Model, motion: FrameMotion, *, pose: bool = False) -> list[Explanation]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = _levels(sight)[-1]
+    level = _Level(sight, _scales(sight)[-1])
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
@@ -160,14 +160,15 @@ def luminance(image: Floats) -> Floats:
     return np.asarray(np.einsum("hwc,c->hw", linear_from_srgb(image), weights))
 
 
-def _levels(sight: Sight) -> list[_Level]:
+def _scales(sight: Sight) -> list[float]:
+    """The sizes at which a frame is compared, as shares of its own, the coarsest first."""
     longest = max(sight.observed.shape)
     sizes = [size for size, _ in LEVELS if size < longest] or [longest]
     if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
         sizes[-1] = longest
     elif sizes[-1] < longest <= LEVELS[-1][0]:
         sizes.append(longest)
-    return [_Level(sight, size / longest) for size in sizes]
+    return [size / longest for size in sizes]
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:

@@ -106,9 +106,14 @@ ONNXRUNTIMES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxr
 """Distributions that bring the module onnxruntime, each with providers of its own."""
 
 
+def installed_onnxruntimes() -> list[str]:
+    """Those that are installed, with their versions."""
+    return [f"{name} {found}" for name in ONNXRUNTIMES if (found := _version(name)) != "absent"]
+
+
 @cache
 def _onnxruntime(device: Literal["cpu", "cuda"]) -> str:
-    installed = [f"{name} {found}" for name in ONNXRUNTIMES if (found := _version(name)) != "absent"]
+    installed = installed_onnxruntimes()
     if device == "cuda":
         # Imported, as only a trial says whether the provider loads.
         from cleargs.models.onnx import network_device

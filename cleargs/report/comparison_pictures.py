@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -134,5 +135,5 @@ def _telling(out: Path, cell: Cell, capture: Path) -> str:
 
 def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
     """The image of that stem as sRGB in [0, 1]; None without one."""
-    files = sorted(folder.glob(f"{stem}.*"))
+    files = sorted(folder.glob(f"{glob.escape(stem)}.*"))
     return read_rgb_float(files[0]) if files else None

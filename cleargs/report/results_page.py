@@ -22,7 +22,7 @@ from cleargs.evaluate.comparison_tables import (
     work_table,
 )
 from cleargs.evaluate.evidence import Outcome, Section
-from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_of, losses_table
+from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_table
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, WHOLE
 
 CONFIDENCE = "95 %"
@@ -76,20 +76,27 @@ def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
 
 
-def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
-    """Sections and all cells in which the whole method is behind, those that are sure first."""
-    found = [
-        (outcome.section.title, loss)
+def gaps(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
+    """Sections, and the whole method against every other variant in each of their cells."""
+    once = _Once()
+    return [
+        (outcome.section.title, gap)
         for outcome, cells in _compared(outcomes)
-        for loss in losses_of(cells, WHOLE)
+        for gap in compared_with(cells, WHOLE)
+        if once.is_new(cells, gap.views, gap.column, WHOLE, gap.against, gap.metric)
     ]
+
+
+def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
+    """Those in which the whole method is behind, the sure ones first."""
+    found = [(section, gap) for section, gap in gaps(outcomes) if is_behind(gap.difference, gap.metric)]
     return sorted(found, key=lambda item: VERDICTS.index(item[1].verdict))
 
 
 def losses_found(outcomes: Sequence[Outcome]) -> str:
     """The losses, and of how many comparisons they are."""
     found, labels = losses(outcomes), _labels()
-    compared = sum(1 for _, cells in _compared(outcomes) for _ in compared_with(cells, WHOLE))
+    compared = len(gaps(outcomes))
     sure = sum(loss.verdict == "sure" for _, loss in found)
     line = f"{len(found)} of {compared} comparisons, {sure} of them sure."
     places = [
@@ -102,7 +109,7 @@ def losses_found(outcomes: Sequence[Outcome]) -> str:
 
 def answers_table(outcomes: Sequence[Outcome]) -> str:
     """For each question and metric, in how many columns the answer is better, worse or none."""
-    rows = []
+    rows, once = [], _Once()
     for question, variant, against in QUESTIONS:
         row = [question]
         for metric in COMPARED:
@@ -112,6 +119,7 @@ def answers_table(outcomes: Sequence[Outcome]) -> str:
                 for views in cells.view_sets()
                 for column in cells.columns(views)
                 if (difference := cells.difference(views, column, variant, against, metric)) is not None
+                and once.is_new(cells, views, column, variant, against, metric)
             ]
             worse = sum(one.is_sure and is_behind(one, metric) for one in found)
             better = sum(one.is_sure for one in found) - worse
@@ -142,6 +150,26 @@ def values_table(cells: Cells, views: ViewSet) -> str:
             texts = value_texts(cells, views, variant, metric)
             rows.append([metric_title(metric), labels[variant], *texts])
     return Table(["", "", *columns], rows).markdown()
+
+
+class _Once:
+    """Tells what another section has compared already: sections share scenes, and none may count twice."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, str, str], list[frozenset[tuple[str, str]]]] = {}
+
+    def is_new(
+        self, cells: Cells, views: ViewSet, column: str, variant: str, against: str, metric: str
+    ) -> bool:
+        """Whether no earlier call had all of these pairs of judged scenes, perhaps among others."""
+        theirs = {cell.sample: cell.evaluation for cell in cells.of(views, column, against)}
+        ours = cells.of(views, column, variant)
+        pairs = frozenset((cell.evaluation, theirs[cell.sample]) for cell in ours if cell.sample in theirs)
+        known = self._known.setdefault((variant, against, metric), [])
+        if any(pairs <= other for other in known):
+            return False
+        known.append(pairs)
+        return True
 
 
 def _compared(outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Cells]]:

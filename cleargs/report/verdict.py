@@ -181,16 +181,13 @@ def _capture_warnings(
     manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
 ) -> Iterator[Caution]:
     unplaced = sum(row.role == UNPLACED for row in rows)
+    available = _figure(manifests, "ingest", "frames_available") or 0
     if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
         yield Caution(
             f"{count(unplaced, 'frame')} found no place",
             "They share too few points with their neighbours: too blurred, or too far apart.",
-            (
-                f"ingest.max_frames={2 * len(rows)}",
-                f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}",
-            ),
+            tuple(_closer(len(rows), available, config)),
         )
-    available = _figure(manifests, "ingest", "frames_available") or 0
     if available > 1.5 * len(rows):
         yield Caution(
             f"{len(rows)} of {available} frames were used",
@@ -203,6 +200,14 @@ def _capture_warnings(
             "All figures here are of frames that the scene has seen; new views may look worse.",
             ("ingest.holdout=every:8",),
         )
+
+
+def _closer(frames: int, available: int, config: Config) -> Iterator[str]:
+    """Settings that bring frames nearer to each other, or compare more of them."""
+    if available > frames:
+        yield f"ingest.max_frames={min(available, 2 * frames)}"
+    if frames >= _setting(config, "ingest", "exhaustive_below"):  # below it all pairs are compared
+        yield f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}"
 
 
 def _allocation_warnings(

@@ -58,8 +58,10 @@ class RivrConfig(Record):
     """Render-Guided In-Video Restoration."""
 
     rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="times that every target frame is repaired")
-    targets: Literal["all", "degraded"] = Field(
-        "all", description="frames to repair: all registered training frames, or those that are not strong"
+    targets: Literal["auto", "all", "degraded"] = Field(
+        "auto",
+        description="frames to repair: all registered training frames, or those that are not strong; auto = "
+        "all, but degraded in a draft",
     )
     expert: str = Field(
         "embedded",
@@ -111,6 +113,13 @@ class RivrConfig(Record):
     gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
     distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
+
+    @property
+    def which_targets(self) -> Literal["all", "degraded"]:
+        """``targets``, decided: a draft is a look within minutes, and repairs take most of RIVR's time."""
+        if self.targets == "auto":
+            return "degraded" if self.distil.quality == "draft" else "all"
+        return self.targets
 
 
 class ConsolidateConfig(Record):

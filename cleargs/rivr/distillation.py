@@ -42,7 +42,8 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 class Snapshot:
-    """A scene on disk (``scene.ply`` and ``exposure.parquet`` in ``folder``), ready to be rendered."""
+    """A scene on disk (``scene.ply``, ``exposure.parquet`` and ``formation.parquet`` in ``folder``), ready to
+    be rendered. Raises StoreError without one of them."""
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         self.folder = folder

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -205,8 +206,12 @@ def _attributes(row: Selection) -> dict[str, int | float | str]:
 def pseudo_view(target: View, row: Selection, out: Path) -> View:
     """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
+    @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
+    def mask() -> Mask | None:
+        return target.load()[1]
+
     def load() -> tuple[Image, Mask | None]:
-        return from_layer(read_exr(out / row.exr).layers[row.chosen]), target.load()[1]
+        return from_layer(read_exr(out / row.exr).layers[row.chosen]), mask()
 
     return replace(target, weight=1.0, kind="pseudo", load=load)
 

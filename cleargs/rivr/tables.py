@@ -35,7 +35,7 @@ SELECTION = pa.schema(
         column(
             "exr",
             pa.string(),
-            "layers render, restored, fused, observed, deblurred; below the rivr folder",
+            "layers render, restored, fused, observed, deblurred, explained; below the rivr folder",
         ),
         *_scores("primary", "decides"),
         *_scores("tiebreak", "decides among the candidates within rivr.margin of the best primary score"),

@@ -6,16 +6,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from pydantic import Field, JsonValue, field_validator, model_validator
 
 from cleargs.plugins import require_known
-from cleargs.record import Record
-
-Unit = Annotated[float, Field(ge=0.0, le=1.0)]
-"""A number in [0, 1]."""
+from cleargs.record import Record, Unit
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
 

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cleargs.plugins import require_known
+from cleargs.record import Unit
 from cleargs.splat.effort import Quality, steps_from_frames
 
 STRATEGIES = ("mcmc", "adaptive")
@@ -77,7 +78,7 @@ class TrainConfig(BaseModel):
     Rates hold for 30,000 steps; a shorter training learns faster by ``rate_factor``. They are those of 3DGS
     and gsplat but for the scales, which get twice theirs, the means, which get 2.5 times theirs (their noise
     is gsplat's at 3,200 steps), and the SH terms above the constant, which get four times theirs.
-    docs/training.md has what that is worth.
+    docs/experiments/training.md has what that is worth.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -114,7 +115,12 @@ class TrainConfig(BaseModel):
         le=20_000_000,
         description="most Gaussians, from the first step on; unset = growth ends at a number from the pixels",
     )
-    max_budget: int = Field(400_000, ge=1, le=20_000_000, description="most Gaussians where budget is unset")
+    max_budget: int = Field(
+        400_000,
+        ge=1,
+        le=20_000_000,
+        description="most Gaussians where budget is unset, before the quality's factor",
+    )
     growth: float = Field(
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
     )
@@ -215,9 +221,7 @@ class G0Config(TrainConfig):
         0.05, ge=0, description="auto: spread of the frames' gains from which it is on (0.05 = 5 %)"
     )
     antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    background: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="sRGB behind the scene, each in [0, 1]"
-    )
+    background: tuple[Unit, Unit, Unit] = Field((0.0, 0.0, 0.0), description="sRGB behind the scene")
     min_points: int = Field(
         10_000,
         ge=1,

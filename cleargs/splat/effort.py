@@ -1,7 +1,7 @@
 """How much is spent on a training where the settings leave it open: steps and Gaussians, from the capture.
 
 Neither is one number for all captures. Steps follow the frames, since each is to be seen often enough;
-Gaussians follow the pixels, since they have that much to say. ``quality`` scales both. docs/training.md has
+Gaussians follow the pixels, since they have that much to say. ``quality`` scales both. docs/speed.md has
 what each step up costs and brings.
 """
 
@@ -41,12 +41,14 @@ def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
 
 
 def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
-    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all, up to ``max_budget``.
+    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all.
 
-    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames), and
-    40,000 at least: fewer cost a small capture a dB.
+    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
+    40,000 at least, since fewer cost a small capture a dB, and ``max_budget`` at most: all times the
+    quality's factor.
     """
-    return min(int(BUDGET_FACTOR[quality] * max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET)), max_budget)
+    standard = min(max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET), max_budget)
+    return max(1, int(BUDGET_FACTOR[quality] * standard))
 
 
 def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:

@@ -59,8 +59,12 @@ class TrainLog:
         self._rows[["loss", "l1", "ssim", "psnr"]][step] = (loss, l1, ssim, psnr)
 
     def recent_psnr(self, done: int) -> float:
-        """Mean PSNR in dB of the last steps before ``done``; NaN before the first."""
+        """Mean PSNR in dB of the last steps before ``done``; NaN before the first.
+
+        That of a frame of which no pixel counts is infinite, and left out.
+        """
         recent = self._rows["psnr"][max(0, done - _RECENT) : done]
+        recent = recent[np.isfinite(recent)]
         return float(recent.mean()) if len(recent) else math.nan
 
     def packed(self, done: int) -> Tensor:

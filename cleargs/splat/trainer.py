@@ -189,10 +189,8 @@ class Trainer:
         formed = self._formed(view, factor, target, mask)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
-        render = self._render(
-            view.camera.scaled(factor) if formed is None else formed.camera,
-            depth=formed is not None and formed.needs_depth,
-        )
+        camera = view.camera.scaled(factor) if formed is None else formed.camera
+        render = self._render(camera, depth=formed is not None and formed.needs_depth)
         image = render.image if formed is None else formed.forward(render)
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
@@ -200,7 +198,7 @@ class Trainer:
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
         if config.densify:
-            self._strategy.observe(self._engine, view.camera if formed is None else formed.camera)
+            self._strategy.observe(self._engine, camera)
         backend_for(self._device).regularise(
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
         )
@@ -414,13 +412,19 @@ class _Progress:
         self._task.update(done=trainer.done, note=", ".join(words), share=self._share[trainer.done])
 
 
+def _numbers(camera: Camera) -> list[float]:
+    size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return [*size, *camera.world_to_camera.ravel().tolist()]
+
+
 def _fingerprint(
     scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
-    seen = [(view.frame_id, view.kind, view.weight, view.camera.width, view.camera.height) for view in views]
-    digest = hashlib.sha256(json.dumps([settings, seen, list(starts)], sort_keys=True).encode())
+    seen = [(view.frame_id, view.kind, view.weight, _numbers(view.camera)) for view in views]
+    parts = [settings, seen, scene.antialias, scene.background, list(starts)]
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -65,3 +66,21 @@ def test_a_result_that_left_the_store(bench: Bench, capsys: pytest.CaptureFixtur
         folder.rename(bench.root / "away")
     assert invoke(["verify", str(bench.folder)], bench.dag) == 1
     assert "total        it is no longer in the store" in capsys.readouterr().out
+
+
+def test_a_copy_with_links_followed_is_read_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = bench.root / "copy"
+    shutil.copytree(bench.folder, copy)
+    assert invoke(["verify", str(copy)], bench.dag) == 0
+    assert "15 files of 3 stages read: all as they were made" in capsys.readouterr().out
+    (copy / "count" / "numbers" / "3.txt").write_text("rotten")
+    assert invoke(["verify", str(copy)], bench.dag) == 1
+
+
+def test_a_run_without_results_is_not_called_healthy(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in bench.dag.names:
+        (bench.folder / name).unlink()
+    assert invoke(["verify", str(bench.folder)], bench.dag) == 2
+    assert "has no results yet" in capsys.readouterr().err

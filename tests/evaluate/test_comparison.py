@@ -7,17 +7,21 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
 from cleargs.evaluate.choices import judge_choices
+from cleargs.evaluate.comparison import capture_name
 from cleargs.evaluate.equal_work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.evaluate.variants import VARIANTS, WHOLE, Variant
+from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.progress import SilentReporter
+from cleargs.report import comparison_pictures
 from cleargs.splat.effort import budget_from_pixels
 from cleargs.splat.initialise import sh_degree_from_views
 from cleargs.synth.synthetic_capture import make_capture
@@ -247,6 +251,7 @@ def test_a_capture_without_truth_or_held_out_frames_is_refused(
     (bare / "transforms.json").symlink_to(capture / "transforms.json")
     assert compare(bare, "-o", str(tmp_path / "out"), "--variants", "all-view") == 2
     assert "sharpest:8" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "bare-0").exists(), "nothing was made for it"
 
 
 def test_two_captures_of_one_name_are_refused(
@@ -256,3 +261,27 @@ def test_two_captures_of_one_name_are_refused(
     code = invoke(["compare", str(capture), str(tmp_path / "other" / "room"), "-o", str(tmp_path / "out")])
     assert code == 2
     assert "two captures are called room" in capsys.readouterr().err
+
+
+def test_two_runs_of_one_name_are_refused(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They would be one row of the tables, and one of them lost."""
+    other = tmp_path / "other"
+    shutil.copytree(out / "room-0", other / "room-0", symlinks=True)
+    runs = [str(out / "room-0" / "rva"), str(other / "room-0" / "rva")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "two runs are called rva" in capsys.readouterr().err
+
+
+def test_a_dot_in_the_name_of_a_folder_is_no_suffix(tmp_path: Path) -> None:
+    (tmp_path / "scan.2024-05-01").mkdir()
+    assert capture_name(tmp_path / "scan.2024-05-01") == "scan.2024-05-01"
+    assert capture_name(tmp_path / "walk.mp4") == "walk"
+
+
+def test_brackets_in_a_name_are_no_pattern(tmp_path: Path) -> None:
+    name = "Walk [dQw4w9WgXcQ]_000012"
+    write_rgb(tmp_path / f"{name}.png", np.full((4, 4, 3), 51, np.uint8))
+    found = comparison_pictures._find(tmp_path, name)
+    assert found is not None and np.allclose(found, 0.2)

@@ -138,7 +138,7 @@ def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
         sh_degree=1,
         cpu_seconds=4.0,
         peak_memory_gb=0.5,
-        evaluation="evaluations/x",
+        evaluation=f"evaluations/{variant}-{sample}-{psnr}",
     )
 
 
@@ -162,9 +162,18 @@ def test_losses_come_first_and_say_how_sure_they_are() -> None:
     assert single.verdict == "one sample"
     assert losses([outcome(1.0, 1.1, 0.9)]) == []
     ordered = [
-        loss.verdict for _, loss in losses([outcome(-1.0, 0.5), outcome(-1.0), outcome(-1.0, -1.1, -0.9)])
+        loss.verdict for _, loss in losses([outcome(-1.0, 0.5), outcome(-1.5), outcome(-1.0, -1.1, -0.9)])
     ]
     assert ordered == ["sure", "one sample", "none"]
+
+
+def test_scenes_that_two_sections_share_count_once() -> None:
+    whole, part, other = outcome(-1.0, -1.1, -0.9), outcome(-1.0), outcome(-2.0)
+    assert len(losses([whole, whole, part])) == 1
+    assert len(losses([whole, other])) == 2
+    page = results_page([whole, part], ORIGIN)
+    assert "1 of 2 comparisons, 1 of them sure." in page
+    assert "| the whole method, against all-view training | 0 / 1 / 0 | not made |" in page
 
 
 def test_the_page_of_a_few_cells() -> None:

@@ -145,12 +145,13 @@ def crossed() -> list[View]:
 def test_what_moves_teaches_little(tmp_path: Path) -> None:
     """Every place is covered in one view of five at most; without the weights a fifth of the red stays."""
     errors = {}
-    for name, tolerance in (("plain", 0.0), ("doubted", 0.05)):
-        look = FormationConfig(start=0.0, unexplained=tolerance)
+    for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
+        look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
         trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
         shown = [photograph(trained.scene, view) - photograph(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
     assert errors["doubted"] < 0.1 * errors["plain"], errors
+    assert errors["alone"] < 0.1 * errors["plain"], errors
 
 
 def test_a_resumed_training_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

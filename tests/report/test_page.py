@@ -18,11 +18,13 @@ from report_run import COUNT, HOSTILE, FinishedRun, wall
 from cleargs.cli.main import invoke
 from cleargs.cli.report import older_report, report_on
 from cleargs.errors import InputError
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
 from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.manifest import linked_manifest, write_manifest
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
-from cleargs.report import facts
+from cleargs.report import facts, verdict
 from cleargs.report.charts import weight_colour
 from cleargs.report.html import json_in_html
 from cleargs.report.page import write_report
@@ -224,3 +226,12 @@ def test_weights_run_from_amber_to_teal() -> None:
         return np.array([int(weight_colour(weight)[k : k + 2], 16) for k in (1, 3, 5)])
 
     assert rgb(0.0)[0] > 200 and rgb(1.0)[0] < 50 and (rgb(2.0) == rgb(1.0)).all()
+
+
+def test_advice_is_only_what_can_help() -> None:
+    def advice(frames: int, available: int) -> list[str]:
+        return list(verdict._closer(frames, available, load_config(installed(), "default")))
+
+    assert advice(40, 40) == []  # every frame is used, and compared with every other
+    assert advice(40, 60) == ["ingest.max_frames=60"]
+    assert advice(150, 400) == ["ingest.max_frames=300", "ingest.overlap=16"]

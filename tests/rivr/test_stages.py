@@ -26,6 +26,7 @@ from tiny_capture import (
     write_capture,
 )
 
+from cleargs.errors import InputError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
@@ -360,6 +361,22 @@ def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> Non
     assert not same_scene(context.out, first.out)
     assert set(consolidate.OUTPUTS) <= {path.name for path in context.out.iterdir()}
     assert result.summary["repairs"] == len(TARGETS) - 1
+
+
+def test_frames_that_judge_must_not_have_been_repaired(capture: Capture) -> None:
+    harm = {"held_back": 0.0, "psnr_margin": 100, "score_margin": 100}
+    rivr.run(capture.context("rivr", tiny_rivr(rounds=1, harm=harm)))
+    with pytest.raises(InputError, match="held_back keeps from repair"):
+        consolidate.run(capture.context("consolidate", tiny_consolidate()))
+
+
+def test_a_draft_repairs_only_what_is_not_sharp(capture: Capture) -> None:
+    distil = {"steps": 12, "checkpoint_interval": 5, "quality": "draft"}
+    context = capture.context("rivr", tiny_rivr(rounds=1, distil=distil))
+    rivr.run(context)
+    rows = read_selection(context.out / "selection.parquet")
+    assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
+    assert tiny_rivr(distil=distil, targets="all").which_targets == "all"
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:

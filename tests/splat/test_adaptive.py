@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splat_toy import camera, gaussians, images, start, views
+from splat_toy import WIDTH, camera, gaussians, images, start, views
 
 from cleargs.errors import ConfigError
 from cleargs.pipeline.config import load_config
@@ -18,7 +18,7 @@ from cleargs.splat.config import AdaptiveConfig, TrainConfig
 from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
-from cleargs.splat.strategy.adaptive import densify, lower_opacities, prune
+from cleargs.splat.strategy.adaptive import AdaptiveDensityControl, densify, lower_opacities, prune
 from cleargs.splat.strategy.mcmc import sigmoid
 from cleargs.splat.trainer import Trainer, train
 
@@ -145,3 +145,15 @@ def test_an_unknown_strategy_is_refused_with_a_near_name() -> None:
     with pytest.raises(ConfigError, match=r"g0\.strategy = 'adaptiv' cannot be used") as caught:
         load_config(installed(), "default", ["g0.strategy=adaptiv"])
     assert caught.value.hint == "did you mean adaptive?"
+
+
+def test_reduced_images_are_observed_through_their_own_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients are by the pixel of the render: with the full-size camera they would count twice."""
+    seen = []
+    monkeypatch.setattr(AdaptiveDensityControl, "observe", lambda self, engine, at: seen.append(at.width))
+    config = CONFIG.model_copy(update={"coarse_share": 0.5, "coarse_factor": 0.5})
+    trainer = Trainer(start(), views(images(gaussians(), 6)), config, seed=(7,))
+    for _ in range(config.length):
+        trainer.step()
+    half = config.length // 2
+    assert seen == [WIDTH // 2] * half + [WIDTH] * half

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pytest
+from pydantic import ValidationError
 from splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
@@ -166,6 +167,18 @@ def test_exposure_can_be_forced(capture: Path, tmp_path: Path) -> None:
     result = g0.run(context(capture, tmp_path, CONFIG.model_copy(update={"exposure": "on"})))
     assert result.summary["exposure"]
     assert read_exposure(tmp_path / "out" / "exposure.parquet").enabled
+
+
+def test_the_spread_of_exposures_is_told_where_compensation_is_off(capture: Path, tmp_path: Path) -> None:
+    off = g0.run(context(capture, tmp_path / "off", CONFIG.model_copy(update={"exposure": "off"})))
+    on = g0.run(context(capture, tmp_path / "on", CONFIG.model_copy(update={"exposure": "on"})))
+    assert off.summary["exposure_spread"] == on.summary["exposure_spread"] is not None
+
+
+@pytest.mark.parametrize("background", [(255, 255, 255), (-0.1, 0, 0), (float("nan"), 0, 0)])
+def test_a_background_is_a_colour(background: tuple[float, ...]) -> None:
+    with pytest.raises(ValidationError):
+        G0Config(background=background)
 
 
 def test_no_active_frame_is_an_error(capture: Path, tmp_path: Path) -> None:

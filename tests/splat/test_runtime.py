@@ -25,7 +25,7 @@ def test_the_cache_is_named_by_the_sources(monkeypatch, tmp_path):
 def test_digest_follows_every_kernel_source(monkeypatch):
     before = runtime.kernel_digest()
     read = Path.read_bytes
-    for name in ("constants.py", "simd.py", "harmonics.py"):
+    for name in ("constants.py", "simd.py", "harmonics.py", "splat_layout.py", "warp_layout.py"):
         with monkeypatch.context() as patch:
             patch.setattr(Path, "read_bytes", lambda path, name=name: read(path) + b"#" * (path.name == name))
             assert runtime.kernel_digest() != before

@@ -239,6 +239,36 @@ def test_a_checkpoint_of_another_training_is_ignored(pictures: list[np.ndarray],
     assert "another" in listener.warnings[0]
 
 
+@pytest.mark.parametrize("changed", ["pose", "background"])
+def test_so_is_one_of_other_cameras_or_another_background(
+    changed: str, pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    run(pictures, tmp_path)
+    seen, scene = views(pictures), start(sh_degree=1)
+    if changed == "pose":
+        moved = seen[0].camera.world_to_camera.copy()
+        moved[0, 3] += 0.1
+        seen[0] = replace(seen[0], camera=replace(seen[0].camera, world_to_camera=moved))
+    else:
+        scene = replace(scene, background=(1.0, 1.0, 1.0))
+    listener = Listener()
+    run(seen, tmp_path, scene=scene, reporter=listener)
+    assert "another" in listener.warnings[0]
+
+
+def test_a_frame_without_a_pixel_that_counts_spoils_no_mean(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    """Its PSNR is infinite; such frames are real: whole frames can be masked."""
+    seen = views(pictures)
+    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    seen[0] = replace(seen[0], load=lambda: (pictures[0], nothing))
+    made = Trainer(start(sh_degree=1), seen, CONFIG, seed=(7,))
+    for _ in range(12):
+        made.step()
+    assert np.isfinite(made.last_psnr)
+
+
 def test_threads_change_no_bit(pictures: list[np.ndarray], tmp_path: Path) -> None:
     results = []
     for threads in (1, 2):

@@ -15,7 +15,11 @@ def kernel_digest() -> str:
     calls from other files; a folder named by this digest does not.
     """
     folder = Path(__file__).parent
-    sources = [folder.parent / "constants.py", *sorted((folder / "cpu").glob("*.py"))]
+    sources = [
+        folder.parent / "constants.py",
+        *sorted(folder.glob("*.py")),  # the layouts, whose numbers are compiled in
+        *sorted((folder / "cpu").glob("*.py")),
+    ]
     digest = hashlib.sha256()
     for source in sources:
         digest.update(source.name.encode())

@@ -115,7 +115,7 @@ def backpropagate_one(
     basis: Floats,
     weights: Floats,
 ) -> None:
-    """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see layout.SUM_*)."""
+    """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see splat_layout.SUM_*)."""
     x, y, z = camera_position(means[g], view)
     qw, qx, qy, qz, norm = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])

@@ -13,8 +13,8 @@ because G is symmetric. The window is separable: each output row needs eleven in
 vertically into row buffers and then horizontally, so rows are independent work items and no
 intermediate image of the five means is stored.
 
-Images are copied once into padded rows: 16 zeros, 3 W interleaved values, zeros to a multiple of 8 and 16
-more. Neighbouring pixels are then three floats apart and the zero padding comes for free. Masked pixels
+Images are copied once into padded rows: 16 zeros, 3 W interleaved values, zeros to a multiple of `LANES` and
+16 more. Neighbouring pixels are then three floats apart and the zero padding comes for free. Masked pixels
 are zeroed in both images, so that they act like the padding outside the image.
 
 Sums run in float64 within each row, and over the rows in their order.

@@ -199,7 +199,7 @@ class CpuRasteriser:
         shown = np.flatnonzero(pairs)
         owner = np.repeat(np.arange(len(shown)), pairs[shown])
         u, v = (np.bincount(owner, sums[:, column], len(shown)) for column in (SUM_VU, SUM_VY))  # float64
-        # a, e and k are those of `layout`; BEND_X is a log2(e) / 2.
+        # a, e and k are those of `splat_layout`; BEND_X is a log2(e) / 2.
         splats = frame.splats[shown]
         x = 2.0 * math.log(2.0) * splats[:, BEND_X] * u
         y = 2.0 * math.log(2.0) * splats[:, BEND_Y] * v - splats[:, SKEW] * x

@@ -6,8 +6,9 @@ Gaussian's, s its scales and J the 2 x 3 Jacobian of the pinhole projection,
     U = J W R diag(s)          [2, 3], rows u0 and u1
     Σ = U Uᵀ + 0.3 I
 
-The ellipse is wanted as in ``layout``: e = 1 / Σyy, k = Σxy / Σyy and a = Σyy / det Σ = 1 / s, where s is the
-variance of x at fixed y. It is the least of |u0 - k u1|² + 0.3 (1 + k²) over all k, so with w = u0 - k u1
+The ellipse is wanted as in ``splat_layout``: e = 1 / Σyy, k = Σxy / Σyy and a = Σyy / det Σ = 1 / s, where
+s is the variance of x at fixed y. It is the least of |u0 - k u1|² + 0.3 (1 + k²) over all k, so
+with w = u0 - k u1
 
     s = |w|² + 0.3 (1 + k²),      det Σ = s Σyy,      ds = 2 w · (du0 - k du1).
 

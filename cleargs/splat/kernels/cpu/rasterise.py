@@ -12,8 +12,8 @@ and S what g · pixel would be if only what lies behind the splat were there, se
     v = dL/d(ln alpha) = w (g · c - S),   0 where alpha is clamped,      S += alpha (g · c - S).
 
 Only the sums of v times 1, u, dy, u², u dy, dy² and of w g are needed of a (tile, splat) pair
-(layout.SUM_*); gradients.backpropagate turns them into gradients once per Gaussian. Each pair owns a row
-of scratch, so there are no atomics, no races and no dependence on the number of threads.
+(splat_layout.SUM_*); gradients.backpropagate turns them into gradients once per Gaussian. Each pair owns a
+row of scratch, so there are no atomics, no races and no dependence on the number of threads.
 
 A tile's pixels live in a small buffer, cut into pieces: the LANES pixels of a row that make a vector. Piece
 16 h + r is row r of the tile's h-th block of LANES columns (there is one block where a vector holds a whole
