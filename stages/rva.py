@@ -8,7 +8,7 @@ from pathlib import Path
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.rva.config import RvaConfig
 
-VERSION = 3
+VERSION = 4
 CONFIG = RvaConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "observations.parquet", "images", "masks")

@@ -20,6 +20,7 @@ from cleargs.models.lpips import NETS, tensors_digest, weights_file
 from cleargs.models.model_folder import installed_file, read_receipt, state, verify
 from cleargs.models.registry import InstalledFile, Model, find_model, load_registry, model_dir
 from cleargs.models.scorer import scorer_path
+from cleargs.rivr.config import RivrConfig
 
 
 @pytest.fixture(scope="module")
@@ -245,3 +246,8 @@ def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.Monk
     for named in (scorer_path, expert_path):
         with pytest.raises(InputError, match="'nonesuch'"):
             named("nonesuch")
+
+
+def test_what_ships_is_listed_under_the_name_that_settings_take() -> None:
+    shipped = {model.name for model in load_registry() if model.shipped is not None}
+    assert RivrConfig().expert in shipped and RivrConfig().primary_scorer in shipped

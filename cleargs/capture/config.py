@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from difflib import get_close_matches
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -89,10 +90,17 @@ class IngestConfig(BaseModel):
     def _layout_is_known(cls, name: str) -> str:
         return require_known("layouts", name, ("auto",))
 
+    @field_validator("holdout", mode="before")
+    @classmethod
+    def _a_number_may_be_a_name(cls, value: object) -> object:
+        return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
     @field_validator("holdout")
     @classmethod
     def _known_holdout(cls, value: str) -> str:
-        if ":" in value and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
+        kind = value.partition(":")[0]
+        misspelt = ":" in value and get_close_matches(kind, ("every", "sharpest"))
+        if misspelt and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
         if value in ("every:1", "sharpest:1"):
             raise ValueError(f"{value} would hold out every frame")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 from cleargs.capture.config import IngestConfig
 from cleargs.capture.listing import read_listing
+from cleargs.media import IMAGE_SUFFIXES
 from cleargs.pipeline.stage import External
 from cleargs.plugins import load_part
 
@@ -55,6 +56,26 @@ def image_folders(root: Path) -> list[Path]:
     return [folder for _, folder in sorted(found)]
 
 
+def source_of_images(root: Path) -> Path:
+    """The folder of a capture that is nothing but images: the first that holds any of ``images/``, ``root``
+    itself, and the reductions, the largest first; ``root`` where none does."""
+    folders = [root / "images", root, *image_folders(root)]
+    return next((folder for folder in folders if folder.is_dir() and image_files(folder)), root)
+
+
+def image_files(folder: Path, *, below: bool = False) -> list[Path]:
+    """The images in ``folder``, with ``below`` also those in its folders, but none that is hidden; in any
+    order."""
+    found = folder.rglob("*") if below else folder.iterdir()
+    return [
+        path
+        for path in found
+        if path.suffix.lower() in IMAGE_SUFFIXES
+        and path.is_file()
+        and lies_below(path.relative_to(folder).as_posix())
+    ]
+
+
 def find_model(root: Path) -> Path | None:
     """The folder of the sparse model of a COLMAP project, or None."""
     for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0"):
@@ -82,7 +103,7 @@ def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
     if not source.is_dir():
         return {"capture": source}
     kind = folder_kind(source, poses=config.poses == "auto")
-    images, transforms = source / "images", source / "transforms.json"
+    transforms = source / "transforms.json"
     found: dict[str, External]
     if kind == "llff":
         found = {"poses_bounds": source / POSES_BOUNDS}
@@ -90,7 +111,8 @@ def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
     elif kind == "transforms":
         found = {"transforms": transforms, "images": read_listing(transforms).files}
     else:
-        found = {"images": images} if images.is_dir() else {"capture": source}
+        images = source / "images" if kind == "colmap" else source_of_images(source)
+        found = {"capture": source} if images == source else {"images": images}
     if (masks := mask_folder(source)) is not None:
         found["masks"] = masks
     if kind == "colmap" and (model := find_model(source)) is not None:

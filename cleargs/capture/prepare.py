@@ -14,7 +14,7 @@ from cleargs.capture.cameras import Camera
 from cleargs.capture.sources import Capture, SourceFrame
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import read_alpha, read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import image_size, read_alpha, read_mask, read_rgb, write_mask, write_rgb
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
 
@@ -122,17 +122,19 @@ def _decode_video(
 
 def _upright(frame: SourceFrame) -> NDArray[np.uint8]:
     """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
-    rgb = read_rgb(frame.path)
-    if frame.camera is not None and not _alike(frame.camera.width, frame.camera.height, rgb):
-        stored = read_rgb(frame.path, upright=False)
-        if _alike(frame.camera.width, frame.camera.height, stored):
-            return stored
-    return rgb
+    return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
 
-def _alike(width: int, height: int, image: NDArray[np.uint8]) -> bool:
-    """Whether an image has these proportions, but for rounding to whole pixels."""
-    h, w = image.shape[:2]
+def _is_as_stored(frame: SourceFrame) -> bool:
+    """Whether the frame's camera fits the image as it is stored, which is what COLMAP works on. Half a turn
+    keeps the proportions: then it is taken to fit."""
+    camera = frame.camera
+    return camera is not None and _alike(camera.width, camera.height, image_size(frame.path))
+
+
+def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
+    """Whether an image of this width and height has these proportions, but for rounding to whole pixels."""
+    w, h = size
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
@@ -141,7 +143,7 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
     height, width = rgb.shape[:2]
     camera = frame.camera
     if camera is not None:
-        if not _alike(camera.width, camera.height, rgb):
+        if not _alike(camera.width, camera.height, (width, height)):
             raise InputError(
                 f"{frame.name} does not have the proportions of its camera ({camera.width}x{camera.height})",
                 hint="give the images that the poses were made from, or set ingest.poses=sfm",
@@ -151,7 +153,7 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
     if stencil is not None and not resumable(mask, reporter, read_mask):
         # To whole pixels, a mask of one pixel has any proportions.
         coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
-        if coarse or not _alike(stencil.shape[1], stencil.shape[0], rgb):
+        if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
             what = "is far smaller than it" if coarse else "does not have its proportions"
             raise InputError(
                 f"the mask of {frame.name} {what}",
@@ -165,4 +167,4 @@ def _stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
     """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
     if frame.mask is not None:
         return read_mask(frame.mask)
-    return None if frame.pts is not None else read_alpha(frame.path)
+    return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))

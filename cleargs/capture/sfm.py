@@ -129,7 +129,8 @@ class _Job:
     cameras: list[Camera]
     camera_of: list[int]
     poses: list[list[list[float]]] | None
-    exif_image: str | None
+    exif_images: list[str | None]
+    """For each camera an input image that may state its focal length."""
     masked: bool
 
 
@@ -138,13 +139,13 @@ def _sfm_job(frames: Sequence[WorkFrame], config: IngestConfig) -> _Job:
     owners = [f"{frame.width}x{frame.height}" if config.shared_camera else frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
     cameras = [_starting_camera(frames[owners.index(owner)], config) for owner in numbers]
-    path = frames[0].source.path
+    first = [frames[owners.index(owner)].source for owner in numbers]
     return _Job(
         names=[frame.image for frame in frames],
         cameras=cameras,
         camera_of=[numbers[owner] for owner in owners],
         poses=None,
-        exif_image=str(path.resolve()) if frames[0].source.pts is None else None,
+        exif_images=[None if source.pts is not None else str(source.path.resolve()) for source in first],
         masked=any(frame.masked for frame in frames),
     )
 
@@ -168,7 +169,9 @@ def _triangulation_job(frames: Sequence[WorkFrame], poses: Sequence[Pose]) -> _J
         camera_of.append(cameras.index(frame.camera))
     matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses]
     masked = any(frame.masked for frame in frames)
-    return _Job([frame.image for frame in frames], cameras, camera_of, matrices, None, masked)
+    return _Job(
+        [frame.image for frame in frames], cameras, camera_of, matrices, [None] * len(cameras), masked
+    )
 
 
 def _run(

@@ -130,8 +130,9 @@ def _import(job: dict[str, Any], database: Path) -> None:
         for leftover in database.parent.glob("database.db*"):
             leftover.unlink()
     cameras = [pycolmap.Camera(**camera) for camera in job["cameras"]]
-    if job["exif_image"] is not None:
-        apply_exif_focal(cameras, Path(job["exif_image"]))
+    for camera, image in zip(cameras, job["exif_images"], strict=True):
+        if image is not None:
+            apply_exif_focal(camera, Path(image))
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
         for index, camera in enumerate(cameras):
             camera.camera_id = index + 1
@@ -147,8 +148,8 @@ def _import(job: dict[str, Any], database: Path) -> None:
             opened.write_frame(frame, use_frame_id=True)
 
 
-def apply_exif_focal(cameras: Sequence[pycolmap.Camera], image: Path) -> None:
-    """Start from the focal length that the input's first image states, where it does."""
+def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
+    """Start from the focal length that an input image of the camera states, where it does."""
     try:
         stated = pycolmap.infer_camera_from_image(image)
     except ValueError:  # a format that COLMAP does not read (it gets PNG copies): no EXIF either
@@ -156,12 +157,11 @@ def apply_exif_focal(cameras: Sequence[pycolmap.Camera], image: Path) -> None:
     if not stated.has_prior_focal_length:
         return
     factor = stated.mean_focal_length() / max(stated.width, stated.height)
-    for camera in cameras:
-        params = list(camera.params)
-        for index in camera.focal_length_idxs():
-            params[index] = factor * max(camera.width, camera.height)
-        camera.params = params
-        camera.has_prior_focal_length = True
+    params = list(camera.params)
+    for index in camera.focal_length_idxs():
+        params[index] = factor * max(camera.width, camera.height)
+    camera.params = params
+    camera.has_prior_focal_length = True
 
 
 def _extract(
@@ -297,8 +297,6 @@ def _triangulate(
             model.add_camera_with_trivial_rig(camera)
         for image in sorted(opened.read_all_images(), key=lambda image: image.image_id):
             pose = job["poses"][image.image_id - 1]
-            if pose is None:
-                continue
             world_to_camera = pycolmap.Rigid3d(np.array(pose))
             model.add_image_with_trivial_frame(
                 pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),

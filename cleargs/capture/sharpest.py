@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.prepare import reduced
 from cleargs.capture.sources import Capture, video_frame
+from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
@@ -48,6 +49,11 @@ def sharpest(capture: Capture, folder: Path, long_side: int, reporter: Reporter)
                 if value > best[place]:
                     best[place], chosen[place] = value, number
                 task.advance()
+        if (best < 0.0).any():
+            raise InputError(
+                f"{source.name}: of a stretch of it no frame can be decoded",
+                hint="convert the video with ffmpeg, or cut the damaged part off",
+            )
         write_json(folder / CHOICE, chosen)
     return replace(capture, frames=tuple(video_frame(source, timeline, number) for number in chosen))
 

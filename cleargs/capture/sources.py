@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import numpy as np
@@ -13,12 +14,19 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import Layout, find_model, folder_kind, image_folders, lies_below, mask_folder
+from cleargs.capture.layout import (
+    Layout,
+    find_model,
+    folder_kind,
+    image_files,
+    lies_below,
+    mask_folder,
+    source_of_images,
+)
 from cleargs.capture.llff import read_llff
 from cleargs.capture.model import SparseModel, read_model
-from cleargs.capture.transforms import read_transforms
+from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.errors import InputError
-from cleargs.media import IMAGE_SUFFIXES
 from cleargs.media.image import image_size
 from cleargs.media.video import Timeline, read_timeline, video_size
 from cleargs.plugins import load_part
@@ -168,12 +176,12 @@ def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[in
 def _open_transforms(source: Path, config: IngestConfig) -> Capture:
     listed = read_transforms(source / "transforms.json", poses=config.poses == "auto")
     listed.sort(key=lambda frame: frame_key(frame.name))
-    masks = _masks(mask_folder(source))
+    masks = _masks(mask_folder(source), [_below_images(frame) for frame in listed])
     frames = tuple(
         SourceFrame(
             frame.name,
             frame.path,
-            mask=frame.mask or _mask_of(masks, frame.path.name),
+            mask=frame.mask or masks.get(_below_images(frame)),
             camera=frame.camera,
             pose=frame.pose,
         )
@@ -185,12 +193,12 @@ def _open_transforms(source: Path, config: IngestConfig) -> Capture:
 def _open_llff(source: Path, config: IngestConfig) -> Capture:
     # In the order of the rows: the test views of these data sets are every N-th row.
     views = read_llff(source)
-    masks = _masks(mask_folder(source))
+    masks = _masks(mask_folder(source), [view.path.name for view in views])
     frames = tuple(
         SourceFrame(
             view.path.name,
             view.path,
-            mask=_mask_of(masks, view.path.name),
+            mask=masks.get(view.path.name),
             camera=view.camera,
             pose=view.pose,
         )
@@ -200,18 +208,15 @@ def _open_llff(source: Path, config: IngestConfig) -> Capture:
 
 
 def _open_images(source: Path, config: IngestConfig) -> Capture:
-    files = _image_files(source / "images" if (source / "images").is_dir() else source)
-    if not files and (folders := image_folders(source)):
-        files = _image_files(folders[0])
+    files = sorted(image_files(source_of_images(source)), key=lambda path: frame_key(path.name))
     if not files:
         raise InputError(
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
-    masks = _masks(mask_folder(source))
+    masks = _masks(mask_folder(source), [path.name for path in files])
     frames = tuple(
-        SourceFrame(path.name, path, mask=_mask_of(masks, path.name))
-        for path in spread(files, config.max_frames)
+        SourceFrame(path.name, path, mask=masks.get(path.name)) for path in spread(files, config.max_frames)
     )
     return Capture("images", frames, len(files))
 
@@ -237,8 +242,9 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
             hint="put the images that the model was made from into images/, or set ingest.poses=sfm",
         )
     # Images that COLMAP could not register are frames too: they stay in the table, marked.
-    names = sorted(set(posed) | {path.name for path in _image_files(root)}, key=frame_key)
-    masks = _masks(mask_folder(source))
+    stored = {path.relative_to(root).as_posix() for path in image_files(root, below=True)}
+    names = sorted(set(posed) | stored, key=frame_key)
+    masks = _masks(mask_folder(source), names)
     frames = []
     for name in spread(names, config.max_frames):
         image = posed.get(name)
@@ -248,23 +254,32 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
             )
         camera = model.cameras[image.camera_id] if image is not None else None
         pose = image.pose if image is not None else None
-        frames.append(SourceFrame(name, root / name, mask=_mask_of(masks, name), camera=camera, pose=pose))
+        frames.append(SourceFrame(name, root / name, mask=masks.get(name), camera=camera, pose=pose))
     return Capture(
         "colmap", tuple(frames), len(names), model if len(model.point_ids) or model.dropped else None
     )
 
 
-def _image_files(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
-    return sorted(
-        (path for path in files if not path.name.startswith(".")), key=lambda path: frame_key(path.name)
-    )
+def _below_images(frame: TransformsFrame) -> str:
+    """The name of a frame's image by its place below ``images/``."""
+    return PurePosixPath(frame.name).as_posix().removeprefix("images/")
 
 
-def _masks(folder: Path | None) -> dict[str, Path]:
-    return {} if folder is None else {path.stem: path for path in _image_files(folder)}
-
-
-def _mask_of(masks: Mapping[str, Path], name: str) -> Path | None:
-    """The mask of the same stem, or (as COLMAP names them) of the full file name."""
-    return masks.get(Path(name).stem) or masks.get(Path(name).name)
+def _masks(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
+    """The masks in ``folder`` of the images of these ``names``: in the same place, by stem or full name (as
+    COLMAP has them); elsewhere where no other image has that stem."""
+    if folder is None:
+        return {}
+    found = {
+        path.relative_to(folder).with_suffix("").as_posix(): path for path in image_files(folder, below=True)
+    }
+    stems = Counter(PurePosixPath(name).stem for name in names)
+    masks = {}
+    for name in names:
+        path = PurePosixPath(name)
+        spellings = [path.with_suffix("").as_posix(), name]
+        spellings += [path.stem, path.name] if stems[path.stem] == 1 else []
+        mask = next((found[spelling] for spelling in spellings if spelling in found), None)
+        if mask is not None:
+            masks[name] = mask
+    return masks

@@ -54,7 +54,7 @@ POINTS = pa.schema(
         column("r", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
         column("g", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
         column("b", pa.uint8(), "sRGB, mean over the train frames that observe the point"),
-        column("error", pa.float64(), "mean reprojection error, px of the input image"),
+        column("error", pa.float64(), "mean reprojection error, px of the image in which features are found"),
         column("track_length", pa.int32(), "registered frames that observe the point"),
     ]
 )

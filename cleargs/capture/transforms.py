@@ -52,7 +52,8 @@ def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
     frames = []
     for entry in listing.entries:
         assert entry.image is not None
-        name = str(Path(entry.values["file_path"]).with_suffix(entry.image.suffix))
+        # The ending may be left out, dots in the name are none, and Windows has other slashes.
+        name = str(Path(entry.values["file_path"].replace("\\", "/")).with_name(entry.image.name))
         if entry.mask is None and "mask_path" in entry.values:
             raise InputError(
                 f"{name} names the mask {entry.values['mask_path']}, which does not exist",

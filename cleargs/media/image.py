@@ -57,15 +57,18 @@ def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
 
 
 def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
-    """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`."""
+    """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
+
+    The border lies at half of the mask's own maximum: some programs write 1, not 255.
+    """
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
-    return np.where(grey > 127, np.uint8(255), np.uint8(0))
+    return np.where(grey > int(grey.max()) // 2, np.uint8(255), np.uint8(0))
 
 
-def read_alpha(path: Path) -> NDArray[np.uint8] | None:  # [H, W]
+def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:  # [H, W]
     """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
 
-    None where it is opaque all over. Raises InputError like `read_rgb`.
+    None where it is opaque all over. ``upright`` turns it as `read_rgb` does. Raises InputError like it.
     """
     if path.suffix.lower() in _OPAQUE:
         return None
@@ -73,7 +76,33 @@ def read_alpha(path: Path) -> NDArray[np.uint8] | None:  # [H, W]
     if image.ndim != 3 or image.shape[2] != 4:
         return None
     opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
-    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
+    if opaque.all():
+        return None
+    # OpenCV turns an image, but not when it is to keep the alpha.
+    turned = _turned(opaque, _orientation(path)) if upright else opaque
+    return np.where(turned, np.uint8(255), np.uint8(0))
+
+
+def _orientation(path: Path) -> int:
+    """EXIF's orientation, 1 to 8; 1 where there is none."""
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()  # else it is told on stderr at the end
+        return 1
+    orientation = source.spec().get_int_attribute("Orientation", 1)
+    source.close()
+    return int(orientation)
+
+
+def _turned(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """A stored image [H, W] as it is to be seen."""
+    if orientation >= 5:  # mirrored at the diagonal, then as the first four
+        image = image.T
+    mirrored = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
+    down, across = mirrored.get(orientation, (1, 1))
+    return np.ascontiguousarray(image[::down, ::across])
 
 
 def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
@@ -88,17 +89,23 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
 
     Raises InputError when a wanted frame cannot be decoded.
     """
-    for number, frame in _decoded(path, pts):
-        yield number, frame_rgb(frame)
+    missing = set(pts)
+    for number, frame, aspect in _decoded(path, pts):
+        missing.discard(number)
+        yield number, frame_rgb(frame, aspect)
+    if missing:
+        raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
 
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast."""
-    for number, frame in _decoded(path, pts):
+    """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast. Frames that
+    cannot be decoded, as at the start of a clip that was cut out of another, are left out."""
+    for number, frame, _ in _decoded(path, pts):
         yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)
 
 
-def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame]]:
+def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame, float]]:
+    """The wanted frames that can be decoded, and the width of their pixels over the height."""
     wanted = set(pts)
     last = max(wanted)
     with _open(path) as (container, stream):
@@ -108,16 +115,17 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
                 continue
             if frame.pts in wanted:
                 wanted.discard(frame.pts)
-                yield frame.pts, frame
+                yield frame.pts, frame, float(stream.sample_aspect_ratio or 1.0)
             if not wanted:
                 return
-    if wanted:
-        raise InputError(f"{path.name}: {len(wanted)} of its frames cannot be decoded", hint=_HINT)
 
 
-def frame_rgb(frame: VideoFrame) -> NDArray[np.uint8]:  # [H, W, 3]
-    """A decoded frame as upright sRGB."""
+def frame_rgb(frame: VideoFrame, aspect: float = 1.0) -> NDArray[np.uint8]:  # [H, W, 3]
+    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
+    if aspect != 1.0:
+        wide = max(1, round(aspect * rgb.shape[1]))
+        rgb = np.asarray(cv2.resize(rgb, (wide, rgb.shape[0]), interpolation=cv2.INTER_CUBIC), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
 
 

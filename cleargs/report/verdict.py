@@ -192,7 +192,7 @@ def _capture_warnings(
         yield Caution(
             f"{len(rows)} of {available} frames were used",
             "More frames bring more views of every surface, at more time.",
-            (f"ingest.max_frames={min(available, 2 * len(rows))}",),
+            tuple(_more_frames(len(rows), available, config)),
         )
     if rows and not any(row.role == HELD_OUT for row in rows):
         yield Caution(
@@ -204,10 +204,18 @@ def _capture_warnings(
 
 def _closer(frames: int, available: int, config: Config) -> Iterator[str]:
     """Settings that bring frames nearer to each other, or compare more of them."""
-    if available > frames:
-        yield f"ingest.max_frames={min(available, 2 * frames)}"
+    yield from _more_frames(frames, available, config)
     if frames >= _setting(config, "ingest", "exhaustive_below"):  # below it all pairs are compared
         yield f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}"
+
+
+def _more_frames(frames: int, available: int, config: Config) -> Iterator[str]:
+    """The setting that limits the frames of a capture, where there are more."""
+    fps, most = _setting(config, "ingest", "fps"), _setting(config, "ingest", "max_frames")
+    if fps is not None and frames < most:
+        yield f"ingest.fps={2 * fps:g}"
+    elif available > frames:
+        yield f"ingest.max_frames={min(available, 2 * frames)}"
 
 
 def _allocation_warnings(
@@ -219,7 +227,7 @@ def _allocation_warnings(
             "The best of them are used instead. Thresholds nearer to this capture would separate good frames "
             "from bad ones.",
             tuple(
-                f"rva.{name}={_setting(config, 'rva', name) + step:.2f}"
+                f"rva.{name}={min(max(_setting(config, 'rva', name) + step, 0.0), 1.0):.2f}"
                 for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
             ),
         )

@@ -107,7 +107,7 @@ def keep_sharp(R: Floats, B: Floats, share: float, config: RvaConfig) -> tuple[R
     """
     reliable = is_reliable(R, B, config)
     kept = reliable.copy()
-    kept[np.argsort(B - R, kind="stable")[: math.ceil(share * len(R))]] = True
+    kept[np.argsort(B - R, kind="stable")[: max(1, math.ceil(share * len(R) - _ROUNDING))]] = True
     roles = np.select(
         [reliable, kept], [Role.STRONG.value, Role.AUXILIARY.value], default=Role.SUPPRESSED.value
     )

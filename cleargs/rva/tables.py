@@ -2,8 +2,8 @@
 
 Both tables speak of the training frames only: held-out frames (split ``test``) enter no RVA set and have no
 row. Rows stand in trajectory order, by ``frame_id``. The columns of ``FRAMES`` are those of the interface, in
-its order, and one more at the end, ``stand_in``, which says that no frame was reliable and which frames took
-that place.
+its order, and two more at the end: ``stand_in``, which says that no frame was reliable and which frames took
+that place, and ``reactivated_for``.
 """
 
 from __future__ import annotations

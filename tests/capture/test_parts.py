@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from OpenImageIO import ImageOutput, ImageSpec
 from pydantic import ValidationError
 
 from cleargs.capture.cameras import Camera, Pose, pinhole
@@ -20,9 +22,19 @@ from cleargs.capture.holdout import held_out, holdout_hash
 from cleargs.capture.layout import externals
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.capture.prepare import WorkFrame, _stencil, _upright
+from cleargs.capture.sfm import _sfm_job
 from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sharpest import sharpness
-from cleargs.capture.sources import choose_times, frame_key, natural_key, open_capture, spread
+from cleargs.capture.sources import (
+    SourceFrame,
+    _masks,
+    choose_times,
+    frame_key,
+    natural_key,
+    open_capture,
+    spread,
+)
 from cleargs.capture.transforms import read_transforms
 from cleargs.capture.undistort import undistorter
 from cleargs.capture.world import normalise
@@ -307,6 +319,79 @@ def test_forms_of_transforms(images: Path, extra: dict, model: str, params: tupl
     assert np.allclose(frame.pose.rotation, np.diag([1, -1, -1]))
 
 
+def test_names_with_dots_and_slashes_of_windows(images: Path) -> None:
+    (images / "images").mkdir()
+    for index in range(2):
+        shutil.copy(images / "view0.png", images / "images" / f"frame.{index:04d}.png")
+    entries = [
+        {"file_path": path, "transform_matrix": np.eye(4).tolist()}
+        for path in ("images/frame.0000", "images\\frame.0001")
+    ]
+    path = images / "transforms.json"
+    path.write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 50.0, "frames": entries}))
+    found = [frame.name for frame in read_transforms(path, poses=True)]
+    assert found == ["images/frame.0000.png", "images/frame.0001.png"]
+
+
+def test_a_frame_name_may_be_a_number_or_a_time() -> None:
+    assert IngestConfig.model_validate({"holdout": 7}).holdout == "7"
+    assert IngestConfig(holdout="2024-05-01T12:30:01.jpg").holdout == "2024-05-01T12:30:01.jpg"
+
+
+def test_an_empty_folder_of_images_hides_no_other(images: Path) -> None:
+    (images / "images").mkdir()
+    assert externals(images, IngestConfig()) == {"capture": images}
+    assert len(open_capture(images, IngestConfig()).frames) == len(list(images.glob("*.png")))
+
+
+def test_masks_lie_as_their_images_do(tmp_path: Path) -> None:
+    names = ["cam1/0001.jpg", "cam2/0001.jpg", "cam2/0002.jpg", "0003.jpg"]
+    for mask in ("cam1/0001.jpg.png", "0001.png", "0002.png", "0003.png"):
+        (tmp_path / mask).parent.mkdir(exist_ok=True)
+        (tmp_path / mask).write_bytes(b"")
+    found = {name: path.relative_to(tmp_path).as_posix() for name, path in _masks(tmp_path, names).items()}
+    # 0001.png could be of either camera, so it is of none.
+    assert found == {
+        "cam1/0001.jpg": "cam1/0001.jpg.png",
+        "cam2/0002.jpg": "0002.png",
+        "0003.jpg": "0003.png",
+    }
+
+
+def test_every_camera_has_the_exif_of_an_image_of_its_own(images: Path) -> None:
+    sources = [SourceFrame(f"{k}.jpg", images / f"{k}.jpg") for k in range(3)]
+    frames = [WorkFrame(source, f"{k:06d}.png", 60, 40, False, None) for k, source in enumerate(sources)]
+    apart = _sfm_job(frames, IngestConfig(shared_camera=False))
+    assert apart.exif_images == [str((images / f"{k}.jpg").resolve()) for k in range(3)]
+    assert _sfm_job(frames, IngestConfig()).exif_images == apart.exif_images[:1]
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_camera_that_fits_the_stored_image_keeps_it_so(tmp_path: Path, orientation: int) -> None:
+    """COLMAP works on pixels as they are stored; half a turn keeps the proportions, and would go unseen."""
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 4), np.uint8)
+    path = tmp_path / "turned.png"
+    write_oriented(path, pixels, orientation)
+    camera = Camera("PINHOLE", 6, 4, (5.0, 5.0, 3.0, 2.0))
+    stored = _upright(SourceFrame("turned.png", path, camera=camera))
+    assert np.array_equal(stored, pixels[..., :3])
+    alone = SourceFrame("turned.png", path)
+    turns = {1: 0, 3: 2, 6: 3}[orientation]
+    assert np.array_equal(_upright(alone), np.rot90(pixels[..., :3], turns))
+    stencil = _stencil(alone)
+    assert stencil is not None and np.array_equal(stencil > 0, np.rot90(pixels[..., 3] > 127, turns))
+
+
+def write_oriented(path: Path, pixels: np.ndarray, orientation: int) -> None:
+    """A PNG with EXIF's orientation."""
+    spec = ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
+    spec.attribute("Orientation", orientation)
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # colours are not multiplied with it
+    output = ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels)
+    output.close()
+
+
 def test_externals_name_what_is_read(posed: Path, images: Path) -> None:
     config = IngestConfig()
     listed = {f"images/{index:03d}.png": posed / "images" / f"{index:03d}.png" for index in range(10)}
@@ -335,13 +420,13 @@ def test_exif_focal_length_is_the_starting_guess(tmp_path: Path) -> None:
     path = tmp_path / "phone.jpg"
     path.write_bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 720.0, 600, 400)
-    apply_exif_focal([camera], path)
+    apply_exif_focal(camera, path)
     # A 35 mm film frame is 36 mm wide; COLMAP takes 35.
     assert camera.has_prior_focal_length and 0.97 < camera.params[0] / (600 * 28 / 36) < 1.04
     # Without EXIF the guess stays.
     cv2.imwrite(str(tmp_path / "plain.png"), np.zeros((40, 60, 3), np.uint8))
     other = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 720.0, 600, 400)
-    apply_exif_focal([other], tmp_path / "plain.png")
+    apply_exif_focal(other, tmp_path / "plain.png")
     assert not other.has_prior_focal_length and other.params[0] == 720
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from OpenImageIO import ImageOutput, ImageSpec
 
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
 from cleargs.media.header import PNG, image_size
-from cleargs.media.image import read_mask, read_rgb
+from cleargs.media.image import read_alpha, read_mask, read_rgb
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -70,3 +71,26 @@ def test_a_link_to_an_image_is_an_image(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 6, 3), np.uint8))
     (tmp_path / "b.png").symlink_to("a.png")
     assert read_rgb(tmp_path / "b.png").shape == (4, 6, 3)
+
+
+def test_a_mask_of_zeros_and_ones(tmp_path: Path) -> None:
+    """As segmentation programs write them."""
+    labels = np.eye(4, dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "mask.png"), labels)
+    assert np.array_equal(read_mask(tmp_path / "mask.png"), labels * 255)
+    cv2.imwrite(str(tmp_path / "nothing.png"), 0 * labels)
+    assert not read_mask(tmp_path / "nothing.png").any()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_transparency_turns_with_its_image(tmp_path: Path, orientation: int) -> None:
+    opaque = np.random.default_rng(orientation).integers(0, 2, (4, 6, 1), np.uint8) * 255
+    spec = ImageSpec(6, 4, 4, "uint8")
+    spec.attribute("Orientation", orientation)
+    path = tmp_path / "cut.png"
+    output = ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.repeat(opaque, 4, axis=2))
+    output.close()
+    for upright in (True, False):
+        alpha = read_alpha(path, upright=upright)
+        assert alpha is not None and np.array_equal(alpha, read_rgb(path, upright=upright)[..., 0])

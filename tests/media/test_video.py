@@ -22,7 +22,7 @@ from cleargs.media.colour import (
     tone_map,
 )
 from cleargs.media.encode import write_video
-from cleargs.media.video import decode_frames, read_timeline
+from cleargs.media.video import decode_frames, decode_grey, read_timeline
 
 # EBU bars at 75 %, with greys and a saturated red, in sRGB code values.
 BARS = np.array(
@@ -70,12 +70,14 @@ def encode(
     transfer: int = 1,
     pts: tuple[int, ...] = (0, 1, 2),
     options: dict[str, str] | None = None,
+    aspect: Fraction = Fraction(1),
 ) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30, options=options or {})
         stream.width, stream.height, stream.pix_fmt = planes[0].shape[1], planes[0].shape[0], pixel
         stream.time_base = stream.codec_context.time_base = Fraction(1, 90)
         context = stream.codec_context
+        context.sample_aspect_ratio = aspect
         context.colorspace, context.color_range, context.color_trc = matrix, color_range, transfer
         context.color_primaries = 9 if matrix == 9 else 1
         for index, stamp in enumerate(pts):
@@ -174,6 +176,27 @@ def test_only_wanted_frames_are_yielded(tmp_path: Path) -> None:
     frames = dict(decode_frames(path, wanted))
     assert tuple(frames) == wanted
     assert not np.array_equal(frames[wanted[0]], frames[wanted[1]])
+
+
+def test_pixels_become_square(tmp_path: Path) -> None:
+    """AVCHD and DV have pixels that are wider than high."""
+    path = tmp_path / "clip.mp4"
+    encode(path, bar_planes("bt709", False), codec="libx264", aspect=Fraction(4, 3))
+    (_, wide), *_ = decode_frames(path, read_timeline(path).pts[:1])
+    height, width = bar_planes("bt709", False)[0].shape
+    assert wide.shape == (height, round(4 * width / 3), 3)
+
+
+def test_a_frame_that_cannot_be_decoded_spoils_no_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "clip.mkv"
+    encode(path, bar_planes("bt709", False), pts=tuple(range(0, 30, 3)))
+    stamps = read_timeline(path).pts
+    wanted = [*stamps, stamps[-1] + 5]
+    assert [number for number, _ in decode_grey(path, wanted)] == list(stamps)
+    with pytest.raises(InputError, match="1 of its frames cannot be decoded"):
+        list(decode_frames(path, wanted))
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

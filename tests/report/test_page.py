@@ -229,9 +229,10 @@ def test_weights_run_from_amber_to_teal() -> None:
 
 
 def test_advice_is_only_what_can_help() -> None:
-    def advice(frames: int, available: int) -> list[str]:
-        return list(verdict._closer(frames, available, load_config(installed(), "default")))
+    def advice(frames: int, available: int, *settings: str) -> list[str]:
+        return list(verdict._closer(frames, available, load_config(installed(), "default", settings)))
 
     assert advice(40, 40) == []  # every frame is used, and compared with every other
     assert advice(40, 60) == ["ingest.max_frames=60"]
+    assert advice(40, 60, "ingest.fps=2") == ["ingest.fps=4"]
     assert advice(150, 400) == ["ingest.max_frames=300", "ingest.overlap=16"]
