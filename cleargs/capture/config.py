@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from difflib import get_close_matches
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -98,9 +97,8 @@ class IngestConfig(BaseModel):
     @field_validator("holdout")
     @classmethod
     def _known_holdout(cls, value: str) -> str:
-        kind = value.partition(":")[0]
-        misspelt = ":" in value and get_close_matches(kind, ("every", "sharpest"))
-        if misspelt and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
+        # Letters before a colon are meant for a rule; a frame may be named by a time of day.
+        if re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
         if value in ("every:1", "sharpest:1"):
             raise ValueError(f"{value} would hold out every frame")

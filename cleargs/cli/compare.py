@@ -156,7 +156,7 @@ def compare(
             made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])
         else:
             samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
-            _check_names([sample.name for sample in samples], "captures")
+            _check_names([source.resolve().name for source in sources], "captures")
             made = make_scenes(out, samples, chosen, recipe, store, reporter)
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels

@@ -223,7 +223,7 @@ def _evaluate(
         versions={
             **versions(),
             **{name: version(name) for name in _LIBRARIES},
-            "onnxruntime": ", ".join(installed_onnxruntimes()),
+            "onnxruntime": ", ".join(installed_onnxruntimes()) or "absent",
         },
         images=tuple(images),
     )

@@ -59,10 +59,11 @@ def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
 def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
 
-    The border lies at half of the mask's own maximum: some programs write 1, not 255.
+    The border lies in the middle, of masks of 0 and 1 alone, as some programs write them, above 0.
     """
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
-    return np.where(grey > int(grey.max()) // 2, np.uint8(255), np.uint8(0))
+    border = 127 if grey.max() > 1 else 0
+    return np.where(grey > border, np.uint8(255), np.uint8(0))
 
 
 def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:  # [H, W]

@@ -121,10 +121,18 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
 
 
 def frame_rgb(frame: VideoFrame, aspect: float = 1.0) -> NDArray[np.uint8]:  # [H, W, 3]
-    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high."""
+    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high.
+
+    Raises InputError where that gives too many.
+    """
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
-    if aspect != 1.0:
-        wide = max(1, round(aspect * rgb.shape[1]))
+    wide = max(1, round(aspect * rgb.shape[1]))
+    if wide * rgb.shape[0] > MAX_PIXELS:
+        raise InputError(
+            f"a frame would have {wide}x{rgb.shape[0]} square pixels; at most {MAX_PIXELS} are read",
+            hint=_HINT,
+        )
+    if wide != rgb.shape[1]:
         rgb = np.asarray(cv2.resize(rgb, (wide, rgb.shape[0]), interpolation=cv2.INTER_CUBIC), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
 

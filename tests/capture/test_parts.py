@@ -230,7 +230,9 @@ def test_hash_of_the_holdout() -> None:
     assert len({digest, *others}) == 4
 
 
-@pytest.mark.parametrize("rule", ["every:1", "sharpest:1", "every:x", "every:0", "fairest:3", "", " , "])
+@pytest.mark.parametrize(
+    "rule", ["every:1", "sharpest:1", "every:x", "every:0", "fairest:3", "each:8", "", " , "]
+)
 def test_unknown_holdout_is_refused(rule: str) -> None:
     with pytest.raises(ValidationError):
         IngestConfig(holdout=rule)

@@ -22,7 +22,7 @@ from cleargs.media.colour import (
     tone_map,
 )
 from cleargs.media.encode import write_video
-from cleargs.media.video import decode_frames, decode_grey, read_timeline
+from cleargs.media.video import decode_frames, decode_grey, frame_rgb, read_timeline
 
 # EBU bars at 75 %, with greys and a saturated red, in sRGB code values.
 BARS = np.array(
@@ -185,6 +185,10 @@ def test_pixels_become_square(tmp_path: Path) -> None:
     (_, wide), *_ = decode_frames(path, read_timeline(path).pts[:1])
     height, width = bar_planes("bt709", False)[0].shape
     assert wide.shape == (height, round(4 * width / 3), 3)
+    # A damaged header must not ask for all memory.
+    frame = av.VideoFrame(width, height, "rgb24")
+    with pytest.raises(InputError, match="square pixels"):
+        frame_rgb(frame, 1e6)
 
 
 def test_a_frame_that_cannot_be_decoded_spoils_no_search(
