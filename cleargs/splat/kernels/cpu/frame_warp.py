@@ -11,6 +11,9 @@ every side; beyond its border the border pixels go on.
 Between pixels the image is interpolated by lines, and by cubics where one sample is all (a rolling shutter
 without blur): lines would blur what such a frame shows sharp.
 
+Pixels whose samples all lie within the image, nearly all of them, need no care for its border: their path is
+the fast one.
+
 A row's arithmetic does not depend on other rows, and the transpose adds up bands of rows of a fixed height in
 their order: results do not depend on the number of threads.
 """
@@ -24,7 +27,22 @@ from numba import prange
 
 from cleargs.splat.kernels import warp_layout as layout
 from cleargs.splat.kernels.cpu.jit import Array, Floats, inlined, kernel
-from cleargs.splat.kernels.cpu.pixel import black, load_pixel, plus_scaled, scaled, store_pixel
+from cleargs.splat.kernels.cpu.pixel import (
+    black,
+    black_pair,
+    both,
+    fractions_of,
+    load_pair,
+    load_pixel,
+    offset_of,
+    place_of,
+    plus_product,
+    plus_scaled,
+    scaled,
+    shares,
+    store,
+    sum_of,
+)
 from cleargs.splat.kernels.warp_layout import CHANNELS
 
 BAND = 32
@@ -40,6 +58,16 @@ def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, 
     inside = min(max(position, _ZERO), last)
     first = np.int32(min(inside, max(last - _ONE, _ZERO)))
     return first, inside - np.float32(first)
+
+
+@inlined
+def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> bool
+    """Whether all samples of a pixel lie within the image, not near its border; false for NaN.
+
+    A sample's point of the disc may lie a tenth beyond its rim.
+    """
+    far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE
+    return place - far >= _ZERO and place + far <= last
 
 
 @inlined
@@ -155,24 +183,37 @@ def expose(
             x0 = np.float32(x + margin) + offset[0, y, x]
             y0 = np.float32(y + margin) + offset[1, y, x]
             along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
+            if not cubic and _inside(x0, along_x, wide, right) and _inside(y0, along_y, wide, bottom):
+                start, along = place_of(x0, y0), place_of(along_x, along_y)
+                sums = black_pair()
+                for k in range(len(samples)):
+                    place = plus_scaled(start, along, samples[k, 0])
+                    place = plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+                    a, b = fractions_of(place)
+                    at = offset_of(place, columns)
+                    above, under = load_pair(image, at), load_pair(image, at + below)
+                    mixed = plus_scaled(scaled(above, _ONE - b), under, b)
+                    sums = plus_product(sums, mixed, shares(a))
+                store(out, CHANNELS * (y * width + x), scaled(sum_of(sums), share))
+                continue
             total = black()
             for k in range(len(samples)):
                 i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
                 j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
                 if cubic:
-                    across, shares = _neighbours(i, columns), _cubic(a)
+                    across, weights = _neighbours(i, columns), _cubic(a)
                     down, parts = _neighbours(j, rows), _cubic(b)
                     for m in range(4):
                         for n in range(4):
                             at = CHANNELS * (down[m] * columns + across[n])
-                            total = plus_scaled(total, load_pixel(image, at), parts[m] * shares[n])
+                            total = plus_scaled(total, load_pixel(image, at), parts[m] * weights[n])
                     continue
                 at = CHANNELS * (np.int64(j) * columns + i)
                 total = plus_scaled(total, load_pixel(image, at), (_ONE - b) * (_ONE - a))
                 total = plus_scaled(total, load_pixel(image, at + beside), (_ONE - b) * a)
                 total = plus_scaled(total, load_pixel(image, at + below), b * (_ONE - a))
                 total = plus_scaled(total, load_pixel(image, at + below + beside), b * a)
-            store_pixel(out, CHANNELS * (y * width + x), scaled(total, share))
+            store(out, CHANNELS * (y * width + x), scaled(total, share))
 
 
 @kernel
@@ -207,16 +248,28 @@ def spread(
                 x0 = np.float32(x + margin) + offset[0, y, x]
                 y0 = np.float32(y + margin) + offset[1, y, x]
                 along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
+                if not cubic and _inside(x0, along_x, wide, right) and _inside(y0, along_y, wide, bottom):
+                    start, along = place_of(x0, y0), place_of(along_x, along_y)
+                    twice = both(seen)
+                    for k in range(len(samples)):
+                        place = plus_scaled(start, along, samples[k, 0])
+                        place = plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+                        a, b = fractions_of(place)
+                        at = offset_of(place, columns) - CHANNELS * first * columns
+                        across = shares(a)
+                        _add_pair(part, at, twice, scaled(across, _ONE - b))
+                        _add_pair(part, at + below, twice, scaled(across, b))
+                    continue
                 for k in range(len(samples)):
                     i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
                     j, b = _between(y0 + samples[k, 0] * along_y + samples[k, 2] * wide, bottom)
                     if cubic:
-                        across, shares = _neighbours(i, columns), _cubic(a)
+                        across, weights = _neighbours(i, columns), _cubic(a)
                         down, parts = _neighbours(j, rows), _cubic(b)
                         for m in range(4):
                             for n in range(4):
                                 at = CHANNELS * ((down[m] - first) * columns + across[n])
-                                _add(part, at, seen, parts[m] * shares[n])
+                                _add(part, at, seen, parts[m] * weights[n])
                         continue
                     at = CHANNELS * (np.int64(j - first) * columns + i)
                     _add(part, at, seen, (_ONE - b) * (_ONE - a))
@@ -227,7 +280,12 @@ def spread(
 
 @inlined
 def _add(image: Any, offset: Any, light: Any, share: Any) -> None:
-    store_pixel(image, offset, plus_scaled(load_pixel(image, offset), light, share))
+    store(image, offset, plus_scaled(load_pixel(image, offset), light, share))
+
+
+@inlined
+def _add_pair(image: Any, offset: Any, light: Any, share: Any) -> None:
+    store(image, offset, plus_product(load_pair(image, offset), light, share))
 
 
 @kernel

@@ -1,7 +1,8 @@
-"""A pixel's four float32 numbers (RGB and one of padding) as one SIMD value, beside `simd`'s lanes.
+"""A pixel's four float32 numbers (RGB and one of padding) as one SIMD value, and a pair of pixels.
 
-Where every pixel reads from another place, lanes would have to be gathered; the channels of a pixel lie side
-by side. Images are [H, W, 4]; offsets count elements of the whole array and are not checked.
+Where every pixel reads from another place, `simd`'s lanes would have to be gathered; the channels of a pixel
+lie side by side, and so do two pixels of a row, between which a place lies. Images are [H, W, 4]; offsets
+count elements of the whole array and are not checked.
 """
 
 from __future__ import annotations
@@ -20,68 +21,185 @@ from cleargs.splat.kernels.cpu.simd import (
 )
 from cleargs.splat.kernels.warp_layout import CHANNELS
 
-_VECTOR = ir.VectorType(ir.FloatType(), CHANNELS)
+_PIXEL = ir.VectorType(ir.FloatType(), CHANNELS)
+_PAIR = ir.VectorType(ir.FloatType(), 2 * CHANNELS)
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
+_WHOLE = ir.VectorType(_I32, CHANNELS)
 
 
 class _PixelType(types.Type):
     """The type of four float32 numbers."""
 
 
+class _PairType(types.Type):
+    """The type of a pixel and the one right of it."""
+
+
 pixel = _PixelType("pixel")
-_register_type(_PixelType, _VECTOR)
+pair = _PairType("pixel pair")
+_register_type(_PixelType, _PIXEL)
+_register_type(_PairType, _PAIR)
 
-
-def _at(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    address = _element_address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-    return builder.bitcast(address, _VECTOR.as_pointer())
-
-
-def _loaded(builder: Any, address: Any) -> Any:
-    value = builder.load(address)
-    value.align = 4
-    return value
+# Numba's constructor is not annotated.
+_new_tuple: Any = types.UniTuple
+_SHARES = _new_tuple(types.float32, 2)
 
 
 def _scaled(builder: Any, value: Any, factor: Any) -> Any:
-    return builder.fmul(value, _broadcast_to(builder, factor, _VECTOR), flags=_FLAGS)
+    return builder.fmul(value, _broadcast_to(builder, factor, value.type), flags=_FLAGS)
+
+
+def _plus(builder: Any, x: Any, y: Any) -> Any:
+    return builder.fadd(x, y, flags=_FLAGS)
+
+
+def _at(context: Any, builder: Any, sig: Any, args: Any, vector: Any) -> Any:
+    address = _element_address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
+    return builder.bitcast(address, vector.as_pointer())
+
+
+def _load(vector: Any) -> Any:
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = builder.load(_at(context, builder, sig, args, vector))
+        value.align = 4
+        return value
+
+    return generate
 
 
 @_intrinsic
 def black(typing_context: Any) -> Any:
-    """Zeros."""
-    return pixel(), lambda context, builder, sig, args: ir.Constant(_VECTOR, [0.0] * CHANNELS)
+    """A pixel of zeros."""
+    return pixel(), lambda context, builder, sig, args: ir.Constant(_PIXEL, [0.0] * CHANNELS)
+
+
+@_intrinsic
+def black_pair(typing_context: Any) -> Any:
+    """Two pixels of zeros."""
+    return pair(), lambda context, builder, sig, args: ir.Constant(_PAIR, [0.0] * 2 * CHANNELS)
 
 
 @_intrinsic
 def load_pixel(typing_context: Any, array: Any, offset: Any) -> Any:
     """The pixel at ``offset``."""
-    return pixel(array, offset), lambda context, builder, sig, args: _loaded(
-        builder, _at(context, builder, sig, args)
-    )
+    return pixel(array, offset), _load(_PIXEL)
 
 
 @_intrinsic
-def store_pixel(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write the pixel at ``offset``."""
+def load_pair(typing_context: Any, array: Any, offset: Any) -> Any:
+    """The pixel at ``offset`` and the one right of it."""
+    return pair(array, offset), _load(_PAIR)
+
+
+@_intrinsic
+def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Write a pixel or a pair at ``offset``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _at(context, builder, sig, args)).align = 4
+        builder.store(args[2], _at(context, builder, sig, args, args[2].type)).align = 4
         return context.get_dummy_value()
 
-    return types.void(array, offset, pixel), generate
+    return types.void(array, offset, value), generate
 
 
 @_intrinsic
 def scaled(typing_context: Any, value: Any, factor: Any) -> Any:
-    """``value * factor`` for a float32 ``factor``."""
-    return pixel(pixel, types.float32), lambda context, builder, sig, args: _scaled(builder, *args)
+    """A pixel or a pair times a float32 ``factor``."""
+    return value(value, types.float32), lambda context, builder, sig, args: _scaled(builder, *args)
 
 
 @_intrinsic
 def plus_scaled(typing_context: Any, total: Any, value: Any, factor: Any) -> Any:
-    """``total + value * factor`` for a float32 ``factor``."""
+    """``total + value * factor`` for pixels or pairs and a float32 ``factor``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.fadd(args[0], _scaled(builder, args[1], args[2]), flags=_FLAGS)
+        return _plus(builder, args[0], _scaled(builder, *args[1:]))
 
-    return pixel(pixel, pixel, types.float32), generate
+    return total(total, value, types.float32), generate
+
+
+@_intrinsic
+def plus_product(typing_context: Any, total: Any, x: Any, y: Any) -> Any:
+    """``total + x * y`` for pairs, number by number."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _plus(builder, args[0], builder.fmul(*args[1:], flags=_FLAGS))
+
+    return pair(pair, pair, pair), generate
+
+
+@_intrinsic
+def shares(typing_context: Any, second: Any) -> Any:
+    """How much each of a pair counts: 1 - ``second``, then ``second``, float32."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        base = ir.Constant(_PAIR, [1.0] * CHANNELS + [0.0] * CHANNELS)
+        rise = ir.Constant(_PAIR, [-1.0] * CHANNELS + [1.0] * CHANNELS)
+        return _plus(builder, base, _scaled(builder, rise, args[0]))
+
+    return pair(types.float32), generate
+
+
+@_intrinsic
+def both(typing_context: Any, value: Any) -> Any:
+    """A pixel, twice."""
+    places = ir.Constant(ir.VectorType(_I32, 2 * CHANNELS), [*range(CHANNELS)] * 2)
+    return pair(pixel), lambda context, builder, sig, args: builder.shuffle_vector(args[0], args[0], places)
+
+
+@_intrinsic
+def sum_of(typing_context: Any, value: Any) -> Any:
+    """The two pixels of a pair, added."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        left, right = (
+            builder.shuffle_vector(args[0], args[0], ir.Constant(_WHOLE, [*range(start, start + CHANNELS)]))
+            for start in (0, CHANNELS)
+        )
+        return _plus(builder, left, right)
+
+    return pixel(pair), generate
+
+
+# -- places in an image, x and y in the first two of a pixel's numbers ---------------------------------------
+
+
+@_intrinsic
+def place_of(typing_context: Any, x: Any, y: Any) -> Any:
+    """The place (x, y), float32, in pixels."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = ir.Constant(_PIXEL, [0.0] * CHANNELS)
+        for lane, number in enumerate(args):
+            value = builder.insert_element(value, number, ir.Constant(_I32, lane))
+        return value
+
+    return pixel(types.float32, types.float32), generate
+
+
+@_intrinsic
+def offset_of(typing_context: Any, place: Any, columns: Any) -> Any:
+    """Where the pixel left of and above ``place`` begins in an image of so many ``columns``, int64.
+
+    Places are not negative.
+    """
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        whole = builder.fptosi(args[0], _WHOLE)
+        x, y = (builder.sext(builder.extract_element(whole, ir.Constant(_I32, n)), _I64) for n in (0, 1))
+        return builder.mul(builder.add(builder.mul(y, args[1]), x), ir.Constant(_I64, CHANNELS))
+
+    return types.int64(pixel, types.int64), generate
+
+
+@_intrinsic
+def fractions_of(typing_context: Any, place: Any) -> Any:
+    """How far ``place`` lies right of and below the pixel of `offset_of`: two float32 from 0 to 1."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        whole = builder.sitofp(builder.fptosi(args[0], _WHOLE), _PIXEL)
+        rest = builder.fsub(args[0], whole, flags=_FLAGS)
+        parts = [builder.extract_element(rest, ir.Constant(_I32, n)) for n in (0, 1)]
+        return context.make_tuple(builder, sig.return_type, parts)
+
+    return _SHARES(pixel), generate
