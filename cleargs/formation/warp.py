@@ -26,7 +26,8 @@ SAMPLES_PER_DISC_PIXEL = 0.8
 MIN_SAMPLES, MAX_SAMPLES = 3, 64
 STEPS_APART = 4
 """Samples of neighbouring times write to the same pixels in the transpose. One that follows at once waits for
-the other; four steps later it does not, which halves the transpose's time."""
+the other; four steps later it does not: along a row that takes half of the transpose's time, down a column
+as much as before."""
 
 STRIDE = 8
 """Every so many rows and columns, a pixel's displacement helps to set the number of samples."""

@@ -212,9 +212,11 @@ def _closer(frames: int, available: int, config: Config) -> Iterator[str]:
 def _more_frames(frames: int, available: int, config: Config) -> Iterator[str]:
     """The setting that limits the frames of a capture, where there are more."""
     fps, most = _setting(config, "ingest", "fps"), _setting(config, "ingest", "max_frames")
+    if available <= frames:
+        return
     if fps is not None and frames < most:
         yield f"ingest.fps={2 * fps:g}"
-    elif available > frames:
+    else:
         yield f"ingest.max_frames={min(available, 2 * frames)}"
 
 

@@ -235,4 +235,5 @@ def test_advice_is_only_what_can_help() -> None:
     assert advice(40, 40) == []  # every frame is used, and compared with every other
     assert advice(40, 60) == ["ingest.max_frames=60"]
     assert advice(40, 60, "ingest.fps=2") == ["ingest.fps=4"]
+    assert advice(40, 40, "ingest.fps=2") == []  # images have no rate
     assert advice(150, 400) == ["ingest.max_frames=300", "ingest.overlap=16"]

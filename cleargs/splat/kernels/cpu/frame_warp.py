@@ -71,6 +71,13 @@ def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> 
 
 
 @inlined
+def _seen_from(start: Any, along: Any, wide: Any, samples: Any, k: Any) -> Any:
+    """The place that the ``k``-th sample of a pixel comes from."""
+    place = plus_scaled(start, along, samples[k, 0])
+    return plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+
+
+@inlined
 def _cubic(a: Any) -> tuple[Any, Any, Any, Any]:  # float32 -> 4 float32
     """Shares of the four pixels about a place that lies ``a`` behind the second of them.
 
@@ -187,8 +194,7 @@ def expose(
                 start, along = place_of(x0, y0), place_of(along_x, along_y)
                 sums = black_pair()
                 for k in range(len(samples)):
-                    place = plus_scaled(start, along, samples[k, 0])
-                    place = plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+                    place = _seen_from(start, along, wide, samples, k)
                     a, b = fractions_of(place)
                     at = offset_of(place, columns)
                     above, under = load_pair(image, at), load_pair(image, at + below)
@@ -252,8 +258,7 @@ def spread(
                     start, along = place_of(x0, y0), place_of(along_x, along_y)
                     twice = both(seen)
                     for k in range(len(samples)):
-                        place = plus_scaled(start, along, samples[k, 0])
-                        place = plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+                        place = _seen_from(start, along, wide, samples, k)
                         a, b = fractions_of(place)
                         at = offset_of(place, columns) - CHANNELS * first * columns
                         across = shares(a)
