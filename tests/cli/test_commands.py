@@ -522,6 +522,19 @@ def test_elsewhere_than_on_linux_it_says_so() -> None:
     assert done.returncode == 2 and "runs on Linux" in cause and remedy.startswith("hint: ")
 
 
+@pytest.mark.parametrize(("own", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
+def test_threads_wait_asleep_unless_told_otherwise(own: dict[str, str], policy: str) -> None:
+    script = (
+        "import os, sys\nfrom cleargs.cli.entry import main\nsys.argv = ['cleargs', '--version']\n"
+        "try:\n    main()\nfinally:\n    print(os.environ['OMP_WAIT_POLICY'])"
+    )
+    outside = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env={**outside, **own}, check=True
+    )
+    assert done.stdout.splitlines()[-1] == policy
+
+
 def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("os.sched_getaffinity")
     monkeypatch.setattr("os.cpu_count", lambda: 6)
