@@ -18,8 +18,8 @@ def main() -> None:
         print(f"error: ClearGS runs on Linux, this is {sys.platform}", file=sys.stderr)
         print("hint: use a Linux machine or container; on Windows, WSL 2", file=sys.stderr)
         sys.exit(2)
-    # OpenMP's threads wait for each other asleep: awake, each would hold a core that another program's work, or
-    # the very thread that they wait for, could have. Read once, when PyTorch loads it.
+    # OpenMP's threads wait for each other asleep: awake, each would hold a core that another program, or the
+    # very thread that they wait for, could have. Read once, when PyTorch loads it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from cleargs.cli.main import main as run
 
