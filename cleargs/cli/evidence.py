@@ -74,17 +74,23 @@ def evidence(
     """
     from cleargs.evaluate.comparison import Recipe
     from cleargs.evaluate.evidence import Workshop, chosen_sections, make_section, minutes, read_evidence
-    from cleargs.files import write_bytes, write_json
+    from cleargs.evaluate.kept_sections import keep_section, kept_sections
+    from cleargs.files import write_bytes
     from cleargs.report.origin import version_of_source
     from cleargs.report.results_page import Origin, results_page
 
-    chosen = chosen_sections(read_evidence(listed), quick=quick, names=sections)
+    lists = read_evidence(listed)
+    chosen = chosen_sections(lists, quick=quick, names=sections)
     out = out.absolute()
     page = (page or out / "results.md").absolute()
+    beside = page.parent / "results"
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
     recipe = Recipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options)
-    found: list[Outcome] = []
+    command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
+    origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
+    version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"
+    whole = True
     with opened_store(out / STORE_FOLDER) as store:
         shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)
         plan = list(zip(chosen, minutes(chosen, shop), strict=True))
@@ -95,23 +101,15 @@ def evidence(
             return 0
         for section, _ in plan:
             started = time.monotonic()
-            found.append(make_section(section, shop))
+            found = make_section(section, shop)
             reporter.info(f"section {section.name}: {(time.monotonic() - started) / 60:.1f} min")
-            _write_pictures(found[-1], shop, page.parent / "results")
-            if found[-1].compared is not None:
-                write_json(out / f"{section.name}.json", found[-1].compared.document())
-    origin = Origin(
-        version=version_of_source(),
-        command=_command(quick=quick, captures=captures is not None, listed=listed is not None),
-        sections=sections,
-        recipe=recipe.workflow,
-        quick=quick,
-        threads=recipe.threads,
-        device=recipe.device,
-    )
-    write_bytes(page, results_page(found, origin).encode())
+            _write_pictures(found, shop, beside)
+            keep_section(beside, found, version, machine)
+            kept = kept_sections(beside, origin.sections, reporter)
+            write_bytes(page, results_page(kept, origin).encode())
+            whole = whole and not found.missing
     click.echo(f"written: {page}")
-    return DONE_IN_PART if any(outcome.missing for outcome in found) else 0
+    return 0 if whole else DONE_IN_PART
 
 
 def _command(*, quick: bool, captures: bool, listed: bool) -> str:

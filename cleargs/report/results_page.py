@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
@@ -21,8 +21,9 @@ from cleargs.evaluate.comparison_tables import (
     value_texts,
     work_table,
 )
-from cleargs.evaluate.evidence import Outcome, Section
+from cleargs.evaluate.evidence import Section
 from cleargs.evaluate.gaps import VERDICTS, Gap, compared_with, is_behind, losses_table
+from cleargs.evaluate.kept_sections import KeptSection
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, WHOLE
 
 CONFIDENCE = "95 %"
@@ -33,70 +34,70 @@ _ROUGH = "This is the rough page (`--quick`): small images, short trainings, few
 
 @dataclass(frozen=True)
 class Origin:
-    """How a page was made."""
+    """How a page is made."""
 
-    version: str
     command: str
     """Without the names of sections."""
-    sections: tuple[str, ...]
-    """Those that were asked for; empty for all."""
     recipe: str
     quick: bool
-    threads: int
-    device: str
-
-    def made(self, section: Section | None = None) -> str:
-        """The line under a table."""
-        names = self.sections if section is None else (section.name,)
-        command = " ".join((self.command, *(f"--section {name}" for name in names)))
-        return f"`{command}`, version {self.version}"
+    sections: tuple[Section, ...]
+    """All that its list has."""
 
 
-def results_page(outcomes: Sequence[Outcome], origin: Origin) -> str:
+def made(origin: Origin, found: Sequence[KeptSection]) -> str:
+    """The line under a table: the command that makes these sections, and the versions that made them."""
+    names = [] if len(found) == len(origin.sections) else [kept.section.name for kept in found]
+    command = " ".join((origin.command, *(f"--section {name}" for name in names)))
+    return f"`{command}`, version {_all(kept.version for kept in found)}"
+
+
+def results_page(found: Sequence[KeptSection], origin: Origin) -> str:
     """The whole page as Markdown; pictures are expected in ``results/`` beside it, by the sections' names."""
     template = (files("cleargs.report") / "results.md").read_text(encoding="utf-8")
-    nets = {
-        metric for found in outcomes if found.compared for metric in found.compared.results.cells.metrics()
-    }
+    nets = {metric for kept in found for metric in kept.results.cells.metrics()}
     lacking = [NAMES[name] for name in ("lpips_alex", "lpips_vgg") if name not in nets]
     warnings = [_ROUGH] * origin.quick
+    there = {kept.section.name for kept in found}
+    if absent := [section.title for section in origin.sections if section.name not in there]:
+        warnings.append(f"Not made yet: {', '.join(absent)}.")
     if lacking:
         warnings.append(f"{' and '.join(lacking)} could not be measured: `cleargs models install lpips`.")
     values = {
         "warning": "\n".join(f"**{warning}**" for warning in warnings),
         "confidence": CONFIDENCE,
-        "losses": losses_found(outcomes),
-        "answers": answers_table(outcomes),
+        "losses": losses_found(found),
+        "answers": answers_table(found),
         "recipe": origin.recipe,
         "variants": "\n".join(_variant_rows()),
-        "made": origin.made(),
-        "machine": f"{origin.device}, {origin.threads} threads",
-        "sections": "\n\n".join(_section(found, origin) for found in outcomes),
+        "made": made(origin, found),
+        "machine": _all(kept.machine for kept in found),
+        "sections": "\n\n".join(_section(kept, origin) for kept in found),
     }
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
 
 
-def gaps(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
+def gaps(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
     """Sections, and the whole method against every other variant in each of their cells."""
     once = _Once()
     return [
-        (outcome.section.title, gap)
-        for outcome, cells in _compared(outcomes)
+        (one.section.title, gap)
+        for one in kept
+        for cells in (one.results.cells,)
         for gap in compared_with(cells, WHOLE)
         if once.is_new(cells, gap.views, gap.column, WHOLE, gap.against, gap.metric)
     ]
 
 
-def losses(outcomes: Sequence[Outcome]) -> list[tuple[str, Gap]]:
+def losses(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
     """Those in which the whole method is behind, the sure ones first."""
-    found = [(section, gap) for section, gap in gaps(outcomes) if is_behind(gap.difference, gap.metric)]
+    found = [(section, gap) for section, gap in gaps(kept) if is_behind(gap.difference, gap.metric)]
     return sorted(found, key=lambda item: VERDICTS.index(item[1].verdict))
 
 
-def losses_found(outcomes: Sequence[Outcome]) -> str:
+def losses_found(kept: Sequence[KeptSection]) -> str:
     """The losses, and of how many comparisons they are."""
-    found, labels = losses(outcomes), _labels()
-    compared = len(gaps(outcomes))
+    found, labels = losses(kept), _labels()
+    compared = len(gaps(kept))
     sure = sum(loss.verdict == "sure" for _, loss in found)
     line = f"{len(found)} of {compared} comparisons, {sure} of them sure."
     places = [
@@ -107,7 +108,7 @@ def losses_found(outcomes: Sequence[Outcome]) -> str:
     return f"{line}\n\n{rows.markdown()}" if found else line
 
 
-def answers_table(outcomes: Sequence[Outcome]) -> str:
+def answers_table(kept: Sequence[KeptSection]) -> str:
     """For each question and metric, in how many columns the answer is better, worse or none."""
     rows, once = [], _Once()
     for question, variant, against in QUESTIONS:
@@ -115,7 +116,7 @@ def answers_table(outcomes: Sequence[Outcome]) -> str:
         for metric in COMPARED:
             found = [
                 difference
-                for _, cells in _compared(outcomes)
+                for cells in (one.results.cells for one in kept)
                 for views in cells.view_sets()
                 for column in cells.columns(views)
                 if (difference := cells.difference(views, column, variant, against, metric)) is not None
@@ -172,9 +173,9 @@ class _Once:
         return True
 
 
-def _compared(outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Cells]]:
-    """The sections that could be made, with their cells."""
-    return [(found, found.compared.results.cells) for found in outcomes if found.compared is not None]
+def _all(words: Iterable[str]) -> str:
+    """Each of them once."""
+    return " and ".join(dict.fromkeys(words))
 
 
 def _labels() -> dict[str, str]:
@@ -191,30 +192,30 @@ def _variant_rows() -> list[str]:
     return rows
 
 
-def _section(found: Outcome, origin: Origin) -> str:
+def _section(kept: KeptSection, origin: Origin) -> str:
     """Tables and pictures of a section, and what of it is missing."""
-    section, made = found.section, origin.made(found.section)
+    section, line = kept.section, made(origin, [kept])
     parts = [f"## {section.title}", _setting(section)]
-    if found.missing:
-        parts.append("Not made:\n\n" + "\n".join(f"* {line}" for line in found.missing))
-    if found.compared is None:
-        return "\n\n".join([*parts, f"Nothing of this section could be made ({made})."])
-    results, labels = found.compared.results, _labels()
+    if kept.missing:
+        parts.append("Not made:\n\n" + "\n".join(f"* {reason}" for reason in kept.missing))
+    if not kept.cells:
+        return "\n\n".join([*parts, f"Nothing of this section could be made ({line})."])
+    results, labels = kept.results, _labels()
     cells = results.cells
     for views in cells.view_sets():
-        parts += [f"### {TITLES[views]}", values_table(cells, views), made]
+        parts += [f"### {TITLES[views]}", values_table(cells, views), line]
         if questions := questions_table(cells, views):
-            parts += ["Differences:", questions, made]
-    parts += ["### Work", work_table(cells, labels).markdown(), made]
-    parts += ["### Roles of the frames", roles_table(results.roles, labels).markdown(), made]
+            parts += ["Differences:", questions, line]
+    parts += ["### Work", work_table(cells, labels).markdown(), line]
+    parts += ["### Roles of the frames", roles_table(results.roles, labels).markdown(), line]
     if results.choices:
-        parts += ["### The choice against the truth", choices_table(results.choices, labels).markdown(), made]
+        parts += ["### The choice against the truth", choices_table(results.choices, labels).markdown(), line]
     elif section.kind == "video":
         parts.append("Whether RIVR chose well cannot be said here: the repaired frames have no truth.")
     parts += [
         f"![Differences, {section.title}](results/{section.name}.png)",
         f"![Truth, input and scenes, {section.title}](results/{section.name}-sheet.jpg)",
-        made,
+        line,
     ]
     return "\n\n".join(parts)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from cleargs.cli.main import invoke
 from cleargs.errors import ConfigError
 from cleargs.evaluate.cells import Cell
 from cleargs.evaluate.comparison import Recipe
-from cleargs.evaluate.comparison_findings import Compared
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.evidence import Outcome, Workshop, minutes, read_evidence
+from cleargs.evaluate.evidence import Workshop, minutes, read_evidence
+from cleargs.evaluate.kept_sections import KeptSection
 from cleargs.evaluate.variants import QUESTIONS, VARIANTS, find_variants
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import opened_store
@@ -67,7 +68,7 @@ size = [96, 54]
 steps = 24
 variants = ["all-view"]
 """
-ORIGIN = Origin("0.1.0, abc", "cleargs evidence -o OUT", (), "default", False, 2, "cpu")
+ORIGIN = Origin("cleargs evidence -o OUT", "default", False, read_evidence().quick)
 
 
 def test_the_test_set_is_no_tuning_set() -> None:
@@ -142,33 +143,39 @@ def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
     )
 
 
-def outcome(*gains: float) -> Outcome:
+def found(*gains: float, version: str = "0.1.0, abc") -> KeptSection:
     """The whole method gains so much PSNR in each sample, and always 0.1 of LPIPS."""
     cells = []
     for number, gain in enumerate(gains):
         cells.append(cell("all-view", f"s{number}", 20.0 + number, 0.4))
         cells.append(cell("full", f"s{number}", 20.0 + number + gain, 0.3 + 0.001 * number))
     (section, *_) = read_evidence().quick
-    return Outcome(section, Compared(cells=cells), ("phone: no protocol is called 'phone'",))
+    return KeptSection(
+        section=section,
+        version=version,
+        machine="cpu, 2 threads",
+        missing=("phone: no protocol is called 'phone'",),
+        cells=tuple(cells),
+        roles=(),
+        choices=(),
+    )
 
 
 def test_losses_come_first_and_say_how_sure_they_are() -> None:
-    ((section, sure),) = losses([outcome(-1.0, -1.1, -0.9)])
+    ((section, sure),) = losses([found(-1.0, -1.1, -0.9)])
     assert section == "Motion blur"
     assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
-    ((_, chance),) = losses([outcome(-1.0, 0.5, -0.2)])
+    ((_, chance),) = losses([found(-1.0, 0.5, -0.2)])
     assert chance.verdict == "none"
-    ((_, single),) = losses([outcome(-1.0)])
+    ((_, single),) = losses([found(-1.0)])
     assert single.verdict == "one sample"
-    assert losses([outcome(1.0, 1.1, 0.9)]) == []
-    ordered = [
-        loss.verdict for _, loss in losses([outcome(-1.0, 0.5), outcome(-1.5), outcome(-1.0, -1.1, -0.9)])
-    ]
+    assert losses([found(1.0, 1.1, 0.9)]) == []
+    ordered = [loss.verdict for _, loss in losses([found(-1.0, 0.5), found(-1.5), found(-1.0, -1.1, -0.9)])]
     assert ordered == ["sure", "one sample", "none"]
 
 
 def test_scenes_that_two_sections_share_count_once() -> None:
-    whole, part, other = outcome(-1.0, -1.1, -0.9), outcome(-1.0), outcome(-2.0)
+    whole, part, other = found(-1.0, -1.1, -0.9), found(-1.0), found(-2.0)
     assert len(losses([whole, whole, part])) == 1
     assert len(losses([whole, other])) == 2
     page = results_page([whole, part], ORIGIN)
@@ -177,7 +184,7 @@ def test_scenes_that_two_sections_share_count_once() -> None:
 
 
 def test_the_page_of_a_few_cells() -> None:
-    page = results_page([outcome(-1.0, -1.1, -0.9)], ORIGIN)
+    page = results_page([found(-1.0, -1.1, -0.9)], ORIGIN)
     assert "1 of 2 comparisons, 1 of them sure." in page
     row = "| Motion blur | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
     assert row in page
@@ -194,9 +201,23 @@ def test_the_page_of_a_few_cells() -> None:
 
 
 def test_a_section_that_could_not_be_made_stands_on_the_page() -> None:
-    whole = outcome(1.0)
-    page = results_page([Outcome(whole.section, None, ("kitchen: it is not there",))], ORIGIN)
+    nothing = found().model_copy(update={"missing": ("kitchen: it is not there",)})
+    page = results_page([nothing], ORIGIN)
     assert "* kitchen: it is not there" in page and "Nothing of this section could be made" in page
+
+
+def test_the_page_says_which_sections_and_versions_it_is_made_of() -> None:
+    other = read_evidence().quick[1]
+    pair = [found(1.0), found(2.0, version="0.2.0, def").model_copy(update={"section": other})]
+    page = results_page(pair, ORIGIN)
+    absent = [section.title for section in ORIGIN.sections if section not in (pair[0].section, other)]
+    assert f"**Not made yet: {', '.join(absent)}.**" in page
+    command = "`cleargs evidence -o OUT --section blur --section mixed`, version 0.1.0, abc and 0.2.0, def"
+    assert page.count(command) == 2, "under the losses and under the answers"
+    assert "`cleargs evidence -o OUT --section mixed`, version 0.2.0, def" in page
+    alone = replace(ORIGIN, sections=(pair[0].section, other))
+    whole = results_page(pair, alone)
+    assert "Not made yet" not in whole and "`cleargs evidence -o OUT`, version 0.1.0" in whole
 
 
 def test_the_version_names_the_source() -> None:
@@ -224,9 +245,19 @@ def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
     assert "* kitchen: it is a real capture, and --captures was not given" in text
     assert "| mixed 1x | mixed 2x |" in text
     assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
-    for name in ("results/rooms.png", "results/rooms-sheet.jpg", "rooms.json"):
+    for name in ("results/rooms.png", "results/rooms-sheet.jpg", "results/rooms.json"):
         assert (out / name).stat().st_size > 0
     stored = {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
     assert make(out, spec) == 3
     assert stored == {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
     assert (out / "results.md").read_bytes() == page
+
+    # A call for one section takes the others from beside the page; none that another list, or nobody, made.
+    (out / "results.md").unlink()
+    assert make(out, spec, "--section", "videos") == 3
+    assert (out / "results.md").read_bytes() == page
+    spec.write_text(TINY.replace("steps = 24", "steps = 25", 1))
+    capsys.readouterr()
+    assert make(out, spec, "--section", "videos") == 3
+    assert "rooms.json is of another list: the page leaves 'Motion blur' out" in capsys.readouterr().err
+    assert "**Not made yet: Motion blur.**" in (out / "results.md").read_text()
