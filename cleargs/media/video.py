@@ -87,11 +87,17 @@ def video_size(path: Path) -> tuple[int, int]:
 def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
 
-    Raises InputError when a wanted frame cannot be decoded.
+    Raises InputError when a wanted frame cannot be decoded, or has too many pixels.
     """
     missing = set(pts)
     for number, frame, aspect in _decoded(path, pts):
         missing.discard(number)
+        wide, high = _square_width(frame, aspect), frame.height
+        if wide * high > MAX_PIXELS:
+            raise InputError(
+                f"{path.name}: a frame would have {wide}x{high} square pixels; at most {MAX_PIXELS} are read",
+                hint=_HINT,
+            )
         yield number, frame_rgb(frame, aspect)
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
@@ -121,20 +127,15 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
 
 
 def frame_rgb(frame: VideoFrame, aspect: float = 1.0) -> NDArray[np.uint8]:  # [H, W, 3]
-    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high.
-
-    Raises InputError where that gives too many.
-    """
+    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
-    wide = max(1, round(aspect * rgb.shape[1]))
-    if wide * rgb.shape[0] > MAX_PIXELS:
-        raise InputError(
-            f"a frame would have {wide}x{rgb.shape[0]} square pixels; at most {MAX_PIXELS} are read",
-            hint=_HINT,
-        )
-    if wide != rgb.shape[1]:
+    if (wide := _square_width(frame, aspect)) != rgb.shape[1]:
         rgb = np.asarray(cv2.resize(rgb, (wide, rgb.shape[0]), interpolation=cv2.INTER_CUBIC), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
+
+
+def _square_width(frame: VideoFrame, aspect: float) -> int:
+    return max(1, round(aspect * frame.width))
 
 
 def _signal(frame: VideoFrame) -> NDArray[np.float32]:  # [H, W, 3]
