@@ -11,7 +11,7 @@ from cleargs.capture import layout
 from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
 
-VERSION = 7
+VERSION = 8
 CONFIG = IngestConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")

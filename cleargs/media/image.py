@@ -20,6 +20,12 @@ from cleargs.untrusted import cause, open_regular, read_bytes
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
+_TIFF = frozenset({b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"})
+"""How a TIFF begins, and a BigTIFF."""
+
+_BACK = {6: 8, 8: 6}
+"""EXIF's orientation -> the one that undoes it; the others undo themselves."""
+
 
 def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
     """The image in ``path`` as 8-bit sRGB; alpha is dropped, 16 bits are reduced to 8.
@@ -27,7 +33,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
     ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
     """
     flags = cv2.IMREAD_COLOR if upright else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = _decode(path, flags)
+    bgr = _arranged(_decode(path, flags), path, is_upright=upright or _is_tiff(path), upright=upright)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -79,9 +85,9 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
     opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
     if opaque.all():
         return None
-    # OpenCV turns an image, but not when it is to keep the alpha.
-    turned = _turned(opaque, _orientation(path)) if upright else opaque
-    return np.where(turned, np.uint8(255), np.uint8(0))
+    # Of an image that keeps its alpha OpenCV turns TIFFs alone.
+    arranged = _arranged(opaque, path, is_upright=_is_tiff(path), upright=upright)
+    return np.where(arranged, np.uint8(255), np.uint8(0))
 
 
 def _orientation(path: Path) -> int:
@@ -97,10 +103,24 @@ def _orientation(path: Path) -> int:
     return int(orientation)
 
 
+def _is_tiff(path: Path) -> bool:
+    """Whether it is a TIFF, which OpenCV turns whatever it is told."""
+    with open_regular(path) as file:
+        return file.read(4) in _TIFF
+
+
+def _arranged(image: NDArray[Any], path: Path, *, is_upright: bool, upright: bool) -> NDArray[Any]:
+    """An image [H, W, ...] as it is to be seen (``upright``) or as it is stored, whichever it is."""
+    if is_upright == upright:
+        return image
+    orientation = _orientation(path)
+    return _turned(image, orientation if upright else _BACK.get(orientation, orientation))
+
+
 def _turned(image: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """A stored image [H, W] as it is to be seen."""
+    """A stored image as it is to be seen."""
     if orientation >= 5:  # mirrored at the diagonal, then as the first four
-        image = image.T
+        image = image.swapaxes(0, 1)
     mirrored = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
     down, across = mirrored.get(orientation, (1, 1))
     return np.ascontiguousarray(image[::down, ::across])

@@ -85,15 +85,18 @@ def test_a_mask_of_zeros_and_ones(tmp_path: Path) -> None:
     assert not read_mask(tmp_path / "nothing.png").any()
 
 
+@pytest.mark.parametrize("kind", ["png", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_transparency_turns_with_its_image(tmp_path: Path, orientation: int) -> None:
+def test_an_image_turns_with_its_transparency_or_stays(tmp_path: Path, orientation: int, kind: str) -> None:
+    """OpenCV turns a TIFF even where it is to be read as it is stored."""
     opaque = np.random.default_rng(orientation).integers(0, 2, (4, 6, 1), np.uint8) * 255
     spec = ImageSpec(6, 4, 4, "uint8")
     spec.attribute("Orientation", orientation)
-    path = tmp_path / "cut.png"
+    path = tmp_path / f"cut.{kind}"
     output = ImageOutput.create(str(path))
     assert output.open(str(path), spec) and output.write_image(np.repeat(opaque, 4, axis=2))
     output.close()
     for upright in (True, False):
         alpha = read_alpha(path, upright=upright)
         assert alpha is not None and np.array_equal(alpha, read_rgb(path, upright=upright)[..., 0])
+    assert np.array_equal(read_rgb(path, upright=False)[..., :1], opaque)
