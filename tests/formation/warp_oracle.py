@@ -8,7 +8,7 @@ from photographs import MEDIAN, twist
 from torch import Tensor
 
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.warp import padded
+from cleargs.formation.warp import Warp, padded
 from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 ALL = FrameMotion(
@@ -21,6 +21,8 @@ ALL = FrameMotion(
 )
 
 ROLLED = FrameMotion(skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
+
+LONG = FrameMotion(blur=twist(2, 1, -1, 4, 19, 2), skew=twist(1, 0, 2, 3, 5, -2), median_depth=MEDIAN)
 
 
 def tent(distance: Tensor) -> Tensor:
@@ -35,13 +37,22 @@ def keys(distance: Tensor) -> Tensor:
     return torch.where(d <= 1, near, torch.where(d < 2, far, torch.zeros_like(d)))
 
 
-def oracle(image: Tensor, fields: DisplacementFields, margin: int, points: Tensor) -> Tensor:
-    """What `Warp.forward` should give, in float64 torch with autograd: a mean of looks-up between pixels."""
+def oracle(image: Tensor, warp: Warp) -> Tensor:
+    """What `Warp.forward` should give, in float64 torch with autograd; ``image`` of it are its pixels."""
     pixels = image.detach().double().cpu().requires_grad_()
-    rows, columns = image.shape[:2]
+    seen = mean_of_looks(pixels, warp.fields, warp.margin, warp.samples)
+    if warp.between is not None:
+        seen = mean_of_looks(seen, warp.between.fields, 0, warp.between.samples)
+    seen.image = pixels  # type: ignore[attr-defined]
+    return seen
+
+
+def mean_of_looks(pixels: Tensor, fields: DisplacementFields, margin: int, points: Tensor) -> Tensor:
+    """What every pixel sees between pixels, on the average of the samples."""
+    rows, columns = pixels.shape[:2]
     height, width = fields.radius.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    total = torch.zeros(height, width, image.shape[2], dtype=torch.float64)
+    total = torch.zeros(height, width, pixels.shape[2], dtype=torch.float64)
     offset, sweep, radius = (field.double().cpu() for field in fields[:3])
     for t, u, v in points.double().cpu():
         at_x = (x + margin + offset[0] + t * sweep[0] + u * radius).clamp(0, columns - 1)
@@ -56,9 +67,7 @@ def oracle(image: Tensor, fields: DisplacementFields, margin: int, points: Tenso
                 share = between(at_y - j - m) * between(at_x - i - n)
                 pixel = pixels[(j + m).clamp(0, rows - 1), (i + n).clamp(0, columns - 1)]
                 total = total + share[..., None] * pixel
-    total = total / len(points)
-    total.image = pixels  # type: ignore[attr-defined]
-    return total
+    return total / len(points)
 
 
 def random_image(rows: int, columns: int) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from splat_scenes import make_camera, make_gaussians
-from warp_oracle import ALL, ROLLED
+from warp_oracle import ALL, LONG, ROLLED
 
 from cleargs.formation.warp import Warp, displacement_fields
 from cleargs.splat.camera import Camera
@@ -45,7 +45,7 @@ def test_the_gpu_agrees_with_the_cpu(count, size_px, aspect, antialias, device):
         assert error.norm() < 1e-3 * gradient.double().norm(), name
 
 
-@pytest.mark.parametrize("motion", [ALL, ROLLED], ids=["many samples", "one sample"])
+@pytest.mark.parametrize("motion", [ALL, ROLLED, LONG], ids=["many samples", "one sample", "two passes"])
 def test_the_warp_agrees_with_the_cpu_and_with_itself(motion, device):
     width, height = 633, 357
     camera = Camera(width, height, 500.0, 510.0, 310.0, 180.0, np.eye(4))
