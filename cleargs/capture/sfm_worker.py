@@ -98,8 +98,8 @@ def main() -> int:
         missed, refined = _median_error(model), False
         if missed > job["refine_above"]:
             adjusted = _refine(job, database, copy.deepcopy(model), partial, channel)
-            if refined := _median_error(adjusted) <= _CONVINCING * missed:
-                model = adjusted
+            if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
+                model, refined = adjusted, True
     if model is None:
         channel.error(
             "no two frames could be matched well enough to start a reconstruction",
@@ -313,12 +313,12 @@ def _median_error(model: pycolmap.Reconstruction) -> float:
 
 def _refine(
     job: dict[str, Any], database: Path, model: pycolmap.Reconstruction, output: Path, channel: ChildChannel
-) -> pycolmap.Reconstruction:
+) -> pycolmap.Reconstruction | None:
     """Adjust poses and points to the features; the cameras stay.
 
     At better poses more features find their points, so both are done in turn. The features leave place, turn
     and size of the whole open: the adjusted cameras are laid over the given ones by a similarity. A frame
-    that few points hold keeps its given pose.
+    that few points hold keeps its given pose. None where few points hold every frame.
     """
     given = {
         frame_id: pycolmap.Rigid3d(frame.rig_from_world.matrix()) for frame_id, frame in model.frames.items()
@@ -332,6 +332,8 @@ def _refine(
         )
         channel.done(done + 1)
     held = [image for image in model.images.values() if image.num_points3D >= _HELD_BY]
+    if not held:
+        return None
     similarity = pycolmap.estimate_sim3d(
         np.array([_centre_and_axes(image) for image in held]).reshape(-1, 3),
         np.array([before[image.name] for image in held]).reshape(-1, 3),

@@ -180,6 +180,18 @@ def test_a_frame_without_features_keeps_its_pose_amid_an_adjustment(shaken: Path
     assert np.allclose(pose_of(one).centre, pose_of(two).centre, atol=1e-12)
 
 
+def test_poses_stay_where_few_points_hold_every_frame(posed: Path, ingest: Ingest) -> None:
+    """COLMAP once stopped here: no frame was left to lay the adjusted cameras over the given ones by."""
+    random = np.random.default_rng(3)
+    poses = camera_to_world(10)
+    for pose in poses:
+        pose[:3, :3] = Rotation.from_rotvec(np.radians(random.normal(0, 4, 3))).as_matrix() @ pose[:3, :3]
+    write_transforms(posed, poses)
+    done = ingest(posed)
+    assert done.result.summary["given_poses_missed_px"] > 0.6
+    assert done.result.summary["poses"] == "input" and len(load_points(done.out).xyz)
+
+
 def test_a_sparse_model_of_bad_poses_is_adjusted_too(shaken: Path, ingest: Ingest) -> None:
     first = ingest(shaken, "first", refine_above=100)
     second = ingest(first.out, "second")
