@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
-VERSION = 24
+VERSION = 25
 CONFIG = RivrConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
@@ -205,7 +205,7 @@ def _repair_and_distil(
     trainings: list[Path] = []
     current = g0
     for number in range(1, config.rounds + 1):
-        steps = 0
+        steps = done = 0
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
@@ -232,7 +232,7 @@ def _repair_and_distil(
                 continue
             current = current.trained(
                 [*supervision.real, *repairs],
-                config.distil.model_copy(update={"steps": steps}),
+                config.distillation(number, done, steps, len(supervision.real)),
                 context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
                 seed=(context.seed, Stream.RIVR, number, *([place] if place else [])),
                 label=f"{label}: distilling",
@@ -240,7 +240,7 @@ def _repair_and_distil(
                 repaired=repaired_share(rows),
                 reporter=reporter,
             )
-            steps = 0
+            done, steps = done + steps, 0
             if trainings:
                 superseded(trainings[-1])
             trainings.append(current.folder)

@@ -131,12 +131,18 @@ def _settings(plain: Config, variant: Variant, work: Work) -> list[str]:
     own = steps_of(plain, work.frames)
     spent = split(own, variant.stage, work.steps)
     lines = [f"g0.sh_degree={work.sh_degree}"]
-    for name, steps in (
-        ("g0", spent.g0),
-        ("rivr.distil", spent.round),
-        ("consolidate.distil", spent.consolidate),
+    done = 0
+    for name, steps, trainings in (
+        ("g0", spent.g0, 1),
+        ("rivr.distil", spent.round, spent.rounds),
+        ("consolidate.distil", spent.consolidate, 1),
     ):
         lines.append(f"{name}.budget={work.budget}")
-        if steps:  # else the stage does not run
-            lines.append(f"{name}.steps={steps}")
+        if not steps:  # the stage does not run
+            continue
+        lines.append(f"{name}.steps={steps}")
+        if done:
+            lines.append(f"{name}.begin={done / spent.total}")
+        done += trainings * steps
+        lines.append(f"{name}.end={done / spent.total}")
     return lines

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from cleargs.record import Record
-from cleargs.splat.config import DistilConfig
+from cleargs.splat.config import G0_END, ROUNDS_END, DistilConfig
 
 MAX_ROUNDS = 16
 """Most rounds of RIVR."""
@@ -52,6 +52,25 @@ class RepairDistilConfig(DistilConfig):
     """Joint distillation of raw frames and repairs."""
 
     pseudo_weight: float = Field(0.5, ge=0, description="factor on the loss of a repaired view")
+
+
+class RoundsDistilConfig(RepairDistilConfig):
+    """The distillations of RIVR's rounds, which follow each other in one part of the schedule."""
+
+    begin: float = Field(
+        G0_END, ge=0, lt=1, description="share of the schedule that lies behind when the first round begins"
+    )
+    end: float = Field(
+        ROUNDS_END, gt=0, le=1, description="share of the schedule that lies behind when the last round ends"
+    )
+
+
+class ConsolidationDistilConfig(RepairDistilConfig):
+    """The final distillation."""
+
+    begin: float = Field(
+        ROUNDS_END, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
+    )
 
 
 class RivrConfig(Record):
@@ -111,7 +130,7 @@ class RivrConfig(Record):
         "With undo_motion the restored frame has the render's detail already, and would have it twice",
     )
     gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
-    distil: RepairDistilConfig = Field(RepairDistilConfig(), description="distillation of each round")
+    distil: RoundsDistilConfig = Field(RoundsDistilConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
 
     @property
@@ -120,6 +139,17 @@ class RivrConfig(Record):
         if self.targets == "auto":
             return "degraded" if self.distil.quality == "draft" else "all"
         return self.targets
+
+    def distillation(self, round: int, done: int, steps: int, frames: int) -> RoundsDistilConfig:
+        """A training of ``steps`` steps in round ``round`` (from 1), ``done`` of whose steps lie behind, with
+        its part of the schedule.
+
+        frames: active ones, on which the steps of a round rest where they are unset.
+        """
+        each = self.distil.steps_for(frames)
+        step = (self.distil.end - self.distil.begin) / (self.rounds * each)
+        begin = self.distil.begin + step * ((round - 1) * each + done)
+        return self.distil.model_copy(update={"steps": steps, "begin": begin, "end": begin + step * steps})
 
 
 class ConsolidateConfig(Record):
@@ -130,5 +160,7 @@ class ConsolidateConfig(Record):
         description="measures harm: the name of a scorer, or the path of an ONNX file",
         json_schema_extra={"key": False, "plugin": "scorers"},  # its content is in the key
     )
-    distil: RepairDistilConfig = Field(RepairDistilConfig(), description="the final distillation")
+    distil: ConsolidationDistilConfig = Field(
+        ConsolidationDistilConfig(), description="the final distillation"
+    )
     harm: HarmConfig = Field(HarmConfig(), description="when the consolidated scene is rejected")

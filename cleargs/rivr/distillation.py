@@ -30,7 +30,7 @@ from cleargs.splat.config import DistilConfig, FormationConfig
 from cleargs.splat.engine import Engine, Render
 from cleargs.splat.losses import psnr
 from cleargs.splat.ply import read_ply, write_ply
-from cleargs.splat.state import save_state
+from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import train
 from cleargs.splat.views import View
@@ -149,7 +149,7 @@ class Snapshot:
         repaired: float = 1.0,
         reporter: Reporter,
     ) -> Snapshot:
-        """This scene after training with fresh Adam moments on raw and repaired views, kept in ``folder``.
+        """This scene after training on, with Adam's moments, on raw and repaired views, kept in ``folder``.
 
         repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
         go to the raw frames: drawn as often as all of them, a few repairs would drown these.
@@ -171,6 +171,7 @@ class Snapshot:
                 config,
                 seed=seed,
                 formation=formation,
+                moments=read_moments(self.folder / STATE, self.scene.gaussians),
                 pseudo_share=_pseudo_share(config, views, repaired),
                 pseudo_weight=config.pseudo_weight,
                 checkpoint=folder / CHECKPOINT,

@@ -3,10 +3,8 @@
 The paper repairs along the trajectory: what is accepted early is distilled before later frames are rendered,
 and may fade while theirs are. That is what the consolidation is for.
 
-Each group's distillation is a training of its own, with fresh Adam moments and the whole decay of the means'
-rate. One decay over the round would leave the last groups a hundredth of the first one's rate, and so the end
-of the trajectory hardly any geometry of its own. As each group runs through the same decay, the rates of a
-round add up to the same whatever the number of groups.
+Each group's distillation is a training of its own, in its part of the schedule. Over a whole round the rates
+fall by a fifth at most, so that the end of the trajectory gets its geometry too.
 """
 
 from __future__ import annotations

@@ -28,6 +28,22 @@ class Moments:
             {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
         )
 
+    def state(self) -> dict[str, Tensor]:
+        """Them for a ``state.safetensors``, by ``first.NAME`` and ``second.NAME``."""
+        return {
+            f"{prefix}.{name}": tensor
+            for prefix, group in (("first", self.first), ("second", self.second))
+            for name, tensor in group.items()
+        }
+
+    def to(self, device: torch.device) -> Moments:
+        """A copy of them on a device."""
+        first, second = (
+            {name: tensor.to(device, copy=True) for name, tensor in group.items()}
+            for group in (self.first, self.second)
+        )
+        return Moments(first, second)
+
 
 def step_gaussians(
     gaussians: Gaussians,

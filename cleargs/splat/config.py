@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from cleargs.plugins import require_known
 from cleargs.record import Unit
@@ -75,9 +75,13 @@ class AdaptiveConfig(BaseModel):
 class TrainConfig(BaseModel):
     """How a scene is optimised.
 
-    Rates hold for 30,000 steps; a shorter training learns faster by ``rate_factor``. They are those of 3DGS
-    and gsplat but for the scales, which get twice theirs, the means, which get 2.5 times theirs (their noise
-    is gsplat's at 3,200 steps), and the SH terms above the constant, which get four times theirs.
+    The trainings of a run follow one schedule (image sizes, growth, SH degree, rates), each in its part from
+    ``begin`` to ``end``: G0, RIVR's rounds, the consolidation. All of its numbers are shares of the whole.
+
+    Rates hold for 30,000 steps; a shorter schedule learns faster by ``rate_factor``. They are those of 3DGS
+    and gsplat but for scales and opacities, which get twice theirs, the means, which get 2.5 times theirs
+    (their noise is gsplat's at 3,200 steps), and the SH terms above the constant, which get four times
+    theirs.
     docs/experiments/training.md has what that is worth.
     """
 
@@ -94,6 +98,15 @@ class TrainConfig(BaseModel):
         le=1_000_000,
         description="optimisation steps, one view each; unset = 50 an active frame, 3,200 to 7,200, times "
         "what quality says",
+    )
+    begin: float = Field(
+        0.0, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
+    )
+    end: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="share of the schedule that lies behind when this training ends",
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
     coarse_share: float = Field(
@@ -137,7 +150,9 @@ class TrainConfig(BaseModel):
     noise: float = Field(
         6.5e4, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
     )
-    opacity_reg: float = Field(0.01, ge=0, description="factor on the mean opacity in the loss")
+    opacity_reg: float = Field(
+        0.005, ge=0, description="factor on the mean opacity in the loss (3DGS-MCMC: 0.01)"
+    )
     scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
 
     lr_means: float = Field(4e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4)")
@@ -148,15 +163,15 @@ class TrainConfig(BaseModel):
         None,
         gt=0,
         le=20,
-        description="factor on the rates of means, scales, rotations and SH; unset = sqrt(30,000 / steps), 1 "
-        "to 6",
+        description="factor on the rates of means, scales, rotations and SH; unset = sqrt(30,000 / steps of "
+        "the whole schedule), 1 to 6",
     )
     lr_final: float = Field(
         0.1, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
     )
     lr_scales: float = Field(1e-2, ge=0, description="rate of the log scales (3DGS: 5e-3)")
     lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
-    lr_opacities: float = Field(5e-2, ge=0, description="rate of the opacity logits")
+    lr_opacities: float = Field(0.1, ge=0, description="rate of the opacity logits (3DGS: 0.05)")
     lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a fifth")
     lr_exposure: float = Field(1e-3, ge=0, description="rate of the exposure affines, where they are on")
     sh_every: float = Field(
@@ -197,9 +212,25 @@ class TrainConfig(BaseModel):
         return self.steps
 
     @property
+    def planned(self) -> int:
+        """Steps of the whole schedule, of which this training has its part."""
+        return max(self.length, round(self.length / (self.end - self.begin)))
+
+    @property
+    def first(self) -> int:
+        """The step of the schedule that it begins with."""
+        return round(self.begin * self.planned)
+
+    @property
     def refine_interval(self) -> int:
         """Steps between refinements."""
-        return max(1, round(self.refine_every * self.length))
+        return max(1, round(self.refine_every * self.planned))
+
+    @model_validator(mode="after")
+    def _ends_after_its_begin(self) -> TrainConfig:
+        if self.begin >= self.end:
+            raise ValueError(f"the schedule cannot end at {self.end} where it begins at {self.begin}")
+        return self
 
     @field_validator("strategy")
     @classmethod
@@ -207,9 +238,20 @@ class TrainConfig(BaseModel):
         return require_known("strategies", name, STRATEGIES)
 
 
+G0_END, ROUNDS_END = 16 / 19, 18 / 19
+"""Where in the schedule of the whole method the first scene is done, and where RIVR's rounds are."""
+
+
 class G0Config(TrainConfig):
     """The first scene, from the sparse points and the frames that RVA keeps."""
 
+    end: float = Field(
+        G0_END,
+        gt=0,
+        le=1,
+        description="share of the schedule that lies behind when this training ends; RIVR and the "
+        "consolidation go on from there. 1: for a scene that nothing follows",
+    )
     sh_degree: int | None = Field(
         None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
     )
@@ -235,9 +277,9 @@ class G0Config(TrainConfig):
 
 
 class DistilConfig(TrainConfig):
-    """Training on from a finished scene, with repaired views beside the real ones."""
+    """Training on from where a scene has got to, with repaired views beside the real ones."""
 
-    share_of_steps: ClassVar[float] = 1 / 16
+    share_of_steps: ClassVar[float] = (1.0 - ROUNDS_END) / G0_END
 
     steps: int | None = Field(
         None,
@@ -245,30 +287,9 @@ class DistilConfig(TrainConfig):
         le=1_000_000,
         description="optimisation steps, one view each; unset = a sixteenth of a first scene's",
     )
-    coarse_share: float = Field(
-        0.0, ge=0, le=1, description="share of the steps that see reduced images; 0 = off"
-    )
     densify: bool = Field(False, description="let the strategy change the number and places of the Gaussians")
     opacity_reg: float = Field(0.0, ge=0, description="factor on the mean opacity in the loss")
     scale_reg: float = Field(0.0, ge=0, description="factor on the mean scale in the loss")
-    lr_means: float = Field(8e-5, ge=0, description="rate of the means, at the first step")
-    lr_scales: float = Field(5e-3, ge=0, description="rate of the log scales")
-    rate_factor: float | None = Field(
-        1.0, gt=0, le=20, description="factor on the rates of means, scales, rotations and SH"
-    )
-    lr_final: float = Field(
-        1.0, gt=0, le=1, description="share of all other rates left at the last step, exponential decay"
-    )
-    sh_every: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="share of the steps between raises of the SH degree from 0 up; 0 = all degrees from the "
-        "first step",
-    )
-    formation: FormationConfig = Field(
-        FormationConfig(start=0.0), description="what the camera did to each raw frame"
-    )
     pseudo_share: Annotated[float, Field(ge=0, le=1)] | Literal["even"] = Field(
         0.7,
         description="share of the steps that draw a repaired view; even: the repaired views' share of all "

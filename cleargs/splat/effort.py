@@ -53,14 +53,13 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
 
 def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
     """How many Gaussians each step has, [length], where they grow from ``start`` as fast as they may."""
+    first, planned = config.first, config.planned
     counts = np.full(config.length, float(start))
     if not config.densify or config.budget is None or start >= config.budget:
         return counts
-    refined = np.arange(config.refine_interval, config.length, config.refine_interval)
-    between = (refined >= config.refine_start * config.length) & (
-        refined <= config.refine_stop * config.length
-    )
-    for step in refined[between]:
+    refined = np.arange(config.refine_interval, first + config.length, config.refine_interval)
+    between = (refined >= config.refine_start * planned) & (refined <= config.refine_stop * planned)
+    for step in refined[between & (refined > first)] - first:
         counts[step:] = min(config.budget, int((1.0 + config.growth) * counts[step]))
     return counts
 
@@ -70,12 +69,12 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
 
     ``config`` is decided; ``frames`` of ``megapixels`` each are trained on, from ``start`` Gaussians.
     """
-    step = np.arange(config.length)
-    reduced = np.where(step < config.coarse_share * config.length, config.coarse_factor**2, 1.0)
+    step = config.first + np.arange(config.length)
+    reduced = np.where(step < config.coarse_share * config.planned, config.coarse_factor**2, 1.0)
     seconds = STEP_S + STEP_S_PER_MEGAPIXEL * megapixels * reduced
     seconds += STEP_S_PER_GAUSSIAN * gaussians_by_step(config, start)
     if config.formation.enabled:
-        since = step - config.formation.start * config.length
+        since = step - max(config.first, config.formation.start * config.planned)
         again = SEARCH_AGAIN_S / config.formation.every
         seconds += megapixels * np.where(since < 0, 0.0, np.where(since < frames, SEARCH_S, again))
     return seconds

@@ -29,7 +29,7 @@ class Rates:
 
     def __init__(self, config: TrainConfig, coefficients: int, device: torch.device | str = "cpu") -> None:
         self._config = config
-        factor = rate_factor(config.length) if config.rate_factor is None else config.rate_factor
+        factor = rate_factor(config.planned) if config.rate_factor is None else config.rate_factor
         self._factor = factor
         sh = torch.full((coefficients * 3,), factor * config.lr_sh / SH_REST_DIVISOR, device=device)
         sh[:3] = factor * config.lr_sh
@@ -41,14 +41,14 @@ class Rates:
         }
 
     def means(self, step: int) -> float:
-        """Rate of the means before step ``step``, counted from 0."""
+        """Rate of the means before step ``step``, counted from 0 along the schedule."""
         return (
             self._factor
             * self._config.lr_means
-            * float(self._config.lr_means_final ** (step / self._config.length))
+            * float(self._config.lr_means_final ** (step / self._config.planned))
         )
 
     def at(self, step: int) -> dict[str, float | Tensor]:
-        """Every rate before step ``step``, counted from 0."""
-        left = float(self._config.lr_final ** (step / self._config.length))
+        """Every rate before step ``step``, counted from 0 along the schedule."""
+        left = float(self._config.lr_final ** (step / self._config.planned))
         return {"means": self.means(step), **{name: rate * left for name, rate in self._first.items()}}

@@ -11,8 +11,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from cleargs.errors import StoreError
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
+from cleargs.splat.adam import Moments
+from cleargs.splat.gaussians import Gaussians
+from cleargs.untrusted import cause
 
 
 def save_state(path: Path, tensors: dict[str, Tensor]) -> None:
@@ -29,3 +33,23 @@ def load_state(path: Path, reporter: Reporter) -> dict[str, Tensor] | None:
     except (OSError, SafetensorError, ValueError) as error:
         reporter.warn(f"ignoring the damaged checkpoint {path.name}: {error}")
         return None
+
+
+def read_moments(path: Path, gaussians: Gaussians) -> Moments:
+    """Adam's moments of a finished training, from its state; they belong to ``gaussians``, its scene.
+
+    Raises StoreError when the file is missing or damaged, or is of other Gaussians.
+    """
+    hint = "run the stage that made it again with --force"
+    try:
+        state = load_file(path)
+        first, second = (
+            {name: state[f"{prefix}.{name}"] for name in gaussians.tensors()}
+            for prefix in ("first", "second")
+        )
+    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        raise StoreError(f"cannot read {path}: {cause(error)}", hint=hint) from error
+    for name, tensor in gaussians.tensors().items():
+        if not first[name].shape == second[name].shape == tensor.shape:
+            raise StoreError(f"{path} is of another scene than the one beside it", hint=hint)
+    return Moments(first, second)

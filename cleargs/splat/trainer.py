@@ -66,6 +66,7 @@ def train(
     *,
     seed: Sequence[int],
     formation: Formation | None = None,
+    moments: Moments | None = None,
     pseudo_share: float = 0.0,
     pseudo_weight: float = 1.0,
     checkpoint: Path,
@@ -74,12 +75,13 @@ def train(
     round: int = 0,
     device: str = "cpu",
 ) -> Trained:
-    """Train ``scene`` on ``views`` with fresh Adam moments, for as many steps as ``config`` says.
+    """Train ``scene`` on ``views`` for as many steps as ``config`` says.
 
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
-    otherwise with what the formation makes of it, which keeps learning in place. A share ``pseudo_share``
-    of the steps draws a pseudo view, whose loss is multiplied by ``pseudo_weight``. Resumes from
-    ``checkpoint`` where there is one, to the same result bit for bit. Beside each checkpoint lies a preview.
+    otherwise with what the formation makes of it, which keeps learning in place. ``moments`` are Adam's, from
+    the part of the schedule before this one; None: fresh ones. A share ``pseudo_share`` of the steps draws a
+    pseudo view, whose loss is multiplied by ``pseudo_weight``. Resumes from ``checkpoint`` where there is
+    one, to the same result bit for bit. Beside each checkpoint lies a preview.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
     loss ceases to be finite.
@@ -90,6 +92,7 @@ def train(
         config,
         seed=seed,
         formation=formation,
+        moments=moments,
         pseudo_share=pseudo_share,
         pseudo_weight=pseudo_weight,
         device=device,
@@ -130,6 +133,7 @@ class Trainer:
         *,
         seed: Sequence[int],
         formation: Formation | None = None,
+        moments: Moments | None = None,
         pseudo_share: float = 0.0,
         pseudo_weight: float = 1.0,
         device: str = "cpu",
@@ -152,7 +156,8 @@ class Trainer:
                 f"the scene to start from is damaged: {fault}",
                 hint="run the stage that made it again with --force",
             )
-        self._moments = Moments.zeros(self._gaussians)
+        self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
+        self._before = 0 if moments is None else config.first
         self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
         assert config.budget is not None  # decided above
         self._strategy = make_strategy(config, config.budget, seed)
@@ -163,6 +168,7 @@ class Trainer:
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
             *self._seed,
+            self._before,
             self._share,
             pseudo_weight,
             "" if formation is None else formation.digest(),
@@ -176,6 +182,11 @@ class Trainer:
         return replace(self._scene, gaussians=self._gaussians)
 
     @property
+    def _at(self) -> int:
+        """How many steps of the schedule lie behind."""
+        return self._config.first + self.done
+
+    @property
     def last_psnr(self) -> float:
         """Mean PSNR over the last 50 steps, dB."""
         self._read_meter()
@@ -183,8 +194,8 @@ class Trainer:
 
     def step(self) -> None:
         """One iteration: one view, one Adam step, and what densification is due."""
-        config, view = self._config, self._view(self.done)
-        factor = config.coarse_factor if self.done < config.coarse_share * self.length else 1.0
+        config, view, at = self._config, self._view(self.done), self._at
+        factor = config.coarse_factor if at < config.coarse_share * config.planned else 1.0
         target, mask = self._cache.get(view, factor)
         formed = self._formed(view, factor, target, mask)
         weight = view.weight if formed is None else formed.weight
@@ -194,7 +205,7 @@ class Trainer:
         image = render.image if formed is None else formed.forward(render)
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
-        if config.densify and self._strategy.wants_errors(self.done + 1):
+        if config.densify and self._strategy.wants_errors(at + 1):
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
         if config.densify:
@@ -203,7 +214,7 @@ class Trainer:
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
         )
         step_gaussians(
-            self._gaussians, gradients, self._moments, self._rates.at(self.done), step=self.done + 1
+            self._gaussians, gradients, self._moments, self._rates.at(at), step=self._before + self.done + 1
         )
         if formed is not None:  # last, since it may have to wait for the device
             formed.learn()
@@ -239,9 +250,8 @@ class Trainer:
             "step": torch.tensor(self.done),
             "log": self._log.packed(self.done),
         }
-        groups = (self._gaussians.tensors(), self._moments.first, self._moments.second)
-        for prefix, group in zip(("parameter", "first", "second"), groups, strict=True):
-            state |= {f"{prefix}.{name}": tensor for name, tensor in group.items()}
+        state |= {f"parameter.{name}": tensor for name, tensor in self._gaussians.tensors().items()}
+        state |= self._moments.state()
         state |= {f"strategy.{name}": tensor for name, tensor in self._strategy.state().items()}
         if self._formation is not None:
             state |= {f"formation.{name}": tensor for name, tensor in self._formation.state().items()}
@@ -286,7 +296,7 @@ class Trainer:
     def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
         if self._formation is None:
             return None
-        progress = self.done / self.length
+        progress = self._at / self._config.planned
         return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
 
     def _render(self, camera: Camera, *, depth: bool) -> Render:
@@ -300,9 +310,9 @@ class Trainer:
         )
 
     def _sh_degree(self) -> int:
-        every = self._config.sh_every * self.length
+        every = self._config.sh_every * self._config.planned
         largest = self._gaussians.sh_degree
-        return largest if every == 0 else min(largest, int(self.done / every))
+        return largest if every == 0 else min(largest, int(self._at / every))
 
     def _measure(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
         """The gradient of the loss by the image; its value goes into the log, from a GPU with some delay."""
@@ -344,12 +354,12 @@ class Trainer:
 
     def _densify(self) -> None:
         """What the strategy does, and its refinement where one is due."""
-        config = self._config
-        between = config.refine_start * self.length <= self.done <= config.refine_stop * self.length
-        if between and self.done % config.refine_interval == 0:
+        config, at = self._config, self._at
+        between = config.refine_start * config.planned <= at <= config.refine_stop * config.planned
+        if between and at % config.refine_interval == 0:
             self.check_finite()  # a refinement takes one whose opacity is NaN for dead, and hides it
-            self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, self.done)
-        self._strategy.after_step(self._gaussians, self._rates.means(self.done), self.done)
+            self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, at)
+        self._strategy.after_step(self._gaussians, self._rates.means(at), at)
 
     def _on_device(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         return {name: tensor.to(self._device) for name, tensor in tensors.items()}

@@ -89,6 +89,15 @@ def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) 
         ]
         assert {training.budget for training in trainings} == {12_345}
         assert config.sections["g0"].sh_degree == 2
+        made = trainings[: ("g0", "rivr", "consolidate").index(variant.stage) + 1]
+        assert [made[0].begin, *(later.begin for later in made[1:]), 1.0] == [
+            0.0,
+            *(training.end for training in made),
+        ]
+        if variant.stage != "g0":
+            rivr = config.sections["rivr"]
+            made[1] = rivr.distillation(rivr.rounds, 0, rivr.distil.steps, 20)
+        assert {training.planned for training in made} == {total}
 
 
 def test_the_recipe_s_own_total_changes_nothing_but_budget_and_degree() -> None:

@@ -23,6 +23,7 @@ from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rivr.config import ConsolidateConfig, RivrConfig
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
+from cleargs.splat.adam import Moments
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.gaussians import Gaussians
@@ -163,7 +164,7 @@ def write_capture(root: Path) -> None:
     write_ply(g0 / "scene.ply", Scene(disturbed))
     write_exposure(g0 / "exposure.parquet", Exposure.identity([0, 2, 3, 4, 5, 6]))
     write_formation(g0 / "formation.parquet", CaptureFormation([], FormationConfig()), {})
-    save_state(g0 / "state.safetensors", {"step": torch.tensor(0)})
+    save_state(g0 / "state.safetensors", Moments.zeros(disturbed).state())
     write_json(g0 / "manifest.json", {})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,21 @@ import pytest
 import torch
 from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
 
-from cleargs.errors import InputError, StageError
+from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
 from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer
+from cleargs.splat.adam import Moments
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.losses import PhotometricLoss, photometric_loss
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
-from cleargs.splat.state import load_state
+from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer, train
 from cleargs.splat.views import ImageCache, View, unseen_pixels
@@ -99,6 +101,43 @@ def test_it_learns_the_pictures(pictures: list[np.ndarray], tmp_path: Path) -> N
     assert rows.column("width").to_pylist()[0] == WIDTH // 2
     assert rows.column("height").to_pylist()[-1] == HEIGHT
     assert set(rows.column("frame_id").to_pylist()) == set(range(6))
+
+
+def test_a_schedule_in_parts_is_the_schedule(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    """Rates, growth, SH degree, image size, noise and Adam's steps go on where the part before has ended."""
+    one = views(pictures[:1])  # each part draws the views in an order of its own
+    whole = run(one, tmp_path / "whole")
+    ends = (0.0, 0.2, 0.75, 1.0)  # none in the steps that look for errors, which a part forgets
+    scene, moments, rows = start(sh_degree=1), None, []
+    for number, (begin, end) in enumerate(pairwise(ends)):
+        part = CONFIG.model_copy(update={"steps": round(40 * (end - begin)), "begin": begin, "end": end})
+        done = run(one, tmp_path / f"part{number}", part, scene=scene, moments=moments)
+        save_state(tmp_path / "state.safetensors", done.state)
+        scene, moments = done.scene, read_moments(tmp_path / "state.safetensors", done.scene.gaussians)
+        rows += done.rows.to_pylist()
+    for name, tensor in whole.scene.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(scene.gaussians, name)), name
+    told = ("loss", "n_gaussians", "sh_degree", "width")
+    assert [[row[name] for name in told] for row in rows] == [
+        [row[name] for name in told] for row in whole.rows.to_pylist()
+    ]
+
+
+def test_moments_of_another_scene_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "state.safetensors"
+    with pytest.raises(StoreError, match="cannot read"):
+        read_moments(path, start().gaussians)
+    save_state(path, {"step": torch.tensor(0)})
+    with pytest.raises(StoreError, match=r"first\.means"):
+        read_moments(path, start().gaussians)
+    save_state(path, Moments.zeros(start(59).gaussians).state())
+    with pytest.raises(StoreError, match="another scene"):
+        read_moments(path, start().gaussians)
+
+
+def test_a_part_ends_after_its_begin() -> None:
+    with pytest.raises(ValueError, match="cannot end at"):
+        TrainConfig(begin=0.9, end=0.9)
 
 
 def test_weights_of_one_change_no_bit(

@@ -66,11 +66,11 @@ class AdaptiveDensityControl(Strategy):
             arrays, running = densify(
                 arrays, running, pull, grad=grad, dense=dense, budget=self._budget, rng=rng
             )
-        interval = round(config.adaptive.reset * config.length)
+        interval = round(config.adaptive.reset * config.planned)
         large = config.adaptive.large if interval and step > interval else np.inf
         arrays, running = prune(arrays, running, min_opacity=config.min_opacity, large=large)
         since = step - config.refine_interval
-        if interval and step // interval > since // interval and step < config.refine_stop * config.length:
+        if interval and step // interval > since // interval and step < config.refine_stop * config.planned:
             lower_opacities(arrays, running, 2.0 * config.min_opacity)
         self._pull = None
         grown, first, second = (

@@ -68,7 +68,7 @@ class MCMC(Strategy):
         refined = -(-step // interval) * interval
         return (
             refined - step < min(LOOKS, max(1, interval // 8))
-            and config.refine_start * config.length <= refined <= config.refine_stop * config.length
+            and config.refine_start * config.planned <= refined <= config.refine_stop * config.planned
         )
 
     def add_errors(self, errors: Tensor) -> None:
