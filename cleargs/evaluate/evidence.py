@@ -34,8 +34,14 @@ from cleargs.splat.effort import training_cost
 from cleargs.synth.synthetic_capture import make_capture
 from cleargs.untrusted import FAULTS, cause, read_text, shallow
 
-WORLD_SETTINGS = ("rva.enabled=false", "g0.steps=4000", "g0.budget=100000", "ingest.max_frames=60")
-"""How a scene is trained that becomes a world: on every frame."""
+WORLD_SETTINGS = (
+    "rva.enabled=false",
+    "g0.steps=4000",
+    "g0.end=1.0",
+    "g0.budget=100000",
+    "ingest.max_frames=60",
+)
+"""How a scene is trained that becomes a world: on every frame, and to the end."""
 
 Seed = Annotated[int, Field(ge=0)]
 
