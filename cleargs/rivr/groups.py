@@ -3,8 +3,8 @@
 The paper repairs along the trajectory: what is accepted early is distilled before later frames are rendered,
 and may fade while theirs are. That is what the consolidation is for.
 
-Each group's distillation is a training of its own, in its part of the schedule. Over a whole round the rates
-fall by a fifth at most, so that the end of the trajectory gets its geometry too.
+Each group's distillation is a training of its own, in its part of the schedule. Over one of two rounds the
+means' rate falls by a fifth, so that the end of the trajectory gets its geometry too.
 """
 
 from __future__ import annotations

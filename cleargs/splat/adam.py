@@ -28,6 +28,15 @@ class Moments:
             {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
         )
 
+    @classmethod
+    def of_state(cls, state: dict[str, Tensor]) -> Moments:
+        """Those that `state` gave, among whatever else is in ``state``."""
+
+        def group(prefix: str) -> dict[str, Tensor]:
+            return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
+
+        return cls(group("first."), group("second."))
+
     def state(self) -> dict[str, Tensor]:
         """Them for a ``state.safetensors``, by ``first.NAME`` and ``second.NAME``."""
         return {

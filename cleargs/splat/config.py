@@ -25,7 +25,7 @@ class FormationConfig(BaseModel):
         "skewed by its rolling shutter, out of focus",
     )
     start: float = Field(
-        0.25, ge=0, le=1, description="share of the steps before formations are first estimated"
+        0.25, ge=0, le=1, description="share of the schedule before formations are first estimated"
     )
     every: int = Field(
         10, ge=1, description="a frame's formation is estimated again after so many steps on it"
@@ -68,7 +68,7 @@ class AdaptiveConfig(BaseModel):
         0.1,
         ge=0,
         le=1,
-        description="share of the steps after which opacities are lowered again; 0: never",
+        description="share of the schedule after which opacities are lowered again; 0: never",
     )
 
 
@@ -110,7 +110,10 @@ class TrainConfig(BaseModel):
     )
     ssim_lambda: float = Field(0.2, ge=0, le=1, description="share of D-SSIM in the loss, the rest is L1")
     coarse_share: float = Field(
-        0.25, ge=0, le=1, description="share of the steps, from the first, that see reduced images; 0 = off"
+        0.25,
+        ge=0,
+        le=1,
+        description="share of the schedule, its first, with reduced images; 0 = off",
     )
     coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
 
@@ -138,13 +141,13 @@ class TrainConfig(BaseModel):
         0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
     )
     refine_every: float = Field(
-        1 / 64, gt=0, le=1, description="share of the steps between refinements; one step at least"
+        1 / 64, gt=0, le=1, description="share of the schedule between refinements; one step at least"
     )
     refine_start: float = Field(
-        0.05, ge=0, le=1, description="share of the steps before the first refinement"
+        0.05, ge=0, le=1, description="share of the schedule before the first refinement"
     )
     refine_stop: float = Field(
-        0.8, ge=0, le=1, description="share of the steps after which nothing is refined"
+        0.8, ge=0, le=1, description="share of the schedule after which nothing is refined"
     )
     min_opacity: float = Field(0.005, gt=0, lt=1, description="opacity at or below which a Gaussian is dead")
     noise: float = Field(
@@ -178,8 +181,8 @@ class TrainConfig(BaseModel):
         5 / 32,
         ge=0,
         le=1,
-        description="share of the steps between raises of the SH degree from 0 up; 0 = all degrees from the "
-        "first step",
+        description="share of the schedule between raises of the SH degree from 0 up; 0 = all degrees from "
+        "the first step",
     )
 
     formation: FormationConfig = Field(FormationConfig(), description="what the camera did to each raw frame")
@@ -214,7 +217,7 @@ class TrainConfig(BaseModel):
     @property
     def planned(self) -> int:
         """Steps of the whole schedule, of which this training has its part."""
-        return max(self.length, round(self.length / (self.end - self.begin)))
+        return round(self.length / (self.end - self.begin))
 
     @property
     def first(self) -> int:

@@ -42,14 +42,11 @@ def read_moments(path: Path, gaussians: Gaussians) -> Moments:
     """
     hint = "run the stage that made it again with --force"
     try:
-        state = load_file(path)
-        first, second = (
-            {name: state[f"{prefix}.{name}"] for name in gaussians.tensors()}
-            for prefix in ("first", "second")
-        )
-    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        moments = Moments.of_state(load_file(path))
+    except (OSError, SafetensorError, ValueError) as error:
         raise StoreError(f"cannot read {path}: {cause(error)}", hint=hint) from error
-    for name, tensor in gaussians.tensors().items():
-        if not first[name].shape == second[name].shape == tensor.shape:
-            raise StoreError(f"{path} is of another scene than the one beside it", hint=hint)
-    return Moments(first, second)
+    expected = {name: tensor.shape for name, tensor in gaussians.tensors().items()}
+    for group in (moments.first, moments.second):
+        if {name: tensor.shape for name, tensor in group.items()} != expected:
+            raise StoreError(f"the moments in {path} are not of the scene beside it", hint=hint)
+    return moments

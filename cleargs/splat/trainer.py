@@ -264,15 +264,14 @@ class Trainer:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Resume from what `state` returned, in a training with the same arguments."""
 
-        def group(prefix: str) -> dict[str, Tensor]:
-            return {
-                key.split(".", 1)[1]: value for key, value in state.items() if key.startswith(f"{prefix}.")
-            }
+        def group(name: str) -> dict[str, Tensor]:
+            prefix = f"{name}."
+            return {key.removeprefix(prefix): t for key, t in state.items() if key.startswith(prefix)}
 
         self.done = int(state["step"])
         self._log.restore(state["log"])
         self._gaussians = Gaussians(**group("parameter")).to(self._device)
-        self._moments = Moments(*(self._on_device(group(prefix)) for prefix in ("first", "second")))
+        self._moments = Moments.of_state(state).to(self._device)
         self._strategy.restore(self._on_device(group("strategy")))
         if self._formation is not None:
             self._formation.restore(group("formation"))

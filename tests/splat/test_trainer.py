@@ -128,10 +128,10 @@ def test_moments_of_another_scene_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="cannot read"):
         read_moments(path, start().gaussians)
     save_state(path, {"step": torch.tensor(0)})
-    with pytest.raises(StoreError, match=r"first\.means"):
+    with pytest.raises(StoreError, match="not of the scene"):
         read_moments(path, start().gaussians)
     save_state(path, Moments.zeros(start(59).gaussians).state())
-    with pytest.raises(StoreError, match="another scene"):
+    with pytest.raises(StoreError, match="not of the scene"):
         read_moments(path, start().gaussians)
 
 

@@ -18,7 +18,7 @@ class Strategy:
 
     Made with the settings of the training, the most Gaussians there may be, and the seed. Random numbers are
     drawn afresh from (seed, `Stream`, step), and what is remembered from step to step is in `state`: a
-    resumed training is the same training. Steps count from 1.
+    resumed training is the same training. Steps count from 1, along the schedule.
     """
 
     def observe(self, engine: Engine, camera: Camera) -> None:
