@@ -57,6 +57,25 @@ class Pace:
         return (now - begin) * (1.0 - share) / (share - first) if share > first else None
 
 
+class Rate:
+    """Steps a second, of the last seconds: where steps grow longer, the mean of all would flatter."""
+
+    SECONDS = 10.0
+    """It is that of one to two times so many seconds, of fewer at the beginning."""
+
+    def __init__(self) -> None:
+        self._readings: list[tuple[float, int]] = []
+        """Time and steps done: where the rate counts from, then where it will."""
+
+    def a_second(self, done: int) -> float | None:
+        """To be asked whenever ``done`` grows; None at first."""
+        now = time.monotonic()
+        begin = self._readings[0] if self._readings else None
+        if begin is None or now - self._readings[-1][0] >= self.SECONDS:
+            self._readings = [*self._readings[-1:], (now, done)]
+        return (done - begin[1]) / (now - begin[0]) if begin is not None and now > begin[0] else None
+
+
 class SilentTask:
     """A task nobody watches."""
 

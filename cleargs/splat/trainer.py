@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from cleargs.errors import InputError, StageError
-from cleargs.progress import PREVIEW, Reporter, Task
+from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
 from cleargs.splat.adam import Moments, step_gaussians
 from cleargs.splat.backend import backend_for
@@ -408,16 +407,13 @@ class _Progress:
     def __init__(self, task: Task, trainer: Trainer) -> None:
         self._task, self._trainer = task, trainer
         self._share = trainer.shares_of_work()
-        self._begin: tuple[float, int] | None = None
+        self._rate = Rate()
 
     def show(self) -> None:
-        trainer, now = self._trainer, time.perf_counter()
+        trainer = self._trainer
         words = [f"training PSNR {trainer.last_psnr:.2f} dB", f"{trainer.scene.gaussians.num} Gaussians"]
-        if self._begin is None:
-            self._begin = now, trainer.done
-        else:
-            start, first = self._begin
-            words.insert(0, f"{(trainer.done - first) / max(now - start, 1e-9):.1f} it/s")
+        if (rate := self._rate.a_second(trainer.done)) is not None:
+            words.insert(0, f"{rate:.1f} it/s")
         self._task.update(done=trainer.done, note=", ".join(words), share=self._share[trainer.done])
 
 
