@@ -54,7 +54,7 @@ class Pace:
         if share is None:
             share = done / self._total
         begin, first = self._first = self._first or (now, share)
-        return (now - begin) * (1.0 - share) / (share - first) if share > first else None
+        return (now - begin) * max(0.0, 1.0 - share) / (share - first) if share > first else None
 
 
 class Rate:

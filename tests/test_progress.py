@@ -1,11 +1,11 @@
-"""What a progress bar says of the speed."""
+"""What a progress bar says of the speed, and of the time that is left."""
 
 from __future__ import annotations
 
 import pytest
 
 from cleargs import progress
-from cleargs.progress import Rate
+from cleargs.progress import Pace, Rate
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,3 +33,13 @@ def test_a_rate_changes_within_twice_its_seconds(monkeypatch: pytest.MonkeyPatch
     settled = int(2 * Rate.SECONDS)
     assert shown[1:40] == [4.0] * 39
     assert shown[40 + settled :] == [2.0] * (40 - settled)
+
+
+def test_no_less_than_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of work are sums, which end at 1 but for rounding: the bar said "-0 s left"."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    pace = Pace(10)
+    pace.seconds_left(1, 0.1)
+    now = 3600.0
+    assert pace.seconds_left(10, 1.0 + 1e-15) == 0.0
