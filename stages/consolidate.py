@@ -10,7 +10,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
 
-VERSION = 23
+VERSION = 24
 CONFIG = ConsolidateConfig
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),

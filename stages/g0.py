@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
-VERSION = 23
+VERSION = 24
 CONFIG = G0Config
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),

@@ -30,9 +30,12 @@ from cleargs.splat.views import View
 SEARCH_EVERY = 4
 """One in so many fits of a frame begins from scratch."""
 
-ROLLING = 0.03
+ROLLING = 0.015
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
 docs/formation.md."""
+ROLLING_START = 0.1
+"""Share of the schedule from which frames are tested for it. A scene learns to look like skewed frames, and
+where few frames see a place it hides a skew before `FormationConfig.start`: docs/experiments/formation.md."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Frames that must have been tested before a rolling shutter is believed, and most that are tested; between
 these, half of the capture's frames are."""
@@ -121,7 +124,11 @@ class CaptureFormation:
         affines = self._affines
         affine = None if affines is None else affines.affine(view.frame_id)
         begun = progress >= self._config.start
-        searched = begun and self._config.enabled and view.kind == "real"
+        searched = self._config.enabled and view.kind == "real"
+        if searched and not begun:
+            if progress >= ROLLING_START and self._untested(view.frame_id) and not self._rolls():
+                self._test_rolling(view.frame_id, factor, camera, affine, target, mask, render)
+            searched = self._rolls()
         if searched and self._due(view.frame_id):
             self._fit(view.frame_id, factor, camera, affine, target, mask, render)
         weight = view.weight
@@ -184,6 +191,29 @@ class CaptureFormation:
     def _due(self, frame_id: int) -> bool:
         return self._frames[frame_id].draws % self._config.every == 0
 
+    def _rolls(self) -> bool:
+        return rolls(self._frames.values())
+
+    def _untested(self, frame_id: int) -> bool:
+        return frame_id in self._tested and self._frames[frame_id].skew_gain is None
+
+    def _test_rolling(
+        self,
+        frame_id: int,
+        factor: float,
+        camera: Camera,
+        affine: Tensor | None,
+        target: Tensor,
+        mask: Tensor | None,
+        render: Renderer,
+    ) -> None:
+        """Learn what a rolling shutter would explain of a frame, and take no model of it yet."""
+        frame = self._frames[frame_id]
+        found = explain(
+            frame, self._config, camera, affine, target, mask, render, factor=factor, test_rolling=True
+        )
+        self._frames[frame_id] = replace(frame, skew_gain=found.skew_gain)
+
     def _fit(
         self,
         frame_id: int,
@@ -207,7 +237,7 @@ class CaptureFormation:
             render,
             factor=factor,
             warm=again,
-            rolling=rolls(self._frames.values()),
+            rolling=self._rolls(),
             test_rolling=frame_id in self._tested,
         )
 

@@ -220,6 +220,18 @@ def test_a_shutter_rolls_in_the_whole_capture_or_not_at_all(tmp_path: Path, fram
     assert found == (set(range(FRAMES)) if len(frames) == FRAMES else set())
 
 
+def test_a_rolling_shutter_is_asked_for_before_anything_else(tmp_path: Path) -> None:
+    """A scene that has learnt to look like its skewed frames hides their skew."""
+    for name, seen, rolling in (("skewed", skewed([0, 1, 2, 3, 4]), True), ("blurred", views(), False)):
+        formation = CaptureFormation(seen, FormationConfig(start=1.0, every=3))
+        trained = run(tmp_path / name, seen, formation)
+        assert sum(frame.skew_gain is not None for frame in formation.frames.values()) >= MIN_TESTED_FRAMES
+        assert {frame.model for frame in formation.frames.values()} == {"skew" if rolling else "none"}
+        plain = run(tmp_path / f"{name}-plain", seen, None)
+        same = torch.equal(trained.scene.gaussians.sh, plain.scene.gaussians.sh)
+        assert same != rolling, "asking costs a training no bit"
+
+
 def test_some_frames_spread_evenly_are_tested_for_a_rolling_shutter(tmp_path: Path) -> None:
     formation = CaptureFormation(views(), FormationConfig(start=0.0, every=3))
     run(tmp_path, views(), formation)
