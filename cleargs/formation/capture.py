@@ -127,10 +127,13 @@ class CaptureFormation:
         searched = self._config.enabled and view.kind == "real"
         if searched and not begun:
             if progress >= ROLLING_START and self._untested(view.frame_id) and not self._rolls():
-                self._test_rolling(view.frame_id, factor, camera, affine, target, mask, render)
+                gain = self._explained(view.frame_id, factor, camera, affine, target, mask, render).skew_gain
+                self._frames[view.frame_id] = replace(self._frames[view.frame_id], skew_gain=gain)
             searched = self._rolls()
         if searched and self._due(view.frame_id):
-            self._fit(view.frame_id, factor, camera, affine, target, mask, render)
+            self._frames[view.frame_id] = self._explained(
+                view.frame_id, factor, camera, affine, target, mask, render
+            )
         weight = view.weight
         motion = None
         if searched:
@@ -197,7 +200,7 @@ class CaptureFormation:
     def _untested(self, frame_id: int) -> bool:
         return frame_id in self._tested and self._frames[frame_id].skew_gain is None
 
-    def _test_rolling(
+    def _explained(
         self,
         frame_id: int,
         factor: float,
@@ -206,28 +209,11 @@ class CaptureFormation:
         target: Tensor,
         mask: Tensor | None,
         render: Renderer,
-    ) -> None:
-        """Learn what a rolling shutter would explain of a frame, and take no model of it yet."""
-        frame = self._frames[frame_id]
-        found = explain(
-            frame, self._config, camera, affine, target, mask, render, factor=factor, test_rolling=True
-        )
-        self._frames[frame_id] = replace(frame, skew_gain=found.skew_gain)
-
-    def _fit(
-        self,
-        frame_id: int,
-        factor: float,
-        camera: Camera,
-        affine: Tensor | None,
-        target: Tensor,
-        mask: Tensor | None,
-        render: Renderer,
-    ) -> None:
-        """Estimate how the frame was taken, in the light of the scene as it is."""
+    ) -> FrameFormation:
+        """How the frame was taken, in the light of the scene as it is."""
         frame = self._frames[frame_id]
         again = (frame.draws // self._config.every) % SEARCH_EVERY != 0
-        self._frames[frame_id] = explain(
+        return explain(
             frame,
             self._config,
             camera,
