@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PLOTTED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+_COLOURS = 10
+"""Of matplotlib's cycle. Variants beyond them get their colours again, with another marker."""
+_MARKERS = "osD"
+_NAME_INCHES = 2.6
+"""What the longest name of a variant takes in the legend."""
 
 
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
@@ -34,12 +39,14 @@ def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None
 
     metrics = [metric for metric in PLOTTED if metric in cells.metrics()]
     sets = cells.view_sets()
-    widths = [2.5 + len(cells.columns(views)) for views in sets]
+    column_width = max(1.0, 0.2 * len(cells.variants()))
+    widths = [2.5 + column_width * len(cells.columns(views)) for views in sets]
+    width = max(9.0, sum(widths))
     figure, panels = pyplot.subplots(
         len(metrics),
         len(sets),
         squeeze=False,
-        figsize=(max(9.0, sum(widths)), 2.6 * len(metrics) + 0.8),
+        figsize=(width, 2.6 * len(metrics) + 0.8),
         width_ratios=widths,
         layout="constrained",
     )
@@ -47,7 +54,7 @@ def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None
         for panel, views in zip(row, sets, strict=True):
             _panel(panel, cells, labels, views, metric)
     handles, names = panels[0][0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=int(width / _NAME_INCHES), frameon=False)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
     pyplot.close(figure)
@@ -56,6 +63,8 @@ def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None
 def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> None:
     columns, variants = cells.columns(views), cells.variants()
     baseline, *others = variants
+    points = len(others or variants)
+    step = min(0.1, 0.9 / points)
     for number, variant in enumerate(others or variants):
         found = [
             cells.difference(views, column, variant, baseline, metric)
@@ -65,10 +74,11 @@ def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet,
         ]
         shown = [(place, value) for place, value in enumerate(found) if value is not None]
         panel.errorbar(
-            [place + (number - (max(1, len(others)) - 1) / 2) * 0.1 for place, _ in shown],
+            [place + (number - (points - 1) / 2) * step for place, _ in shown],
             [value.mean for _, value in shown],
             [value.half_width or 0.0 for _, value in shown],
-            fmt="o",
+            fmt=_MARKERS[number // _COLOURS % len(_MARKERS)],
+            color=f"C{number % _COLOURS}",
             markersize=4,
             label=labels[variant],
         )
