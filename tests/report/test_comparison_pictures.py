@@ -48,7 +48,7 @@ def test_every_variant_is_within_the_picture(tmp_path: Path, monkeypatch: pytest
         (place,) = np.asarray(line.get_xdata())
         assert left < place < right
         looks.add((line.get_marker(), line.get_color()))
-    assert len(looks) == len(VARIANTS) - 1  # all but the one that they are measured against, each its own look
+    assert len(looks) == len(VARIANTS) - 1  # each its own; the first is what they are measured against
     legend = figure.legends[0].get_window_extent()
     assert legend.x0 >= 0.0 and legend.x1 <= figure.bbox.width
     pyplot.close(figure)
