@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -32,12 +34,19 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
     A nullable column that the file of an older version lacks is null. Raises StoreError when the file is
     missing, damaged, or lacks another column.
     """
-    try:
+    with damage_told(path):
         table = pq.read_table(path)
         for field in schema:
             if field.nullable and field.name not in table.column_names:
                 table = table.append_column(field, pa.nulls(table.num_rows, field.type))
         return table.select(schema.names).cast(schema)
+
+
+@contextmanager
+def damage_told(path: Path) -> Iterator[None]:
+    """While a table is read: what cannot be read becomes a StoreError that names it."""
+    try:
+        yield
     except (OSError, pa.ArrowException, ValueError, KeyError) as error:
         raise StoreError(
             f"cannot read the table {path.name}: {str(error).splitlines()[0]}",

@@ -80,16 +80,20 @@ class StageResults:
         return self.manifest.summary
 
     def table(self, name: str) -> pa.Table:
-        """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none."""
+        """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none,
+        StoreError where it is damaged."""
         import pyarrow.parquet as pq
 
-        try:
-            return pq.read_table(self.folder.resolve() / f"{name}.parquet")
-        except OSError as error:
+        from cleargs.parquet import damage_told
+
+        path = self.folder.resolve() / f"{name}.parquet"
+        if not path.is_file():
             known = sorted(Path(file).stem for file in self.manifest.files if file.endswith(".parquet"))
             raise InputError(
                 f"{self.manifest.stage} has no table {name!r}", hint=f"its tables are {', '.join(known)}"
-            ) from error
+            )
+        with damage_told(path):
+            return pq.read_table(path)
 
     def weights(self) -> dict[int, float]:
         """Frame -> weight of its supervision in [0, 1]: of ``rva``."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from cleargs.cli.common import (
     json_option,
@@ -33,6 +34,17 @@ from cleargs.pipeline.store import STORE_FOLDER
 if TYPE_CHECKING:
     from cleargs.evaluate.comparison import Made, Recipe
     from cleargs.evaluate.variants import Variant
+
+
+TRAINING_OPTIONS = {
+    "variants": "--variants",
+    "seeds": "--seeds",
+    "steps": "--steps",
+    "workflow": "--workflow",
+    "overrides": "--set",
+    "quality": "--quality",
+}
+"""What has no use for runs that are finished."""
 
 
 def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, ...]:
@@ -143,6 +155,11 @@ def compare(
     for source in sources:
         if not source.exists():
             raise InputError(f"there is no {source}", hint="give captures or run folders")
+    if runs and (idle := _named(TRAINING_OPTIONS)):
+        raise InputError(
+            f"{', '.join(idle)}: finished runs are compared as they are",
+            hint="leave it out, or give captures, whose variants are trained",
+        )
     warnings = list(filter(None, (require_fresh(dag, run, dag.names, stale=stale) for run in runs)))
     chosen = find_variants([name.strip() for name in variants.split(",") if name.strip()])
     out = out.absolute()
@@ -153,7 +170,11 @@ def compare(
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             _check_names([run.resolve().name for run in runs], "runs")
-            made: Iterator[Made | str] = iter([existing(run, dag, reference) for run in runs])
+            finished = [existing(run, dag, reference) for run in runs]
+            # Samples go by the capture's name: those of two captures of one name would be paired.
+            sources_of_runs = {scene.sample.capture.resolve() for scene in finished}
+            _check_names([source.name for source in sources_of_runs], "captures of these runs")
+            made: Iterator[Made | str] = iter(finished)
         else:
             samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
             _check_names([source.resolve().name for source in sources], "captures")
@@ -208,6 +229,12 @@ def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe
 def _settings(variant: Variant) -> str:
     recipe = "the recipe" if variant.workflow is None else f"the recipe {variant.workflow}"
     return f"{', '.join((recipe, *variant.overrides))}; the scene of {variant.stage}"
+
+
+def _named(options: Mapping[str, str]) -> list[str]:
+    """Those of ``options`` (parameter -> as it is written) that stand on the command line."""
+    source = click.get_current_context().get_parameter_source
+    return [text for name, text in options.items() if source(name) is ParameterSource.COMMANDLINE]
 
 
 def _check_names(names: Sequence[str], what: str) -> None:

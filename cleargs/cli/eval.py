@@ -297,7 +297,7 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
                 )
         figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
         table.add_row(evaluation.subject, f"mean of {len(evaluation.images)}", *figures)
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:
         console.print(_regions(evaluation), markup=False)

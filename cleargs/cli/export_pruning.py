@@ -99,6 +99,8 @@ def _psnr(scene: Scene, views: Sequence[View], folder: Path, seen: Callable[[], 
 def cropped(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     """``scene`` inside the ``region`` of `parse_crop`, and a line that tells what is left."""
     means = scene.gaussians.means
+    if not len(means):
+        raise InputError("no Gaussian is left to crop", hint="prune less")
     if len(region) == 1:
         low, high = central_box(means, region[0])
     else:

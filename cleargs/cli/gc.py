@@ -11,6 +11,7 @@ from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.store import ROOTS
 
 
 @click.command(
@@ -44,6 +45,10 @@ def gc(
     assert root is not None
     if not root.is_dir():
         raise InputError(f"there is no store {root}", hint="give the folder that was passed as --store")
+    if not (root / ROOTS).is_dir():  # every run that uses a store is noted there
+        raise InputError(
+            f"{root} is no store", hint="give the folder that was passed as --store, or RUN without --store"
+        )
     with opened_store(root) as opened:
         if run is not None and not dry_run:
             opened.add_root(run.absolute())

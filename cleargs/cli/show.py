@@ -228,7 +228,7 @@ def _facts(manifest: Manifest | None, stale: Reasons | None) -> dict[str, Any] |
 def _console() -> Console:
     from rich.console import Console
 
-    return Console(highlight=False)
+    return Console(highlight=False, markup=False)  # names may hold brackets
 
 
 def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons]) -> None:

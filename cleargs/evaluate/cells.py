@@ -9,14 +9,14 @@ from functools import cache
 from typing import Literal
 
 from cleargs.evaluate.eval_report import LOWER_IS_BETTER
-from cleargs.record import Record
+from cleargs.evaluate.figures import Figures
 
 ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
 """Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the
 capture's are noisy), sharp truth off the path, test frames, or the user's own reference."""
 
 
-class Cell(Record):
+class Cell(Figures):
     """One scene judged on one set of views."""
 
     column: str
@@ -140,12 +140,15 @@ class Cells:
         return spread(pairs) if pairs else None
 
     def best(self, views: ViewSet, column: str, metric: str) -> str | None:
-        """The variant with the best mean."""
-        means = {
-            variant: found.mean
+        """The variant with the best mean, of those that were measured on the most samples: means over
+        other samples say nothing of each other."""
+        spreads = {
+            variant: found
             for variant in self.variants()
             if (found := self.spread(views, column, variant, metric)) is not None
         }
+        most = max((found.count for found in spreads.values()), default=0)
+        means = {variant: found.mean for variant, found in spreads.items() if found.count == most}
         if not means:
             return None
         pick = min if metric in LOWER_IS_BETTER else max

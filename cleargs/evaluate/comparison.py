@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ from cleargs.evaluate.equal_work import Work, decide_work, variant_config
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.variants import Variant
 from cleargs.files import write_bytes
+from cleargs.parquet import damage_told
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import canonical_json
@@ -78,6 +80,13 @@ class Recipe:
     options: EvalOptions
     steps: int | None = None
     """Training steps of every variant; None: those of the whole method under the recipe."""
+
+    @cached_property
+    def weights(self) -> dict[str, str]:
+        """Digests of the weights of the metrics that can be had now."""
+        from cleargs.evaluate.metric_set import load_metrics
+
+        return dict(load_metrics(self.options).weights)
 
 
 @dataclass
@@ -266,7 +275,8 @@ def evaluated(
 ) -> tuple[Evaluation, Path]:
     """The evaluation of a scene on a set of views, and the folder that keeps it with the renders.
 
-    One from an earlier call is taken where nothing changed.
+    One from an earlier call is taken where nothing changed, the weights of the metrics included: those that
+    were not installed then may be now.
     """
     from cleargs.evaluate.evaluate import evaluate_scene
     from cleargs.evaluate.references import reference_of
@@ -284,7 +294,9 @@ def evaluated(
     folder = out / "evaluations" / hashlib.sha256(canonical_json(parts).encode()).hexdigest()
     path = folder / "eval.json"
     try:
-        return Evaluation.model_validate_json(read_bytes(path)), folder
+        kept = Evaluation.model_validate_json(read_bytes(path))
+        if kept.weights == recipe.weights:
+            return kept, folder
     except (OSError, ValidationError):
         pass  # not made yet, or damaged
     reference = reference_of(
@@ -319,11 +331,15 @@ def existing(run: Path, dag: Dag, reference: Path | None) -> Made:
 
 
 def trained_steps(made: Made) -> int:
-    """The steps behind a scene: the rows of the logs of all its trainings."""
+    """The steps behind a scene: the rows of the logs of all its trainings. Raises StoreError."""
     from pyarrow import parquet
 
     logs = [made.run / manifest.stage / "train.parquet" for manifest in made.manifests]
-    return sum(parquet.read_metadata(log).num_rows for log in logs if log.is_file())
+    steps = 0
+    for log in filter(Path.is_file, logs):
+        with damage_told(log):
+            steps += parquet.read_metadata(log).num_rows
+    return steps
 
 
 def size_of(scene: Path) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from cleargs.errors import InputError
+from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.cells import Cell, Cells
 from cleargs.evaluate.choices import Choice, Choices, judge_choices
 from cleargs.evaluate.comparison import EVALUATION_VERSION, Made, Recipe, judge
@@ -70,7 +71,8 @@ class Compared:
             "choices": self.choices,
         }
         return {
-            **{name: [item.model_dump(mode="json") for item in found] for name, found in lists.items()},
+            # By way of text, where infinite figures are strings.
+            **{name: [json.loads(item.model_dump_json()) for item in found] for name, found in lists.items()},
             "failures": self.failures,
         }
 
@@ -78,16 +80,26 @@ class Compared:
 def compare_scenes(
     out: Path, made: Iterable[Made | str], recipe: Recipe, store: Store, reporter: Reporter
 ) -> Compared:
-    """Judge every scene; a line in place of one says why it could not be made."""
+    """Judge every scene; a line in place of one says why it could not be made.
+
+    One that cannot be judged is named among the failures and ends none of the others.
+    """
     found = Compared()
     for scene in made:
         if isinstance(scene, str):
             reporter.warn(scene)
             found.failures.append(scene)
             continue
-        found.cells += judge(out, scene, recipe, store, reporter)
-        found.roles.append(roles_of(scene))
-        if (choices := choices_of(out, scene, store)) is not None:
+        try:
+            cells, roles = judge(out, scene, recipe, store, reporter), roles_of(scene)
+            choices = choices_of(out, scene, store)
+        except CleargsError as error:
+            reporter.warn(f"{scene.sample.name}, {scene.variant.label}: {error}")
+            found.failures.append(f"{scene.sample.name}, {scene.variant.label}: {error}")
+            continue
+        found.cells += cells
+        found.roles.append(roles)
+        if choices is not None:
             found.choices.append(choices)
         found.scenes.append(scene)
     if not found.cells:

@@ -252,15 +252,16 @@ def _value(found: Spread | None, metric: str) -> str:
 
 
 def difference_text(found: Spread | None, base: Spread | None, metric: str) -> str:
-    """A paired difference with half its 95 % interval."""
+    """A paired difference with half its 95 % interval; and of how many pairs, where ``base`` has more."""
     if found is None:
         return "n/a"
     digits = _DIGITS.get(metric, 2)
     text = f"{found.mean:+.{digits}f}"
     if found.half_width is not None:
         text += f" ± {found.half_width:.{digits}f}"
+    pairs = f" (n = {found.count})" if base is not None and found.count < base.count else ""
     if found.is_none:
-        return f"none ({text})"
+        return f"none ({text}){pairs}"
     if metric in LOWER_IS_BETTER and base is not None and base.mean > 0:
         text += f" ({100 * found.mean / base.mean:+.0f} %)"
-    return text
+    return f"{text}{pairs}"

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
+from cleargs.evaluate.figures import Figures
 from cleargs.evaluate.regions import Region
 from cleargs.files import disk_error, write_json
 from cleargs.parquet import column, write_table
-from cleargs.record import Record
 from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
@@ -32,12 +32,7 @@ LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """All other metrics are better the higher they are."""
 
 
-class _Record(Record):
-    # A perfect image has an infinite PSNR, which JSON has no number for: it is written as "Infinity".
-    model_config = ConfigDict(ser_json_inf_nan="strings")
-
-
-class Alignment(_Record):
+class Alignment(Figures):
     """How the reference's poses came into the scene's world."""
 
     world: World = Field(
@@ -53,7 +48,7 @@ class Alignment(_Record):
     )
 
 
-class Refinement(_Record):
+class Refinement(Figures):
     """What pose refinement changed in one view."""
 
     rotation_deg: float = Field(ge=0, description="Angle turned, degrees.")
@@ -62,7 +57,7 @@ class Refinement(_Record):
     loss_after: float = Field(ge=0, description="The same after the last accepted step.")
 
 
-class ImageResult(_Record):
+class ImageResult(Figures):
     """The figures of one image."""
 
     name: str = Field(description="Stem of the reference's file.")
@@ -83,7 +78,7 @@ class ImageResult(_Record):
     clipped: Region | None = Field(None, description="Where a channel of the reference is at least 254.")
 
 
-class Evaluation(_Record):
+class Evaluation(Figures):
     """One scene, or one folder of images, against one reference."""
 
     subject: str = Field(description="The stage, or the name of the scene file or of the folder of images.")
@@ -107,7 +102,7 @@ class Evaluation(_Record):
     images: tuple[ImageResult, ...]
 
 
-class Report(_Record):
+class Report(Figures):
     """``eval.json``: evaluations against one reference, one a stage."""
 
     schema_version: Literal[1] = 1

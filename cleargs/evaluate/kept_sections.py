@@ -14,14 +14,14 @@ from cleargs.evaluate.cells import Cell, Cells
 from cleargs.evaluate.choices import Choices
 from cleargs.evaluate.comparison_tables import Results
 from cleargs.evaluate.evidence import Outcome, Section
+from cleargs.evaluate.figures import Figures
 from cleargs.evaluate.roles import Roles
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
-from cleargs.record import Record
 from cleargs.untrusted import read_bytes
 
 
-class KeptSection(Record):
+class KeptSection(Figures):
     """``results/NAME.json``: all that the tables of a section are made from."""
 
     section: Section

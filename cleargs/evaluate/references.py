@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -181,7 +182,11 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
             hint="give --reference DIR, or run it again with --set ingest.holdout=every:8",
         )
     views = []
-    for stem, frame in _by_stem((stem_of(frame.name), frame) for frame in test).items():
+    stems = Counter(stem_of(frame.name) for frame in test)
+    for frame in test:
+        stem = stem_of(frame.name)
+        if stems[stem] > 1:  # as of the cameras of a rig, in folders of their own
+            stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
         mask = None if frame.mask is None else ingest / frame.mask
         size = (frame.width, frame.height)

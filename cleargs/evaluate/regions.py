@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cleargs.evaluate.figures import Figures
 from cleargs.evaluate.metrics import Mask, Pixels, psnr
-from cleargs.record import Record
 from cleargs.splat.camera import Camera
 
 _FEWEST = 10
@@ -20,7 +20,7 @@ _FARTHEST = 0.99
 _CLIPPED = 254
 
 
-class Region(Record):
+class Region(Figures):
     """A part of an image, or of all of them."""
 
     share: float = Field(ge=0, le=1, description="Of the pixels that count.")

@@ -10,6 +10,7 @@ import os
 import socket
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, astuple, dataclass
@@ -108,6 +109,10 @@ def _born(pid: int) -> str:
 
 
 def _now(folder: Path) -> float:
-    """The time by the clock that stamps files in ``folder``: that of the file server, not of this node."""
-    with tempfile.NamedTemporaryFile(dir=folder) as file:
-        return os.fstat(file.fileno()).st_mtime
+    """The time by the clock that stamps files in ``folder``: that of the file server. This node's where no
+    file can be made there, as by somebody who looks at another's run."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder) as file:
+            return os.fstat(file.fileno()).st_mtime
+    except OSError:
+        return time.time()

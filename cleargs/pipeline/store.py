@@ -45,6 +45,9 @@ from cleargs.untrusted import FAULTS, read_text
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""
 
+ROOTS = "roots"
+"""Folder in a store that notes the runs which use it."""
+
 SECONDS = "seconds"
 """File in a work folder: how long the tries before took."""
 
@@ -321,7 +324,7 @@ class Store:
     def add_root(self, run: Path) -> None:
         """Note that ``run`` links into this store, so that `collect` keeps what it shows."""
         name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
-        note = self.root / "roots" / name
+        note = self.root / ROOTS / name
         if not note.exists() and not self._only_readable():
             try:
                 note.parent.mkdir(parents=True, exist_ok=True)
@@ -370,7 +373,7 @@ class Store:
 
     def _linked(self, stages: tuple[str, ...]) -> set[Path]:
         runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
-        for note in (self.root / "roots").glob("*"):
+        for note in (self.root / ROOTS).glob("*"):
             with suppress(*FAULTS):
                 runs.append(Path(read_text(note).rstrip("\n")))
         return {(run / stage).resolve() for run in runs for stage in stages if (run / stage).is_symlink()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from cleargs.evaluate.cells import Cell, Cells, ViewSet
 from cleargs.evaluate.comparison_tables import TITLES, metric_title
 from cleargs.evaluate.eval_report import Evaluation
+from cleargs.evaluate.references import images_by_stem
 from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb_float, write_rgb
 from cleargs.report.contact import Tile, contact_sheet
@@ -80,17 +80,22 @@ def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet,
             fmt=_MARKERS[number // _COLOURS % len(_MARKERS)],
             color=f"C{number % _COLOURS}",
             markersize=4,
-            label=labels[variant],
+            label=_plain(labels[variant]),
         )
     if others:
         panel.axhline(0.0, color="black", linewidth=0.8)
-    panel.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
+    names = [_plain(name) for name in columns]
+    panel.set_xticks(range(len(columns)), names, rotation=30, ha="right", fontsize=8)
     panel.set_xlim(-0.6, len(columns) - 0.4)
-    panel.set_ylabel(
-        f"{metric_title(metric)}, minus {labels[baseline]}" if others else metric_title(metric), fontsize=8
-    )
+    against = f", minus {_plain(labels[baseline])}" if others else ""
+    panel.set_ylabel(metric_title(metric) + against, fontsize=8)
     panel.set_title(TITLES[views].split(",")[0], fontsize=9)
     panel.grid(axis="y", alpha=0.3)
+
+
+def _plain(name: str) -> str:
+    """``name`` as it is, dollars and all: between two of them matplotlib would read a formula."""
+    return name.replace("$", r"\$")
 
 
 def comparison_sheet(
@@ -145,5 +150,5 @@ def _telling(out: Path, cell: Cell, capture: Path) -> str:
 
 def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
     """The image of that stem as sRGB in [0, 1]; None without one."""
-    files = sorted(folder.glob(f"{glob.escape(stem)}.*"))
-    return read_rgb_float(files[0]) if files else None
+    found = images_by_stem(folder).get(stem) if folder.is_dir() else None
+    return None if found is None else read_rgb_float(found)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import Exposure, read_exposure
-from cleargs.parquet import read_table
+from cleargs.parquet import damage_told, read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 
@@ -140,14 +140,16 @@ def _formation(run: Path, final: str | None) -> dict[int, dict[str, Any]]:
     path = run / (final or "") / "formation.parquet"
     if not path.is_file():
         return {}
-    rows = pq.read_table(path).to_pylist()
+    with damage_told(path):
+        rows = pq.read_table(path).to_pylist()
     return {row.pop("frame_id"): row for row in rows if "frame_id" in row}
 
 
 def formation_meanings(run: Path, final: str | None) -> dict[str, str]:
     """Column of ``formation.parquet`` -> what it means."""
     path = run / (final or "") / "formation.parquet"
-    schema = pq.read_schema(path) if path.is_file() else pa.schema([])
+    with damage_told(path):
+        schema = pq.read_schema(path) if path.is_file() else pa.schema([])
     return {field.name: (field.metadata or {}).get(b"meaning", b"").decode() for field in schema}
 
 

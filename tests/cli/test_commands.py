@@ -548,3 +548,16 @@ def test_a_run_is_no_capture(shell: Shell) -> None:
     shell.run()
     code, _, err = shell("run", str(shell.bench.folder), "-o", str(shell.bench.root / "other"))
     assert code == 2 and "is a run, not a capture" in err and str(shell.bench.capture) in err
+
+
+def test_gc_takes_no_folder_for_a_store_that_is_none(shell: Shell, tmp_path: Path) -> None:
+    """The links of a run would be followed into its store, and any folder `work` be unfinished work."""
+    shell.run()
+    thesis = tmp_path / "papers" / "work" / "thesis.tex"
+    thesis.parent.mkdir(parents=True)
+    thesis.write_text("years")
+    for folder in (shell.bench.folder, tmp_path / "papers"):
+        code, _, errors = shell("gc", "--store", str(folder), "--checkpoints")
+        assert code == 2 and "is no store" in errors
+    assert thesis.is_file()
+    assert "already there: count, square, total" in shell.run()[1]

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
 
 from colmap_model import write_sparse
 from eval_world import add_scene, cameras, make_scene, write_run
 
+from cleargs.cli.export_pruning import cropped
 from cleargs.cli.main import invoke
+from cleargs.errors import InputError
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.splat.ply import read_ply
 
@@ -69,3 +73,12 @@ def test_a_stale_scene_is_written_only_on_demand(
     assert export(run, tmp_path / "x.ply", "--stale") == 0
     assert capsys.readouterr().out.startswith("rivr is stale: ")
     assert read_ply(tmp_path / "x.ply").gaussians.num == 30
+
+
+def test_nothing_left_to_crop_is_said() -> None:
+    """After `--prune opacity:1`, say."""
+    scene = make_scene(count=5)
+    empty = replace(scene, gaussians=scene.gaussians.select(torch.zeros(5, dtype=torch.bool)))
+    for region in ((98.0,), (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)):
+        with pytest.raises(InputError, match="no Gaussian is left"):
+            cropped(empty, region)

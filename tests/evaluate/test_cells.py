@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import math
+
 import pytest
 
 from cleargs.evaluate.cells import Cell, Cells, ViewSet, spread, student_t
-from cleargs.evaluate.comparison_tables import Results, markdown
+from cleargs.evaluate.comparison_findings import Compared
+from cleargs.evaluate.comparison_tables import Results, difference_text, markdown
+from cleargs.evaluate.regions import Region
 from cleargs.evaluate.roles import FOR_SHARE, KINDS, Roles
 
 LABELS = {"all-view": "all-view G0", "full": "ClearGS"}
@@ -111,3 +116,29 @@ def test_tables() -> None:
     assert "against the truth\n\n|" not in text, "without RIVR there is no choice to judge"
     assert "musiq" not in text, "a metric that was never measured has no table"
     assert "drop-blurry" not in text, "a baseline that was not run has no table"
+
+
+def test_a_mean_over_fewer_samples_is_not_the_best() -> None:
+    """A variant that failed on the hard capture would win by it."""
+    found = Cells(
+        [
+            cell("all-view", "easy", psnr=30.0),
+            cell("full", "easy", psnr=31.0),
+            cell("lost", "easy", psnr=30.5),
+            cell("all-view", "hard", psnr=20.0),
+            cell("full", "hard", psnr=21.0),
+        ]
+    )
+    assert found.best("observed", "mixed", "psnr") == "full"
+    lost = found.difference("observed", "mixed", "lost", "all-view", "psnr")
+    base = found.spread("observed", "mixed", "all-view", "psnr")
+    assert difference_text(lost, base, "psnr") == "+0.50 (n = 1)"
+
+
+def test_a_perfect_scene_survives_its_json() -> None:
+    text = cell("full", "s", psnr=math.inf, ssim=1.0).model_dump_json()
+    json.loads(text, parse_constant=pytest.fail)  # Infinity is no JSON
+    assert Cell.model_validate_json(text).means["psnr"] == math.inf
+    assert Region.model_validate_json(Region(share=0.1, psnr=math.inf).model_dump_json()).psnr == math.inf
+    document = Compared(cells=[cell("full", "s", psnr=math.inf)]).document()
+    assert document["cells"][0]["means"] == {"psnr": "Infinity"}

@@ -5,21 +5,30 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.errors import ConfigError
+from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.errors import ConfigError, InputError
+from cleargs.evaluate import comparison_findings, evaluate, metric_set
+from cleargs.evaluate.cells import Cell
 from cleargs.evaluate.choices import judge_choices
-from cleargs.evaluate.comparison import capture_name
+from cleargs.evaluate.comparison import Made, Recipe, capture_name, evaluated, existing, view_sets
+from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.equal_work import Steps, Work, decide_work, split, steps_of, variant_config
 from cleargs.evaluate.variants import VARIANTS, WHOLE, Variant
 from cleargs.media.image import write_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
+from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.store import STORE_FOLDER
 from cleargs.progress import SilentReporter
 from cleargs.report import comparison_pictures
 from cleargs.splat.effort import budget_from_pixels
@@ -272,6 +281,15 @@ def test_two_captures_of_one_name_are_refused(
     assert "two captures are called room" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", [["--steps", "100"], ["--set", "g0.steps=9"], ["--quality", "draft"]])
+def test_options_without_effect_on_finished_runs_are_refused(
+    option: list[str], out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", *option]) == 2
+    assert f"{option[0]}: finished runs are compared as they are" in capsys.readouterr().err
+
+
 def test_two_runs_of_one_name_are_refused(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -294,3 +312,63 @@ def test_brackets_in_a_name_are_no_pattern(tmp_path: Path) -> None:
     write_rgb(tmp_path / f"{name}.png", np.full((4, 4, 3), 51, np.uint8))
     found = comparison_pictures._find(tmp_path, name)
     assert found is not None and np.allclose(found, 0.2)
+
+
+def test_runs_of_two_captures_of_one_name_are_refused(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their scenes would be paired as if they showed the same."""
+    other = tmp_path / "house2"
+    shutil.copytree(out / "room-0", other, symlinks=True)
+    (other / "rva").rename(other / "rva2")
+    noted = other / "rva2" / RUN_FILE
+    twin = tmp_path / "room"
+    twin.mkdir()
+    text = noted.read_text()
+    place = re.search(r'"([^"]*/room)"', text)
+    assert place is not None
+    noted.write_text(text.replace(place[1], str(twin)))
+    runs = [str(out / "room-0" / "all-view"), str(other / "rva2")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", "--stale"]) == 2
+    assert "two captures of these runs are called room" in capsys.readouterr().err
+
+
+def test_metrics_whose_weights_came_later_are_measured(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What an earlier call could not measure is not taken for what there is."""
+    run = out / "room-0" / "all-view"
+    dag, options = installed(), EvalOptions(lpips=(), scorers=("clarity-net",))
+
+    def kept_weights() -> dict[str, str]:
+        recipe = Recipe(dag, "smoke", (), "cpu", 1, options)
+        with opened_store(out / STORE_FOLDER) as store:
+            made = existing(run, dag, None)
+            return evaluated(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[0].weights
+
+    whole = metric_set.load_metrics(options)
+    bare = replace(whole, scorers={}, weights={}, unavailable={"clarity-net": "not installed"})
+    monkeypatch.setattr(metric_set, "load_metrics", lambda options: bare)
+    monkeypatch.setattr(evaluate, "load_metrics", lambda options: bare)
+    assert kept_weights() == {}
+    monkeypatch.undo()
+    assert kept_weights() == whole.weights
+
+
+def test_a_scene_that_cannot_be_judged_ends_none_of_the_others(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    judged = comparison_findings.judge
+
+    def judge(folder: Path, made: Made, *rest: Any) -> list[Cell]:
+        if made.variant.name == "all-view":
+            raise InputError("two images are called 0001", hint="give each a name of its own")
+        return judged(folder, made, *rest)
+
+    monkeypatch.setattr(comparison_findings, "judge", judge)
+    runs = [str(out / "room-0" / name) for name in ("all-view", "rva", "full")]
+    code = invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--lpips", "none", "--quiet", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert {cell["variant"] for cell in document["cells"]} == {"rva", "full"}
+    assert "two images are called 0001" in document["failures"][0]
+    assert code == DONE_IN_PART

@@ -348,3 +348,17 @@ def test_an_infinite_psnr_survives_the_file(tmp_path: Path) -> None:
     write_report(tmp_path / "eval.json", Report(evaluations=(found,)))
     json.loads((tmp_path / "eval.json").read_text(), parse_constant=pytest.fail)
     assert read_report(tmp_path / "eval.json").evaluations[0].means["psnr"] == math.inf
+
+
+def test_held_out_frames_of_a_rig_share_names(tmp_path: Path) -> None:
+    """Each camera of a rig has a folder, and frames of the same names."""
+    run = write_run(tmp_path / "run", make_scene(), cameras(), test=[1, 4])
+    table = pq.read_table(run / "ingest" / "frames.parquet")
+    names = [f"cam{row % 2}/0001.jpg" for row in range(table.num_rows)]
+    place = table.schema.get_field_index("name")
+    table = table.set_column(place, table.schema.field(place), [names])
+    pq.write_table(table, run / "ingest" / "frames.parquet")
+    reference = reference_of(run, None, reporter=Remarks())
+    found = measured(run / "g0" / "scene.ply", reference)
+    assert [image.name for image in found.images] == ["000001-0001", "000004-0001"]
+    assert psnr_of(found) > NEARLY_EQUAL

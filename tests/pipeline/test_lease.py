@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -157,3 +158,16 @@ def test_nothing_is_cleared_away_while_another_node_is_at_work(bench: Bench) -> 
         os.utime(held, (0, 0))
         store.collect(bench.dag.names, checkpoints=True, dry_run=False)
         assert not held.exists()
+
+
+def test_whoever_may_only_read_sees_who_is_at_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else's run on another node: the time of the file server cannot be had there."""
+    path = pretend(tmp_path / "other.json", host="another-node", pid=dead_pid())
+
+    def refused(**options: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "NamedTemporaryFile", refused)
+    assert living_holder(path) is not None
+    pretend(path, age=DEAD_AFTER + 60, host="another-node", pid=dead_pid())
+    assert living_holder(path) is None

@@ -9,7 +9,8 @@ import pytest
 
 from cleargs.evaluate.cells import Cell, Cells
 from cleargs.evaluate.variants import VARIANTS
-from cleargs.report.comparison_pictures import plot_comparison
+from cleargs.media.image import write_rgb
+from cleargs.report.comparison_pictures import _find, plot_comparison
 
 
 def cell(variant: str, psnr: float) -> Cell:
@@ -52,3 +53,19 @@ def test_every_variant_is_within_the_picture(tmp_path: Path, monkeypatch: pytest
     legend = figure.legends[0].get_window_extent()
     assert legend.x0 >= 0.0 and legend.x1 <= figure.bbox.width
     pyplot.close(figure)
+
+
+def test_dollars_in_names_are_no_formula(tmp_path: Path) -> None:
+    found = [cell(name, 30.0) for name in ("all-view", "full")]
+    cells = Cells([one.model_copy(update={"column": "b$1_x_$2"}) for one in found])
+    plot_comparison(tmp_path / "plot.png", cells, {"all-view": "$a_b_c$", "full": "$^$"})
+    assert (tmp_path / "plot.png").is_file()
+
+
+def test_only_an_image_of_that_very_name_is_shown(tmp_path: Path) -> None:
+    for name, level in (("b.png", 51), ("b.2.png", 255)):
+        write_rgb(tmp_path / name, np.full((4, 4, 3), level, np.uint8))
+    (tmp_path / "b.AAE").write_text("what a phone notes beside its photo")
+    found = _find(tmp_path, "b")
+    assert found is not None and np.allclose(found, 0.2)
+    assert _find(tmp_path, "b.1") is None and _find(tmp_path / "nowhere", "b") is None

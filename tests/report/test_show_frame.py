@@ -9,10 +9,11 @@ import pyarrow as pa
 import pytest
 from report_run import COUNT, HEIGHT, HOSTILE, UNPLACED, FinishedRun
 
+from cleargs.capture.tables import FRAMES
 from cleargs.cli.main import invoke
 from cleargs.formation.table import FORMATION
 from cleargs.media.image import read_rgb
-from cleargs.parquet import write_table
+from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.manifest import linked_manifest, write_manifest
 
 FOUND = {"model": "blur", "blur_px": 3.25, "explained": 0.625, "weight_before": 0.4, "weight_after": 0.75}
@@ -99,3 +100,24 @@ def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert invoke(["show", str(run), "--frame", "1", "--stale"]) == 0
     streams = capsys.readouterr()
     assert "rva is stale" in streams.err and "frame-000001.png" in streams.out
+
+
+def test_a_damaged_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = FinishedRun(tmp_path).folder
+    (run / "consolidate" / "formation.parquet").write_bytes(b"PAR1, and nothing after it")
+    assert invoke(["show", str(run), "--frame", "1", "--stale"]) == 1
+    assert "cannot read the table formation.parquet" in capsys.readouterr().err
+
+
+def test_brackets_in_names_are_no_markup(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "500")
+    run = FinishedRun(tmp_path).folder
+    path = run / "ingest" / "frames.parquet"
+    rows = read_table(path, FRAMES).to_pylist()
+    rows[0]["name"], rows[1]["name"] = "a[blue]b.jpg", "c[/front].jpg"
+    write_table(path, pa.Table.from_pylist(rows, FRAMES), FRAMES)
+    assert invoke(["show", str(run), "ingest", "--rows", "99", "--stale"]) == 0
+    words = capsys.readouterr().out
+    assert "a[blue]b" in words and "c[/front]" in words
