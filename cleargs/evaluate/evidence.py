@@ -81,6 +81,9 @@ class Section(Record):
     """Multiples of ``steps``: a column each, where there are several."""
     variants: tuple[str, ...]
     settings: tuple[str, ...] = ()
+    align_colour: bool = False
+    """Judge each image after the affine on sRGB that fits it to its reference best: of what other sections
+    judge as it is, so none of it counts again in the page's summary."""
 
 
 class Evidence(Record):
@@ -170,6 +173,7 @@ def make_section(section: Section, shop: Workshop) -> Outcome:
             shop.recipe,
             overrides=(*shop.recipe.overrides, *_settings(section)),
             steps=section.steps * factor,
+            options=shop.recipe.options.model_copy(update={"align_colour": section.align_colour}),
         )
         made = make_scenes(
             shop.out, samples, find_variants(section.variants), recipe, shop.store, shop.reporter

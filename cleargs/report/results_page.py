@@ -81,11 +81,16 @@ def gaps(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
     once = _Once()
     return [
         (one.section.title, gap)
-        for one in kept
+        for one in _as_they_are(kept)
         for cells in (one.results.cells,)
         for gap in compared_with(cells, WHOLE)
         if once.is_new(cells, gap.views, gap.column, WHOLE, gap.against, gap.metric)
     ]
+
+
+def _as_they_are(kept: Sequence[KeptSection]) -> list[KeptSection]:
+    """The sections whose images were judged as they are: they hold all scenes."""
+    return [one for one in kept if not one.section.align_colour]
 
 
 def losses(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
@@ -116,7 +121,7 @@ def answers_table(kept: Sequence[KeptSection]) -> str:
         for metric in COMPARED:
             found = [
                 difference
-                for cells in (one.results.cells for one in kept)
+                for cells in (one.results.cells for one in _as_they_are(kept))
                 for views in cells.view_sets()
                 for column in cells.columns(views)
                 if (difference := cells.difference(views, column, variant, against, metric)) is not None
@@ -231,4 +236,6 @@ def _setting(section: Section) -> str:
     ]
     if section.settings:
         parts.append(f"settings {', '.join(f'`{line}`' for line in section.settings)}")
+    if section.align_colour:
+        parts.append("each image judged after the affine on sRGB that fits it to the truth best")
     return "; ".join(parts) + "."

@@ -47,6 +47,19 @@ variants = ["all-view", "full"]
 settings = ["g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "rivr.rounds=1"]
 
 [[quick]]
+name = "aligned"
+title = "Motion blur, colours aligned"
+kind = "rooms"
+protocols = ["mixed"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view", "full"]
+settings = ["g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "rivr.rounds=1"]
+align_colour = true
+
+[[quick]]
 name = "videos"
 title = "Real videos"
 kind = "video"
@@ -183,6 +196,12 @@ def test_scenes_that_two_sections_share_count_once() -> None:
     assert "| the whole method, against all-view training | 0 / 1 / 0 | not made |" in page
 
 
+def test_scenes_judged_again_with_their_colours_aligned_do_not_count() -> None:
+    plain, again = found(-1.0, -1.1, -0.9), found(-2.0, -2.1, -1.9)
+    again = again.model_copy(update={"section": plain.section.model_copy(update={"align_colour": True})})
+    assert losses([plain, again]) == losses([plain])
+
+
 def test_the_page_of_a_few_cells() -> None:
     page = results_page([found(-1.0, -1.1, -0.9)], ORIGIN)
     assert "1 of 2 comparisons, 1 of them sure." in page
@@ -245,6 +264,16 @@ def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
     assert "* kitchen: it is a real capture, and --captures was not given" in text
     assert "| mixed 1x | mixed 2x |" in text
     assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
+    assert text.count("each image judged after the affine on sRGB that fits it to the truth best.") == 1
+    plain, aligned = (
+        KeptSection.model_validate_json((out / f"results/{name}.json").read_bytes())
+        for name in ("rooms", "aligned")
+    )
+    scenes = {(one.sample, one.variant, one.views): one for one in plain.cells if one.column == "mixed 1x"}
+    for one in aligned.cells:
+        same = scenes[one.sample, one.variant, one.views]
+        assert one.steps == same.steps and one.gaussians == same.gaussians
+        assert (one.means["psnr"] or 0.0) > (same.means["psnr"] or 0.0)
     for name in ("results/rooms.png", "results/rooms-sheet.jpg", "results/rooms.json"):
         assert (out / name).stat().st_size > 0
     stored = {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
