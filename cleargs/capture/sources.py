@@ -176,12 +176,12 @@ def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[in
 def _open_transforms(source: Path, config: IngestConfig) -> Capture:
     listed = read_transforms(source / "transforms.json", poses=config.poses == "auto")
     listed.sort(key=lambda frame: frame_key(frame.name))
-    masks = _masks(mask_folder(source), [_below_images(frame) for frame in listed])
+    masks = masks_of(mask_folder(source), [name_below_images(frame) for frame in listed])
     frames = tuple(
         SourceFrame(
             frame.name,
             frame.path,
-            mask=frame.mask or masks.get(_below_images(frame)),
+            mask=frame.mask or masks.get(name_below_images(frame)),
             camera=frame.camera,
             pose=frame.pose,
         )
@@ -193,7 +193,7 @@ def _open_transforms(source: Path, config: IngestConfig) -> Capture:
 def _open_llff(source: Path, config: IngestConfig) -> Capture:
     # In the order of the rows: the test views of these data sets are every N-th row.
     views = read_llff(source)
-    masks = _masks(mask_folder(source), [view.path.name for view in views])
+    masks = masks_of(mask_folder(source), [view.path.name for view in views])
     frames = tuple(
         SourceFrame(
             view.path.name,
@@ -214,7 +214,7 @@ def _open_images(source: Path, config: IngestConfig) -> Capture:
             f"{source} holds no images, no video and no transforms.json",
             hint="give a video, a folder of images, a COLMAP project, or a folder with transforms.json",
         )
-    masks = _masks(mask_folder(source), [path.name for path in files])
+    masks = masks_of(mask_folder(source), [path.name for path in files])
     frames = tuple(
         SourceFrame(path.name, path, mask=masks.get(path.name)) for path in spread(files, config.max_frames)
     )
@@ -244,7 +244,7 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
     # Images that COLMAP could not register are frames too: they stay in the table, marked.
     stored = {path.relative_to(root).as_posix() for path in image_files(root, below=True)}
     names = sorted(set(posed) | stored, key=frame_key)
-    masks = _masks(mask_folder(source), names)
+    masks = masks_of(mask_folder(source), names)
     frames = []
     for name in spread(names, config.max_frames):
         image = posed.get(name)
@@ -260,12 +260,12 @@ def _open_colmap(source: Path, config: IngestConfig) -> Capture:
     )
 
 
-def _below_images(frame: TransformsFrame) -> str:
+def name_below_images(frame: TransformsFrame) -> str:
     """The name of a frame's image by its place below ``images/``."""
     return PurePosixPath(frame.name).as_posix().removeprefix("images/")
 
 
-def _masks(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
+def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """The masks in ``folder`` of the images of these ``names``: in the same place, by stem or full name (as
     COLMAP has them); elsewhere where no other image has that stem."""
     if folder is None:

@@ -35,7 +35,7 @@ from cleargs.progress import Reporter, SilentReporter
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.untrusted import open_regular, read_bytes, read_json
 
-EVALUATION_VERSION = 2
+EVALUATION_VERSION = 3
 """Raised when an evaluation of equal inputs would give other figures."""
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose
 from cleargs.capture.layout import mask_folder
-from cleargs.capture.sources import natural_key
+from cleargs.capture.sources import masks_of, name_below_images, natural_key
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.capture.undistort import Undistorter, undistorter
@@ -27,7 +27,7 @@ from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
-from cleargs.media.image import IMAGE_SUFFIXES, read_mask, read_rgb
+from cleargs.media.image import IMAGE_SUFFIXES, read_alpha, read_mask, read_rgb
 from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.progress import Reporter
@@ -246,8 +246,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     entries = read_transforms(path, poses=True)
     if not entries:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
-    folder = mask_folder(directory / "images")
-    masks = {} if folder is None else images_by_stem(folder)
+    masks = masks_of(mask_folder(directory / "images"), [name_below_images(entry) for entry in entries])
     undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
@@ -255,8 +254,8 @@ def _listed(directory: Path) -> dict[str, _Listed]:
         assert lens is not None  # asked for with poses=True
         if lens not in undistorters:
             undistorters[lens] = undistorter(lens, sys.maxsize)
-        stem = stem_of(entry.name)
-        listed.append((stem, _Listed(entry, entry.mask or masks.get(stem), undistorters[lens])))
+        mask = entry.mask or masks.get(name_below_images(entry))
+        listed.append((stem_of(entry.name), _Listed(entry, mask, undistorters[lens])))
     return _by_stem(listed)
 
 
@@ -285,17 +284,18 @@ def _view(stem: str, listed: _Listed, pose: Pose) -> ReferenceView:
 def _load(
     path: Path, mask: Path | None, size: tuple[int, int], way: Undistorter | None
 ) -> tuple[Pixels, Mask | None]:
-    """The pinhole image and mask of a reference whose file should have ``size`` (width, height)."""
-    image = read_rgb(path)
+    """The pinhole image of a reference whose file should have ``size`` (width, height), and its mask: that in
+    ``mask``, else the image's transparency."""
+    image, upright = read_rgb(path), True
     if image.shape[1::-1] != size:
         # A camera belongs to the image as it is stored, unless it fits it upright.
-        image = read_rgb(path, upright=False)
+        image, upright = read_rgb(path, upright=False), False
     if image.shape[1::-1] != size:
         raise InputError(
             f"{path} has {image.shape[1]}x{image.shape[0]} pixels, its camera {size[0]}x{size[1]}",
             hint="give the images at the size that transforms.json states (w, h)",
         )
-    stencil = None if mask is None else read_mask(mask)
+    stencil = read_alpha(path, upright=upright) if mask is None else read_mask(mask)
     if stencil is not None and stencil.shape != image.shape[:2]:
         raise InputError(
             f"the mask {mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "

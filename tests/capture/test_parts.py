@@ -28,9 +28,9 @@ from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sharpest import sharpness
 from cleargs.capture.sources import (
     SourceFrame,
-    _masks,
     choose_times,
     frame_key,
+    masks_of,
     natural_key,
     open_capture,
     spread,
@@ -351,7 +351,7 @@ def test_masks_lie_as_their_images_do(tmp_path: Path) -> None:
     for mask in ("cam1/0001.jpg.png", "0001.png", "0002.png", "0003.png"):
         (tmp_path / mask).parent.mkdir(exist_ok=True)
         (tmp_path / mask).write_bytes(b"")
-    found = {name: path.relative_to(tmp_path).as_posix() for name, path in _masks(tmp_path, names).items()}
+    found = {name: path.relative_to(tmp_path).as_posix() for name, path in masks_of(tmp_path, names).items()}
     # 0001.png could be of either camera, so it is of none.
     assert found == {
         "cam1/0001.jpg": "cam1/0001.jpg.png",

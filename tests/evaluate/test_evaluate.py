@@ -362,3 +362,23 @@ def test_held_out_frames_of_a_rig_share_names(tmp_path: Path) -> None:
     found = measured(run / "g0" / "scene.ply", reference)
     assert [image.name for image in found.images] == ["000001-0001", "000004-0001"]
     assert psnr_of(found) > NEARLY_EQUAL
+
+
+@pytest.mark.parametrize("kind", ["COLMAP's name", "transparency"])
+def test_masks_of_references_are_those_of_ingest(tmp_path: Path, kind: str) -> None:
+    """What training ignores is not held against the scene."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    pictures = [picture(scene, camera) for camera in cameras()]
+    counts = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    counts[:20, :30] = 0
+    pictures[2] = pictures[2] * (counts > 0)[..., None]
+    folder = write_reference(tmp_path / "truth", scene, cameras(), pictures=pictures)
+    if kind == "transparency":
+        clear = np.dstack([pictures[2][..., ::-1], counts])
+        cv2.imwrite(str(folder / "images" / "002.png"), clear)
+    else:
+        (folder / "masks").mkdir()
+        write_mask(folder / "masks" / "002.png.png", counts)
+    found = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
+    assert (found.images[2].values["psnr"] or 0) > NEARLY_EQUAL
