@@ -45,7 +45,7 @@ def gc(
     assert root is not None
     if not root.is_dir():
         raise InputError(f"there is no store {root}", hint="give the folder that was passed as --store")
-    if not (root / ROOTS).is_dir():  # every run that uses a store is noted there
+    if run is None and not (root / ROOTS).is_dir():  # every run that uses a store is noted there
         raise InputError(
             f"{root} is no store", hint="give the folder that was passed as --store, or RUN without --store"
         )

@@ -86,6 +86,10 @@ def show(
         raise InputError("--plot draws the stage rva", hint=f"cleargs show {run} rva --plot")
     if frame is not None and stage is not None:
         raise InputError("--frame is about all stages", hint=f"cleargs show {run} --frame {frame}")
+    if stage is None and (columns or rows is not None):
+        raise InputError(
+            "--rows and --columns are about the tables of a stage", hint=f"cleargs show {run} rva --columns"
+        )
     pictured = plot or frame is not None
     if output is not None and (not pictured or output.suffix.lower() != ".png"):
         raise InputError(

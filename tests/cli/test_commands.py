@@ -257,6 +257,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
         (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
         (["explain", "nowhere"], 2, "is no run", "cleargs run INPUT"),
         (["show", "nowhere"], 2, "is no run", "cleargs run INPUT"),
+        (["show", "nowhere", "--rows", "3"], 2, "tables of a stage", "show nowhere rva --columns"),
         (["gc"], 2, "neither a run nor a store", "--store"),
         (["stage", "nope", "nowhere"], 2, "there is no stage 'nope'", "the stages are count, square, total"),
     ],
