@@ -287,6 +287,8 @@ class _Level:
         """Offset, sweep and radius: see `DisplacementFields`."""
 
         def flow(twist: Vector) -> Floats:
+            if not twist.any():
+                return np.zeros(self._basis.shape[1:], np.float32)
             # einsum, for its fixed order of summation.
             return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
 

@@ -332,34 +332,37 @@ def misfits(
     limit: float,
     rows: Array,  # [H] float64, written
 ) -> None:
-    """Each row's sum of weight * min(|observed - photographed image|, limit); images without a margin."""
+    """Each row's sum of weight * min(|observed - photographed image|, limit); images without a margin.
+
+    Pixels of no weight are not looked at.
+    """
     height, width = image.shape
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     share = _ONE / np.float32(len(samples))
     for y in prange(height):
-        exposed = np.zeros(width, np.float32)
-        for k in range(len(samples)):  # pixels innermost: the loop that can be vectorised
-            for x in range(width):
-                i, a = _between(
-                    np.float32(x)
-                    + offset[0, y, x]
-                    + samples[k, 0] * sweep[0, y, x]
-                    + samples[k, 1] * radius[y, x],
-                    right,
-                )
-                j, b = _between(
-                    np.float32(y)
-                    + offset[1, y, x]
-                    + samples[k, 0] * sweep[1, y, x]
-                    + samples[k, 2] * radius[y, x],
-                    bottom,
-                )
+        # Those that count, side by side, so that the inner loop can be vectorised.
+        place, along = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
+        wide, exposed = np.empty(width, np.float32), np.zeros(width, np.float32)
+        count = 0
+        for x in range(width):
+            if weight[y, x] != 0.0:
+                place[0, count] = np.float32(x) + offset[0, y, x]
+                place[1, count] = np.float32(y) + offset[1, y, x]
+                along[0, count], along[1, count] = sweep[0, y, x], sweep[1, y, x]
+                wide[count] = radius[y, x]
+                count += 1
+        for k in range(len(samples)):
+            for n in range(count):
+                i, a = _between(place[0, n] + samples[k, 0] * along[0, n] + samples[k, 1] * wide[n], right)
+                j, b = _between(place[1, n] + samples[k, 0] * along[1, n] + samples[k, 2] * wide[n], bottom)
                 above = image[j, i] + a * (image[j, i + 1] - image[j, i])
                 below = image[j + 1, i] + a * (image[j + 1, i + 1] - image[j + 1, i])
-                exposed[x] += above + b * (below - above)
-        total = 0.0
+                exposed[n] += above + b * (below - above)
+        total, count = 0.0, 0
         for x in range(width):
-            total += weight[y, x] * min(abs(observed[y, x] - exposed[x] * share), limit)
+            if weight[y, x] != 0.0:
+                total += weight[y, x] * min(abs(observed[y, x] - exposed[count] * share), limit)
+                count += 1
         rows[y] = total
 
 
