@@ -300,12 +300,12 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:
-        console.print(_regions(evaluation), markup=False)
-    console.print(_provenance(first), markup=False)
+        console.print(_regions(evaluation))
+    console.print(_provenance(first))
     for metric, reason in first.unavailable.items():
-        console.print(f"{metric}: {reason}", markup=False)
+        console.print(f"{metric}: {reason}")
     if output is not None:
-        console.print(f"written: {output}", markup=False)
+        console.print(f"written: {output}")
 
 
 def _provenance(evaluation: Evaluation) -> str:

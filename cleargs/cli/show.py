@@ -147,11 +147,11 @@ def show(
         if columns:
             _print_columns(console, name, table)
         elif wanted and table.num_rows:
-            console.print(f"\n{name}: {table.num_rows} rows", markup=False)
+            console.print(f"\n{name}: {table.num_rows} rows")
         if wanted and table.num_rows:
             _print_rows(console, table, wanted)
     if not columns:
-        console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns", markup=False)
+        console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 
 
 def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, stale: bool, as_json: bool) -> None:
@@ -249,7 +249,7 @@ def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons])
     console = _console()
     console.print(table)
     for name, reasons in stale.items():
-        console.print(f"{name} is stale: {'; '.join(reasons)}", markup=False)
+        console.print(f"{name} is stale: {'; '.join(reasons)}")
 
 
 def _print_work(run: Run) -> None:
@@ -260,9 +260,9 @@ def _print_work(run: Run) -> None:
     count = f"{found.done} of {found.total}" if found.total else str(found.done or "")
     words = ", ".join(filter(None, (found.label, count, found.note)))
     console, preview = _console(), preview_of(found, run.store)
-    console.print(f"\n{found.stage} is at work: {words}", markup=False)
+    console.print(f"\n{found.stage} is at work: {words}")
     if preview is not None:
-        console.print(f"preview: {preview.path}", markup=False, soft_wrap=True)
+        console.print(f"preview: {preview.path}", soft_wrap=True)
 
 
 def _print_facts(console: Console, manifest: Manifest, stale: Reasons | None) -> None:

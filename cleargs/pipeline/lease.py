@@ -6,6 +6,7 @@ folders and results change hands by rename alone.
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import tempfile
@@ -109,10 +110,12 @@ def _born(pid: int) -> str:
 
 
 def _now(folder: Path) -> float:
-    """The time by the clock that stamps files in ``folder``: that of the file server. This node's where no
-    file can be made there, as by somebody who looks at another's run."""
+    """The time by the clock that stamps files in ``folder``: that of the file server. This node's for whoever
+    may not write there, and so can only look at another's run: nobody is taken for dead by it and robbed."""
     try:
         with tempfile.NamedTemporaryFile(dir=folder) as file:
             return os.fstat(file.fileno()).st_mtime
-    except OSError:
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
         return time.time()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -164,10 +165,15 @@ def test_whoever_may_only_read_sees_who_is_at_work(tmp_path: Path, monkeypatch: 
     """Somebody else's run on another node: the time of the file server cannot be had there."""
     path = pretend(tmp_path / "other.json", host="another-node", pid=dead_pid())
 
+    cause: OSError = PermissionError(errno.EACCES, "Permission denied")
+
     def refused(**options: object) -> None:
-        raise PermissionError(13, "Permission denied")
+        raise cause
 
     monkeypatch.setattr(tempfile, "NamedTemporaryFile", refused)
     assert living_holder(path) is not None
     pretend(path, age=DEAD_AFTER + 60, host="another-node", pid=dead_pid())
     assert living_holder(path) is None
+    cause = OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(OSError, match="No space"):  # a writer: this node's clock must not say who is dead
+        living_holder(path)
