@@ -77,7 +77,7 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
-	$(BIN)/mypy cleargs stages
+	$(BIN)/mypy cleargs stages benchmarks
 
 convert-env: .venv-convert/stamp
 

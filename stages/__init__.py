@@ -10,6 +10,6 @@ STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
 
 def pace(say: Callable[[str], None] | None = None) -> float:
     """This machine's time over that of the one on which the stages' estimates were measured."""
-    from cleargs.bench.pace import machine_pace
+    from cleargs.splat.pace import machine_pace
 
     return machine_pace(say)

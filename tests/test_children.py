@@ -10,9 +10,7 @@ import pytest
 
 import cleargs
 from cleargs.batch.preparation import WATCHER
-from cleargs.bench.peak_memory import peak_memory
 from cleargs.capture.child import run_child
-from cleargs.children import module_command
 from cleargs.errors import StageError
 from cleargs.progress import SilentReporter
 
@@ -36,13 +34,6 @@ def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: P
         run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", SilentReporter())
     assert "no.json" in (tmp_path / "log").read_text()
     subprocess.run(WATCHER, stderr=subprocess.DEVNULL, check=False)
-    subprocess.run([*module_command("cleargs.bench.peak_memory")], stderr=subprocess.DEVNULL, check=False)
-    assert not trap.exists()
-
-
-@pytest.mark.parametrize("trap", ["json.py"], indirect=True)
-def test_the_measured_child_imports_nothing_from_the_working_folder(trap: Path) -> None:
-    peak_memory(10, 16, 16, 1.0)
     assert not trap.exists()
 
 

@@ -14,10 +14,10 @@ from typing import Literal
 import click
 
 import cleargs
-from cleargs.bench.pace import remembered_pace
 from cleargs.cli.common import json_option, print_json
 from cleargs.pipeline.keys import installed_onnxruntimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
+from cleargs.splat.pace import remembered_pace
 
 LIBRARIES = (
     "torch",

@@ -34,15 +34,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "render": ("cleargs.cli.render", "Render the scene: stills, and films along a path."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
-    "compare": ("cleargs.cli.compare", "Put variants, captures or runs side by side: the paper's tables."),
-    "evidence": (
-        "cleargs.cli.evidence",
-        "Make the page of results: all tables and pictures.",
-    ),
-    "rva": ("cleargs.cli.rva", "Compare evaluators of frames, and check them."),
     "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
-    "bench": ("cleargs.cli.bench", "Measure the splatting core on this machine."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
     "verify": ("cleargs.cli.verify", "Read every file of a run again, and name what is damaged."),
     "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
@@ -84,7 +77,9 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
 
-@click.group(cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    "cleargs", cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(cleargs.__version__, prog_name="cleargs")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:
@@ -96,8 +91,8 @@ def cli(debug: bool) -> None:
     """
 
 
-def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
-    """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
+def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
+    """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages (tests)."""
     from cleargs.cli.interrupt import answer_signals
     from cleargs.cli.terminal import protect_streams
 
@@ -105,7 +100,7 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         answer_signals()
-        code = invoke(given, dag)
+        code = invoke(given, dag, program)
     except KeyboardInterrupt:  # before the command began, or after it ended
         code = _interrupted()
     if code == INTERRUPTED:
@@ -116,7 +111,7 @@ def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None
     sys.exit(code)
 
 
-def invoke(arguments: list[str], dag: Dag | None = None) -> int:
+def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = cli) -> int:
     """Run one command; returns its exit code. Errors go to stderr as one line of cause and one of remedy.
 
     ``--debug`` may stand anywhere.
@@ -125,7 +120,7 @@ def invoke(arguments: list[str], dag: Dag | None = None) -> int:
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
         _check_names(arguments)
-        code = cli.main(arguments, prog_name="cleargs", standalone_mode=False, obj=dag or installed())
+        code = program.main(arguments, prog_name=program.name, standalone_mode=False, obj=dag or installed())
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
         return _interrupted()

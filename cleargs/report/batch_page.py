@@ -15,7 +15,6 @@ from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.status import SceneState
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
-from cleargs.evaluate.comparison import size_of
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.manifest import Manifest
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
@@ -24,6 +23,7 @@ from cleargs.report.html import new_report, write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.verdict import training_psnr
 from cleargs.report.words import count, decibel, duration, size
+from cleargs.splat.ply import ply_size
 
 BYTES = 15_000_000
 """About how much all thumbnails together may take."""
@@ -145,7 +145,7 @@ def _figures(run: Path, made: Mapping[str, Manifest]) -> list[tuple[str, str]]:
         found.append((f"{ingest['registered']} of {ingest['frames']}", "frames placed"))
     if (scene := last_scene(made)) is not None:
         with suppress(CleargsError, OSError):  # a damaged scene has no size
-            found.append((f"{size_of(run / scene / 'scene.ply')[0]:,}", "Gaussians"))
+            found.append((f"{ply_size(run / scene / 'scene.ply')[0]:,}", "Gaussians"))
     if (psnr := training_psnr(made)[0]) is not None:
         found.append((decibel(psnr), "PSNR of the first scene on training poses"))
     if made:

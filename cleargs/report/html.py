@@ -11,20 +11,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 import cleargs
-from cleargs.evaluate.comparison_tables import Bold
 from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.pipeline.manifest import plain_json
 from cleargs.report.charts import weight_colour
 from cleargs.report.report_json import FOLDER, PAGE
 
 
-def write_page(folder: Path, template: str, **values: Any) -> None:
+def write_page(folder: Path, template: str | Template, **values: Any) -> None:
     """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
-    html = _environment().get_template(template).render(version=cleargs.__version__, **values)
+    html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
     (folder / PAGE).write_bytes(html.encode())
 
 
@@ -57,7 +56,8 @@ def json_in_html(value: Any) -> Markup:
     return Markup(text)
 
 
-def _environment() -> Environment:
+def page_environment() -> Environment:
+    """Return the templates of the report, with the filters and globals that they use."""
     environment = Environment(
         loader=PackageLoader("cleargs.report"),
         autoescape=True,
@@ -66,7 +66,6 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["json"] = json_in_html
-    environment.tests["bold"] = lambda text: isinstance(text, Bold)
     environment.globals["static"] = _static
     environment.globals["weight_colour"] = weight_colour
     return environment

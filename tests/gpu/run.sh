@@ -4,7 +4,7 @@
 #     tests/gpu/run.sh OUT [RUN]
 #
 # Leaves in OUT: versions.txt; tests.log and agreement.log (the GPU tests against the oracle, and against the CPU back
-# end); sanitizer.log; bench/ (`cleargs bench splat --device cuda`); and, where RUN is given, g0/ (the first scene at
+# end); sanitizer.log; bench/ (`python -m benchmarks splat --device cuda`); and, where RUN is given, g0/ (the first scene at
 # full size: its time and PSNR in stages.json). RUN is a folder with the finished ingest/ and rva/ of a capture, made
 # elsewhere: see splat_stages.py. A step that fails is named at the end and does not keep the others from running.
 #
@@ -72,8 +72,7 @@ fi
 if [ -n "$gsplat_build" ]; then
   wait "$gsplat_build" || echo "gsplat was not built: see gsplat-build.log"
 fi
-step bench 560 "$python" -c 'from cleargs.cli.main import main; main()' \
-  bench splat --device cuda -o "$out/bench" ${QUICK:+--quick}
+step bench 560 "$python" -m benchmarks splat --device cuda -o "$out/bench" ${QUICK:+--quick}
 if [ -n "$run" ]; then
   step g0 560 "$python" tests/gpu/splat_stages.py "$run" "$out/g0" ${QUICK:+--steps 200 --budget 20000}
 elif wanted g0; then

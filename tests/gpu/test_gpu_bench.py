@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from cleargs.bench.benchmark_plan import Case, DevicePlan
+from benchmarks.speed.benchmark_plan import Case, DevicePlan
 from cleargs.progress import SilentReporter
 
 SMALL, LARGE = Case(6, 15, 12), Case(9, 16, 14)
@@ -16,7 +16,7 @@ SMALL, LARGE = Case(6, 15, 12), Case(9, 16, 14)
 @pytest.fixture
 def bench(device):
     """The modules, imported late, since they import Triton."""
-    return importlib.import_module("cleargs.bench.device")
+    return importlib.import_module("benchmarks.speed.device")
 
 
 def test_every_row_has_its_errors_beside_its_times(device, bench):
@@ -29,7 +29,7 @@ def test_every_row_has_its_errors_beside_its_times(device, bench):
         assert 0 < row.ours.accuracy.worst_gradient < 1e-4
         assert set(row.ours.times) == {"forward", "loss", "backward", "adam", "iteration"}
     assert found.rows[0].pairs >= found.rows[0].reached > 0
-    text = importlib.import_module("cleargs.bench.device_markdown").device_markdown(found)
+    text = importlib.import_module("benchmarks.speed.device_markdown").device_markdown(found)
     assert f"{found.rows[1].ours.accuracy.image.max:.1e}" in text
     for table in text.split("\n\n"):
         if table.startswith("|"):

@@ -1,4 +1,4 @@
-"""The pages of a comparison and of a batch in a real browser, wide and on a phone, light and dark."""
+"""The page of a batch in a real browser, wide and on a phone, light and dark."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from typing import Any
 
 import pytest
 from browser import CHROMIUM, NO_CHROMIUM, Opened
-from made_pages import HOSTILE, batch_page, compare_runs
-
-from cleargs.report.compare_page import write_comparison
+from made_pages import batch_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -18,12 +16,8 @@ SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    out, compared = compare_runs(tmp_path_factory.mktemp("compare"))
-    return {
-        "compare": write_comparison(out, compared, [HOSTILE], [HOSTILE], [HOSTILE]),
-        "batch": batch_page(tmp_path_factory.mktemp("batch")),
-    }
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return batch_page(tmp_path_factory.mktemp("batch"))
 
 
 @pytest.fixture(params=SIZES)
@@ -31,13 +25,11 @@ def size(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(params=["compare", "batch"])
-def opened(
-    request: pytest.FixtureRequest, pages: dict[str, Path], browser: Any, size: str
-) -> Iterator[Opened]:
+@pytest.fixture
+def opened(made: Path, browser: Any, size: str) -> Iterator[Opened]:
     scheme = "light" if size == "wide" else "dark"
     page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
-    yield Opened(page, pages[request.param].as_uri())
+    yield Opened(page, made.as_uri())
     page.close()
 
 
@@ -50,31 +42,9 @@ def test_a_page_fits_its_screen_and_asks_for_nothing_else(opened: Opened, size: 
     assert page.evaluate("window.hacked") is None
 
 
-def test_a_pose_opens_under_a_slider_by_keyboard(browser: Any, pages: dict[str, Path]) -> None:
+def test_scenes_are_told_apart_by_their_state(browser: Any, made: Path) -> None:
     page = browser.new_page(viewport=SIZES["wide"])
-    opened = Opened(page, pages["compare"].as_uri())
-    page.locator(".tile").nth(1).press("Enter")
-    assert page.locator("#inspector").is_visible()
-    assert page.locator("#tag-left").inner_text() == "Reference"
-    assert page.locator("#tag-right").inner_text() == HOSTILE
-    first = page.locator("#inspector-title").inner_text()
-    page.locator("#slider").focus()
-    page.keyboard.press("ArrowLeft")
-    assert page.evaluate("document.querySelector('.overlay').style.getPropertyValue('--cut')") == "49%"
-    page.locator(".close").focus()
-    page.keyboard.press("ArrowRight")
-    title = page.locator("#inspector-title").inner_text()
-    assert title != first
-    assert page.locator("#tag-right").inner_text() == HOSTILE, "the variant stays from pose to pose"
-    assert page.locator("#right").get_attribute("alt") == f"{title}: {HOSTILE}"
-    page.keyboard.press("Escape")
-    assert not page.locator("#inspector").is_visible() and opened.complaints == []
-    page.close()
-
-
-def test_scenes_are_told_apart_by_their_state(browser: Any, pages: dict[str, Path]) -> None:
-    page = browser.new_page(viewport=SIZES["wide"])
-    opened = Opened(page, pages["batch"].as_uri())
+    opened = Opened(page, made.as_uri())
     page.locator('#filters [data-kind="failed"]').press("Enter")
     assert page.locator("#strip li:visible b").first.inner_text() == "cellar"
     assert page.locator("#strip li:visible").count() == 1

@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 from numba import config
 
-from cleargs.bench.probe import KERNELS, timed_kernels
-from cleargs.bench.timing import Clock
 from cleargs.splat.kernels import runtime
 
 
@@ -30,13 +28,6 @@ def test_digest_follows_every_kernel_source(monkeypatch):
             patch.setattr(Path, "read_bytes", lambda path, name=name: read(path) + b"#" * (path.name == name))
             assert runtime.kernel_digest() != before
     assert runtime.kernel_digest() == before
-
-
-def test_warm_up_runs_every_kernel_of_an_iteration():
-    clock = Clock()
-    with clock.repetition(), timed_kernels(clock):
-        runtime.warm_up()
-    assert set(clock.quartiles()) == set(KERNELS)
 
 
 def test_set_threads():

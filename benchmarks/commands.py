@@ -1,0 +1,40 @@
+"""The commands of ``python -m benchmarks``."""
+
+from __future__ import annotations
+
+import click
+
+from benchmarks.comparison.compare_command import compare
+from benchmarks.comparison.evidence_command import evidence
+from benchmarks.rva.agree_command import agree
+from benchmarks.rva.check_command import check
+from benchmarks.speed.commands import formation, quality, splat, train
+from cleargs.cli import main as program
+from cleargs.pipeline.dag import Dag
+
+
+@click.group("python -m benchmarks", context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+def benchmarks(debug: bool) -> None:
+    """Measure ClearGS: its speed and error, its variants against each other, its judgement of frames."""
+
+
+@benchmarks.group()
+def rva() -> None:
+    """Compare evaluators of frames, and check them against known truth."""
+
+
+for command in (splat, train, formation, quality, compare, evidence):
+    benchmarks.add_command(command)
+for command in (agree, check):
+    rva.add_command(command)
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    program.main(program=benchmarks)
+
+
+def invoke(arguments: list[str], dag: Dag | None = None) -> int:
+    """Run one command; return its exit code. ``dag`` replaces the installed stages (tests)."""
+    return program.invoke(arguments, dag, benchmarks)

@@ -1,0 +1,137 @@
+"""``evidence``: the page of results, from one command."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cleargs.cli.common import output_option, quiet_option, threads_or_all, work_options
+from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.cli.progress_bars import make_reporter
+from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
+from cleargs.pipeline.store import STORE_FOLDER
+
+if TYPE_CHECKING:
+    from benchmarks.comparison.evidence import Outcome, Workshop
+
+RECIPE = "default"
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  python -m benchmarks evidence -o evidence --quick                          a rough page, evidence/results.md
+  python -m benchmarks evidence -o evidence --captures data --page docs/results.md
+  python -m benchmarks evidence -o evidence --quick --section mixed          one section alone
+"""
+)
+@output_option("Folder of captures, runs and tables; resumes if it exists.", "out")
+@click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
+@click.option(
+    "--captures",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of the real captures, by their names in the list; without it the page calls them missing.",
+)
+@click.option(
+    "--page",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Where the page goes; pictures lie in results/ beside it.  [default: OUT/results.md]",
+)
+@click.option("--section", "sections", multiple=True, metavar="NAME", help="Only this section (repeatable).")
+@click.option(
+    "--list",
+    "listed",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Another list of evidence (TOML) than the one that is frozen.",
+)
+@click.option("--dry-run", is_flag=True, help="Print the plan and make nothing.")
+@work_options
+@quiet_option
+@click.pass_obj
+def evidence(
+    dag: Dag,
+    out: Path,
+    quick: bool,
+    captures: Path | None,
+    page: Path | None,
+    sections: tuple[str, ...],
+    listed: Path | None,
+    dry_run: bool,
+    device: DeviceChoice,
+    threads: int | None,
+    quiet: bool,
+) -> int:
+    """Make the captures, scenes, tables and pictures of the page of results.
+
+    What is compared is listed in one frozen file, on whose captures no default is chosen. The same command
+    resumes where it stopped. What cannot be made (a missing capture, say) is named on the page with
+    the reason.
+    """
+    from benchmarks.comparison.evidence import Workshop, chosen_sections, make_section, minutes, read_evidence
+    from benchmarks.comparison.kept_sections import keep_section, kept_sections
+    from benchmarks.comparison.origin import version_of_source
+    from benchmarks.comparison.results_page import Origin, results_page
+    from benchmarks.comparison.scenes import Recipe
+    from cleargs.files import write_bytes
+
+    lists = read_evidence(listed)
+    chosen = chosen_sections(lists, quick=quick, names=sections)
+    out = out.absolute()
+    page = (page or out / "results.md").absolute()
+    beside = page.parent / "results"
+    reporter = make_reporter(quiet)
+    options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
+    recipe = Recipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options)
+    command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
+    origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
+    version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"
+    whole = True
+    with opened_store(out / STORE_FOLDER) as store:
+        shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)
+        plan = list(zip(chosen, minutes(chosen, shop), strict=True))
+        for section, cost in plan:
+            click.echo(f"{section.name:12} {cost:6.1f} min  {section.title}")
+        click.echo(f"{'in all':12} {sum(cost for _, cost in plan):6.1f} min  on two quiet cores")
+        if dry_run:
+            return 0
+        for section, _ in plan:
+            started = time.monotonic()
+            found = make_section(section, shop)
+            reporter.info(f"section {section.name}: {(time.monotonic() - started) / 60:.1f} min")
+            _write_pictures(found, shop, beside)
+            keep_section(beside, found, version, machine)
+            kept = kept_sections(beside, origin.sections, reporter)
+            write_bytes(page, results_page(kept, origin).encode())
+            whole = whole and not found.missing
+    click.echo(f"written: {page}")
+    return 0 if whole else DONE_IN_PART
+
+
+def _command(*, quick: bool, captures: bool, listed: bool) -> str:
+    """The command as a reader would type it: with words for the folders."""
+    words = [
+        "python -m benchmarks evidence -o OUT",
+        "--quick" * quick,
+        "--captures DIR" * captures,
+        "--list FILE" * listed,
+    ]
+    return " ".join(word for word in words if word)
+
+
+def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
+    from benchmarks.comparison.pictures import comparison_sheet, plot_comparison
+    from benchmarks.comparison.variants import WHOLE
+
+    if found.compared is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    cells, labels = found.compared.results.cells, found.compared.labels
+    plot_comparison(folder / f"{found.section.name}.png", cells, labels)
+    shown = [name for name in (cells.variants()[0], "rva", WHOLE) if name in labels]
+    captures = {scene.sample.name: scene.sample.capture for scene in found.compared.scenes}
+    comparison_sheet(folder / f"{found.section.name}-sheet.jpg", shop.out, cells, labels, shown, captures)

@@ -1,0 +1,302 @@
+"""``OUT/report/index.html``: a comparison as a page, what is behind first, then the variants side by side."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader
+from numpy.typing import NDArray
+
+from benchmarks.comparison.cells import Cell, Cells, ViewSet
+from benchmarks.comparison.findings import Compared
+from benchmarks.comparison.gaps import compared_with, losses_of, losses_table
+from benchmarks.comparison.scenes import Made, view_sets
+from benchmarks.comparison.tables import (
+    NAMES,
+    TITLES,
+    Bold,
+    Table,
+    choices_table,
+    difference_table,
+    metric_title,
+    note_on,
+    number,
+    roles_table,
+    value_text,
+    work_table,
+)
+from benchmarks.comparison.variants import WHOLE
+from cleargs.capture.tables import load_frames
+from cleargs.evaluate.eval_report import Evaluation
+from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
+from cleargs.media.image import read_rgb
+from cleargs.progress import SilentReporter
+from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
+from cleargs.report.html import new_report, page_environment, write_page
+from cleargs.report.report_json import page_of
+
+POSES = 3
+"""Poses shown of a capture and set of views, evenly along their order."""
+PICTURES = 1500
+"""Of more, fewer poses are shown, but one of each set of views."""
+BYTES = 20_000_000
+"""About how much all pictures together may take."""
+
+REFERENCE, FILMED = "reference", "filmed"
+_FOLDER = "poses"
+_SAID = ("psnr", "lpips_vgg", "lpips_alex")
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One place from which a capture's scenes are shown."""
+
+    number: int
+    views: ViewSet
+    name: str
+    size: tuple[int, int]
+    pictures: Mapping[str, Picture]
+    """Layer -> picture: `REFERENCE`, `FILMED` where a frame was filmed there, then the variants' renders."""
+    notes: Mapping[str, str]
+    """Layer of a render -> its figures in short."""
+    figures: Sequence[tuple[str, Sequence[tuple[str, str]]]]
+    """Title of a metric, and the value of every variant by its label."""
+
+
+@dataclass
+class Capture:
+    """One column of the tables: what its scenes are worth on each set of views, and what they look like."""
+
+    name: str
+    tables: list[tuple[ViewSet, str, str, Table]] = field(default_factory=list)
+    """Set of views, its title, what to know of it, values by variant and metric."""
+    poses: list[Pose] = field(default_factory=list)
+
+
+def write_comparison(
+    out: Path, compared: Compared, baselines: Sequence[str], made_with: Sequence[str], warnings: Sequence[str]
+) -> Path:
+    """Write the report of the comparison in ``out``, in place of an older one; returns its page.
+
+    Raises StoreError when it cannot be written, InputError or StoreError when a result cannot be read.
+    """
+    cells, labels = compared.results.cells, compared.labels
+    layers = {name: f"v{place}" for place, name in enumerate(cells.variants())}
+    subject = WHOLE if WHOLE in labels else cells.variants()[-1]
+    samples = {(cell.column, cell.sample) for cell in cells.cells}
+    with new_report(out) as folder:
+        captures = _captures(out, folder, compared, layers)
+        write_page(
+            folder,
+            _environment().get_template("compare.html.jinja"),
+            name=out.name,
+            aspect=None,
+            captures=captures,
+            variants=list(labels.values()),
+            layer_names=_layer_names(layers, labels),
+            warnings=[*warnings, *compared.failures],
+            samples=max(Counter(column for column, _ in samples).values()),
+            **_against(cells, labels, subject),
+            differences=[
+                (TITLES[views], labels[baseline], difference_table(cells, labels, views, baseline))
+                for views in cells.view_sets()
+                for baseline in baselines
+                if baseline in labels and len(labels) > 1
+            ],
+            equal=_equal_work(cells),
+            work=work_table(cells, labels),
+            roles=roles_table(compared.roles, labels),
+            choices=choices_table(compared.choices, labels) if compared.choices else None,
+            made_with=made_with,
+            data=_data(captures, layers, labels, subject),
+        )
+    return page_of(out)
+
+
+def _environment() -> Environment:
+    """Return the templates of the report, and the one of this page."""
+    environment = page_environment()
+    assert environment.loader is not None
+    environment.loader = ChoiceLoader([FileSystemLoader(Path(__file__).parent), environment.loader])
+    environment.tests["bold"] = lambda text: isinstance(text, Bold)
+    return environment
+
+
+def _against(cells: Cells, labels: Mapping[str, str], subject: str) -> dict[str, Any]:
+    """The subject beside the others, in figures and words."""
+    found = losses_of(cells, subject)
+    places = [((loss.column, TITLES[loss.views].split(",")[0], labels[loss.against]), loss) for loss in found]
+    return {
+        "subject": labels[subject],
+        "pairs": sum(1 for _ in compared_with(cells, subject)),
+        "behind": len(found),
+        "verdicts": Counter(loss.verdict for loss in found),
+        "losses": losses_table(("capture", "views", "behind"), places),
+    }
+
+
+def _equal_work(cells: Cells) -> bool:
+    """Whether all variants of a sample had as many steps and the same SH degree."""
+    given = {(cell.sample, cell.steps, cell.sh_degree) for cell in cells.cells}
+    return len(given) == len({sample for sample, _, _ in given})
+
+
+# -- captures -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A pose before its pictures are written."""
+
+    views: ViewSet
+    view: ReferenceView
+    filmed: Path | None
+    renders: Sequence[tuple[str, Cell, Evaluation]]
+    """Layer, cell and figures of every variant."""
+
+
+def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, str]) -> list[Capture]:
+    cells, labels = compared.results.cells, compared.labels
+    columns = list(dict.fromkeys(cell.column for cell in cells.cells))
+    sets = len({(cell.column, cell.views) for cell in cells.cells})
+    poses = max(1, min(POSES, PICTURES // (sets * (len(layers) + 2))))
+    shots = {column: list(_shots(out, compared, column, layers, poses)) for column in columns}
+    pictures = sum(2 + len(shot.renders) for found in shots.values() for shot in found)
+    (folder / _FOLDER).mkdir()
+    captures, numbers = [], 0
+    for column, found in shots.items():
+        capture = Capture(column)
+        for views in cells.view_sets():
+            if column in cells.columns(views):
+                values = _values(cells, labels, views, column)
+                capture.tables.append((views, TITLES[views], note_on(cells, views), values))
+        for shot in found:
+            capture.poses.append(_pose(shot, numbers, pictures, out, folder, labels))
+            numbers += 1
+        captures.append(capture)
+    return captures
+
+
+def _values(cells: Cells, labels: Mapping[str, str], views: ViewSet, column: str) -> Table:
+    metrics = cells.metrics()
+    rows = [
+        [labels[variant], *(value_text(cells, views, column, variant, metric) for metric in metrics)]
+        for variant in cells.variants()
+        if cells.of(views, column, variant)
+    ]
+    return Table(["", *map(metric_title, metrics)], rows)
+
+
+def _shots(
+    out: Path, compared: Compared, column: str, layers: Mapping[str, str], poses: int
+) -> Iterator[_Shot]:
+    """Some poses of the first capture of a column."""
+    scenes = [scene for scene in compared.scenes if scene.sample.column == column]
+    first = scenes[0]
+    samples = {scene.sample.name for scene in scenes if scene.sample.capture == first.sample.capture}
+    for found in view_sets(first):
+        if found.views == "given":  # nearly the pictures of the true poses
+            continue
+        own: dict[str, Cell] = {}
+        for cell in compared.cells:
+            if cell.sample in samples and cell.views == found.views:
+                own.setdefault(cell.variant, cell)
+        renders = [(layers[variant], cell, _evaluation(out, cell)) for variant, cell in own.items()]
+        reference = reference_of(
+            first.run, found.directory, poses=found.poses, align=found.align, reporter=SilentReporter()
+        )
+        filmed = _filmed(first) if found.views == "observed" else {}
+        for view in _evenly(reference.views, poses):
+            yield _Shot(found.views, view, filmed.get(view.name), renders)
+
+
+def _evaluation(out: Path, cell: Cell) -> Evaluation:
+    return Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
+
+
+def _filmed(scene: Made) -> dict[str, Path]:
+    """Stem -> image of the frames that were filmed."""
+    ingest = scene.run / "ingest"
+    return {stem_of(frame.name): ingest / frame.image for frame in load_frames(ingest)}
+
+
+def _evenly(views: Sequence[ReferenceView], wanted: int) -> list[ReferenceView]:
+    wanted = min(wanted, len(views))
+    return [views[(2 * place + 1) * len(views) // (2 * wanted)] for place in range(wanted)]
+
+
+def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]) -> Pose:
+    """Write the pictures of a pose."""
+    reference = shot.view.load()[0]
+    height, width = reference.shape[:2]
+    side = side_of(pictures, height / width, BYTES)
+    images = {REFERENCE: reference}
+    if shot.filmed is not None:
+        images[FILMED] = read_rgb(shot.filmed)
+    notes: dict[str, str] = {}
+    figures: dict[str, list[tuple[str, str]]] = {}
+    for layer, cell, evaluation in shot.renders:
+        image = next((image for image in evaluation.images if image.name == shot.view.name), None)
+        if image is None:  # runs whose references differ
+            continue
+        images[layer] = read_rgb(out / cell.evaluation / f"{shot.view.name}.png")
+        notes[layer] = _note(image.values)
+        for metric, value in image.values.items():
+            if value is not None:
+                figures.setdefault(metric, []).append((labels[cell.variant], number(value, metric)))
+    return Pose(
+        place,
+        shot.views,
+        shot.view.name,
+        (width, height),
+        {
+            layer: write_jpeg(folder, f"{_FOLDER}/{place:03d}-{layer}.jpg", image, side)
+            for layer, image in images.items()
+        },
+        notes,
+        [(metric_title(metric), values) for metric, values in figures.items()],
+    )
+
+
+def _note(values: Mapping[str, float | None]) -> str:
+    """PSNR and one LPIPS, as far as they were measured."""
+    said = [metric for metric in _SAID if values.get(metric) is not None][:2]
+    texts = {metric: number(values[metric] or 0.0, metric) for metric in said}
+    return " · ".join(
+        f"{text} dB" if metric == "psnr" else f"{NAMES[metric]} {text}" for metric, text in texts.items()
+    )
+
+
+def _layer_names(layers: Mapping[str, str], labels: Mapping[str, str]) -> dict[str, str]:
+    renders = {layer: labels[variant] for variant, layer in layers.items()}
+    return {REFERENCE: "Reference", FILMED: "As filmed", **renders}
+
+
+def _data(
+    captures: Sequence[Capture], layers: Mapping[str, str], labels: Mapping[str, str], subject: str
+) -> dict[str, Any]:
+    """What the script of the page knows."""
+    return {
+        "layers": _layer_names(layers, labels),
+        "opening": {"left": REFERENCE, "right": layers[subject]},
+        "frames": [
+            {
+                "id": pose.number,
+                "title": f"{capture.name} · {pose.name}",
+                "role": TITLES[pose.views],
+                "aspect": f"{pose.size[0]} / {pose.size[1]}",
+                "layers": {layer: picture.path for layer, picture in pose.pictures.items()},
+                "notes": pose.notes,
+                "figures": pose.figures,
+            }
+            for capture in captures
+            for pose in capture.poses
+        ],
+    }

@@ -1,0 +1,1 @@
+"""The evaluators of frames against each other, and against known truth."""

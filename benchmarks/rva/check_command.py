@@ -1,0 +1,102 @@
+"""``rva check``: cues against the known faults of synthetic captures."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cleargs.cli.common import json_option, print_json
+from cleargs.errors import InputError
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.manifest import linked_manifest
+from cleargs.pipeline.run_file import read_run_file
+
+if TYPE_CHECKING:
+    from benchmarks.rva.truth import Check
+
+TRUTH = Path("truth", "frames.parquet")
+"""Where `cleargs synth` says what is wrong with each frame."""
+
+_HEADS = ("frames", "strong", "B ~ blur", "-R ~ blur", "motion ~ blur", "defocus ~ disc", "exposure ~ stops")
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs synth data/mixed --protocol mixed
+  cleargs run data/mixed -o runs/mixed --until rva
+  python -m benchmarks rva check runs/mixed
+  python -m benchmarks rva check runs/* --json
+"""
+)
+@click.argument(
+    "runs",
+    metavar="RUN...",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+)
+@json_option
+@click.pass_obj
+def check(dag: Dag, runs: tuple[Path, ...], as_json: bool) -> None:
+    """Say how well the cues of each RUN follow what its synthetic capture is known to suffer from.
+
+    Spearman's rank correlation. A motion under 1 px and an exposure error under a quarter of a stop count as
+    none. B and R are compared with the length of the motion over the frames that have no other fault.
+    """
+    found = {str(run): _check(run, dag) for run in runs}
+    if as_json:
+        print_json({run: asdict(result) for run, result in found.items()})
+        return
+    width = max(map(len, found))
+    click.echo("  ".join([" " * width, *_HEADS]))
+    for run, result in found.items():
+        values = [str(result.frames), f"{100 * result.strong:.0f} %"]
+        values += ["-" if value is None else f"{value:.2f}" for value in list(asdict(result).values())[2:]]
+        cells = [value.rjust(len(head)) for value, head in zip(values, _HEADS, strict=True)]
+        click.echo("  ".join([run.ljust(width), *cells]))
+
+
+def _check(run: Path, dag: Dag) -> Check:
+    """Raises InputError where the run has no table of RVA, or its capture no truth."""
+    import numpy as np
+
+    from benchmarks.rva.truth import Faults, check
+    from cleargs.parquet import read_table
+    from cleargs.rva.scores import Floats
+    from cleargs.rva.tables import B_CUES, FRAMES
+    from cleargs.synth.develop import FRAMES as TRUE_FRAMES
+
+    source = read_run_file(run, dag).source
+    if linked_manifest(run, "rva") is None:
+        raise InputError(f"rva is not done in {run}", hint=f"first: cleargs stage rva {run}")
+    if not (source / TRUTH).is_file():
+        raise InputError(
+            f"the capture {source} has no {TRUTH}", hint="give runs on captures that `cleargs synth` made"
+        )
+    judged = read_table((run / "rva").resolve() / "frames.parquet", FRAMES)
+    true = read_table(source / TRUTH, TRUE_FRAMES)
+    row = {Path(image).name: k for k, image in enumerate(true["image"].to_pylist())}
+    names = [Path(name).name for name in judged["name"].to_pylist()]
+    absent = [name for name in names if name not in row]
+    if absent:
+        raise InputError(
+            f"{absent[0]} is not in {source / TRUTH}",
+            hint="the capture changed: run it again, or make the capture again",
+        )
+    scored = np.flatnonzero(~np.isnan(np.asarray(judged["R"].to_numpy(), dtype=np.float64)))
+    order = np.array([row[names[k]] for k in scored], dtype=np.intp)
+
+    def column(name: str) -> Floats:
+        return np.asarray(judged[name].to_numpy(), dtype=np.float64)[scored]
+
+    return check(
+        column("R"),
+        column("B"),
+        {f"b_{name}": column(f"b_{name}") for name in B_CUES},
+        np.asarray(judged["reliable"].to_numpy(), dtype=bool)[scored],
+        Faults(*(true[name].to_numpy()[order] for name in ("blur_px", "defocus_px", "exposure_ev"))),
+    )

@@ -1,0 +1,73 @@
+"""How well an evaluator's cues follow the faults that a synthetic capture is known to have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.rva.agreement import spearman
+from cleargs.rva.scores import Bools, Floats
+
+MIN_BLUR_PX = 1.0
+"""px: a shorter motion is no fault, and all such frames are equal."""
+MIN_EXPOSURE_ERROR_EV = 0.25
+"""Smaller exposure errors are no fault: automatic exposure drifts by as much."""
+MIN_DEFOCUS_PX = 0.1
+"""px, of the disc of defocus."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with n frames: the columns of ``truth/frames.parquet`` of the same names."""
+
+    blur_px: Floats
+    defocus_px: Floats
+    exposure_ev: Floats
+
+    def noticeable(self) -> Faults:
+        """The same with 0 for what is too small to be a fault, and exposure errors without sign."""
+        stops = np.abs(self.exposure_ev)
+        return Faults(
+            np.where(self.blur_px < MIN_BLUR_PX, 0.0, self.blur_px),
+            np.where(self.defocus_px < MIN_DEFOCUS_PX, 0.0, self.defocus_px),
+            np.where(stops < MIN_EXPOSURE_ERROR_EV, 0.0, stops),
+        )
+
+
+@dataclass(frozen=True)
+class Check:
+    """Rank correlations of one capture; None where either side is constant."""
+
+    frames: int
+    strong: float
+    """Share of the frames in the reliable set A."""
+    B_blur: float | None
+    """B against the length of the motion, over the frames without another fault."""
+    R_blur: float | None
+    """-R against the same."""
+    motion: float | None
+    """b_motion_blur against the length of the motion, over all frames."""
+    defocus: float | None
+    exposure: float | None
+
+
+def check(
+    R: Floats,  # [n]
+    B: Floats,  # [n]
+    cues: dict[str, Floats],  # b_motion_blur, b_defocus, b_exposure_failure -> [n]
+    reliable: Bools,  # [n]
+    faults: Faults,
+) -> Check:
+    """Spearman's rank correlations (average ranks for ties) of scores and cues with the true faults."""
+    true = faults.noticeable()
+    alone = (true.defocus_px == 0.0) & (true.exposure_ev == 0.0)
+    return Check(
+        frames=len(R),
+        strong=float(np.mean(reliable)),
+        B_blur=spearman(B[alone], true.blur_px[alone]),
+        R_blur=spearman(-R[alone], true.blur_px[alone]),
+        motion=spearman(cues["b_motion_blur"], true.blur_px),
+        defocus=spearman(cues["b_defocus"], true.defocus_px),
+        exposure=spearman(cues["b_exposure_failure"], true.exposure_ev),
+    )

@@ -1,0 +1,1 @@
+"""Time, memory and error of the splatting core and of whole runs."""

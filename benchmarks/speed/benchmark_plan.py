@@ -1,0 +1,104 @@
+"""What a benchmark measures: sizes, threads, repeats."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+MEDIAN_SIGMA = 1.8
+"""Median standard deviation of the projected splats, px: about five tiles per splat with its tails."""
+
+
+class Case(NamedTuple):
+    """A random scene in a view."""
+
+    gaussians: int
+    width: int
+    height: int
+    sigma: float = MEDIAN_SIGMA
+
+    @property
+    def title(self) -> str:
+        """As tables name it."""
+        return f"{self.gaussians:,} at {self.width}x{self.height}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A benchmark. Cases are timed on every number of threads in turn."""
+
+    cases: tuple[Case, ...]
+    threads: tuple[int, ...]
+    rounds: int = 7
+    repetitions: int = 3  # iterations a round
+    torch_rounds: int = 3  # of the comparison with torch, one iteration a round
+    torch_largest: Case | None = None  # up to this many splats and pixels pure torch runs
+    roofline: Case | None = None
+    more_splats: tuple[Case, ...] = ()  # scaling: the number of splats grows
+    larger_splats: tuple[Case, ...] = ()  # scaling: each splat grows
+    memory: bool = True
+    peak_repeats: int = 50
+    seed: int = 0
+
+    def compares_torch(self, case: Case) -> bool:
+        """Whether the pure-torch rasteriser runs on this case too."""
+        largest = self.torch_largest
+        return (
+            largest is not None
+            and case.gaussians <= largest.gaussians
+            and case.width * case.height <= largest.width * largest.height
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class DevicePlan:
+    """A benchmark of a GPU."""
+
+    cases: tuple[Case, ...]
+    rounds: int = 7
+    repetitions: int = 10  # iterations a round
+    seed: int = 0
+
+
+def device_plan() -> DevicePlan:
+    """100,000 to 3,000,000 splats, 1280x720 and 1920x1080."""
+    counts = (100_000, 500_000, 1_000_000, 3_000_000)
+    sizes = ((1280, 720), (1920, 1080))
+    return DevicePlan(tuple(Case(count, *size) for size in sizes for count in counts))
+
+
+def quick_device_plan() -> DevicePlan:
+    """Two small cases: to try the command, not to quote."""
+    return DevicePlan((Case(4_000, 160, 90), Case(20_000, 320, 180)), rounds=3, repetitions=3)
+
+
+def full_plan(threads: tuple[int, ...]) -> Plan:
+    """10,000 to 400,000 splats, 320x180 to 1280x720."""
+    counts = (10_000, 50_000, 200_000, 400_000)
+    sizes = ((320, 180), (640, 360), (960, 540), (1280, 720))
+    return Plan(
+        cases=tuple(Case(count, *size) for size in sizes for count in counts),
+        threads=threads,
+        torch_largest=Case(50_000, 960, 540),
+        roofline=Case(50_000, 960, 540),
+        more_splats=tuple(
+            Case(count, 640, 360) for count in (10_000, 20_000, 50_000, 100_000, 200_000, 400_000)
+        ),
+        larger_splats=tuple(Case(50_000, 640, 360, MEDIAN_SIGMA * factor) for factor in (0.5, 1, 2, 4, 8)),
+    )
+
+
+def quick_plan(threads: tuple[int, ...]) -> Plan:
+    """The same kinds of rows at sizes that take seconds: to try the command, not to quote."""
+    return Plan(
+        cases=(Case(1_000, 160, 90), Case(4_000, 160, 90), Case(4_000, 320, 180)),
+        threads=threads,
+        rounds=3,
+        repetitions=2,
+        torch_rounds=2,
+        torch_largest=Case(4_000, 160, 90),
+        roofline=Case(4_000, 320, 180),
+        more_splats=tuple(Case(count, 160, 90) for count in (1_000, 2_000, 4_000)),
+        larger_splats=tuple(Case(1_000, 160, 90, MEDIAN_SIGMA * factor) for factor in (1, 2, 4)),
+        peak_repeats=5,
+    )

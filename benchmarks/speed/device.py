@@ -1,0 +1,185 @@
+"""The benchmark of a GPU: our iteration, gsplat's passes beside it, and the errors of both."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import cleargs
+from benchmarks.speed.benchmark_plan import Case, DevicePlan
+from benchmarks.speed.benchmark_results import Times, named
+from benchmarks.speed.gsplat_cuda import GsplatRasteriser, load_gsplat
+from benchmarks.speed.iteration import SSIM_LAMBDA, Iteration
+from benchmarks.speed.oracle import Accuracy, accuracy, choose_pixels, oracle
+from benchmarks.speed.timing import Clock, EventClock, Quartiles, ratio, take_turns
+from cleargs.progress import Reporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cuda.loss import Meter
+from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
+from cleargs.splat.pace import random_scene
+
+MEMORY_REPETITIONS = 3
+
+
+@dataclass(frozen=True)
+class Side:
+    """One rasteriser on one case."""
+
+    times: Times
+    memory: int | None  # peak bytes of its tensors; None where they do not lie on a GPU
+    accuracy: Accuracy
+
+
+@dataclass(frozen=True)
+class DeviceRow:
+    """One case."""
+
+    case: Case
+    pairs: int
+    reached: int  # pairs before every pixel of their tile has stopped
+    ours: Side
+    gsplat: Side | None
+    ratio: Quartiles | None  # gsplat's forward and backward pass / ours, round by round
+
+
+@dataclass(frozen=True)
+class DeviceBenchmark:
+    """Everything that ``python -m benchmarks splat --device cuda`` reports."""
+
+    device: str
+    versions: dict[str, str]
+    gsplat_missing: str | None  # why gsplat was not run
+    rows: list[DeviceRow]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain dictionaries and lists; a Case becomes an object with named fields."""
+        plain: dict[str, Any] = asdict(self, dict_factory=named)
+        return plain
+
+
+class DeviceIteration(Iteration):
+    """A training iteration as the trainer runs it on a GPU, where nobody waits for the value of the loss."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device) -> None:
+        super().__init__(gaussians, camera, device)
+        self._meter = Meter(SSIM_LAMBDA)
+
+    def differentiate(self, image: Tensor) -> Tensor:
+        """See `Iteration`; the loss itself stays on the device."""
+        self._meter.add(len(self._meter), image, self._target, None, weight=1.0, gradient=self._slope)
+        return self._slope
+
+    def run_several(self, repetitions: int, clock: Clock) -> None:
+        """Several iterations, then the losses are read."""
+        super().run_several(repetitions, clock)
+        self._meter.take()
+
+
+def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[DeviceBenchmark]:
+    """Measure case by case: what is known so far after each, so that a time limit loses the rest alone."""
+    gsplat: Any = None
+    missing: str | None = "runs on a GPU only"
+    if device.type == "cuda":
+        try:
+            gsplat, missing = load_gsplat(), None
+        except ImportError as error:
+            missing = str(error)
+    rows: list[DeviceRow] = []
+    with reporter.task("measuring", len(plan.cases)) as task:
+        for case in plan.cases:
+            rows.append(measure(case, plan, device, gsplat))
+            task.update(done=len(rows), note=case.title)
+            yield DeviceBenchmark(device_name(device), versions(), missing, list(rows))
+
+
+def measure(case: Case, plan: DevicePlan, device: torch.device, gsplat: Any | None) -> DeviceRow:
+    """Times, memory and errors of one case; ``gsplat`` takes turns where it is given."""
+    gaussians, camera = random_scene(case.gaussians, case.width, case.height, sigma=case.sigma)
+    truth = oracle(gaussians, camera, choose_pixels(camera, case.gaussians, plan.seed), plan.seed)
+    make: dict[str, Callable[[], DeviceIteration | GsplatRasteriser]] = {
+        "ours": partial(DeviceIteration, gaussians, camera, device)
+    }
+    if gsplat is not None:
+        make["gsplat"] = partial(GsplatRasteriser, gsplat, gaussians, camera, device)
+    memory = {name: peak_memory(device, made) for name, made in make.items()}
+    rasterisers = {name: made() for name, made in make.items()}
+    clocks = take_turns(
+        {name: partial(made.run_several, plan.repetitions) for name, made in rasterisers.items()},
+        plan.rounds,
+        EventClock if device.type == "cuda" else Clock,
+    )
+    sides = {
+        name: Side(
+            clocks[name].quartiles(),
+            memory[name],
+            accuracy(truth, *made.image_and_gradients(truth.grad_image)),
+        )
+        for name, made in rasterisers.items()
+    }
+    passes = {name: clock.by_round("forward", "backward") for name, clock in clocks.items()}
+    pairs, reached = count_pairs(gaussians.to(device), camera, device)
+    return DeviceRow(
+        case=case,
+        pairs=pairs,
+        reached=reached,
+        ours=sides["ours"],
+        gsplat=sides.get("gsplat"),
+        ratio=ratio(passes["gsplat"], passes["ours"]) if gsplat is not None else None,
+    )
+
+
+def peak_memory(device: torch.device, make: Callable[[], DeviceIteration | GsplatRasteriser]) -> int | None:
+    """Bytes that tensors take at their peak, from nothing on; None where they do not lie on a GPU."""
+    if device.type != "cuda":
+        return None
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    make().run_several(MEMORY_REPETITIONS, Clock())
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device) - before
+
+
+class _OpenRasteriser(CudaRasteriser):
+    """The GPU rasteriser with a view of how much work a picture was."""
+
+    @property
+    def work(self) -> tuple[int, int]:
+        assert self._frame is not None
+        return len(self._frame.pair_ids), int(self._frame.deepest.sum())
+
+
+def count_pairs(gaussians: Gaussians, camera: Camera, device: torch.device) -> tuple[int, int]:
+    """(tile, splat) pairs of a view, and those before every pixel of their tile has stopped."""
+    rasteriser = _OpenRasteriser(device)
+    rasteriser.forward(
+        gaussians, camera, sh_count=1, background=(0.0, 0.0, 0.0), antialias=False, depth=False
+    )
+    return rasteriser.work
+
+
+def device_name(device: torch.device) -> str:
+    """The GPU's name and memory."""
+    if device.type != "cuda":
+        return f"Triton's interpreter on {platform.machine()}"
+    found = torch.cuda.get_device_properties(device)
+    return f"{found.name}, {found.total_memory / 1e9:.0f} GB"
+
+
+def versions() -> dict[str, str]:
+    """Of what the times depend on; CUDA as PyTorch was built."""
+    known = {"cleargs": cleargs.__version__, "python": platform.python_version()}
+    for name in ("torch", "triton", "gsplat"):
+        try:
+            known[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return known | {"CUDA": torch.version.cuda or "none"}

@@ -1,0 +1,75 @@
+"""The benchmark of a GPU as Markdown."""
+
+from __future__ import annotations
+
+from benchmarks.speed.device import DeviceBenchmark, DeviceRow
+from benchmarks.speed.iteration import PARTS, WHOLE
+from benchmarks.speed.markdown import GROUPS, NOT_RUN, accuracy_cells, megabytes, milliseconds, table
+
+
+def device_markdown(benchmark: DeviceBenchmark) -> str:
+    """Every table, with what its figures mean."""
+    versions = ", ".join(f"{name} {number}" for name, number in benchmark.versions.items())
+    parts = [
+        "# Speed against error of the splatting core on a GPU",
+        f"{benchmark.device}; {versions}.",
+        "Times are milliseconds of the device, median [quartiles]. Random splats of SH degree 3, evenly over "
+        "the view, black background.",
+        "## A training iteration",
+        "Forward pass, L1 + D-SSIM with its gradient, backward pass, Adam. Pairs are (tile, splat); reached "
+        "are those before every pixel of their tile has stopped. Memory is the peak of parameters, moments, "
+        "gradients and buffers.",
+        table(
+            ["splats", "pairs", "reached", *PARTS, WHOLE, "peak memory, MB"],
+            [_iteration(row) for row in benchmark.rows],
+        ),
+        "## Beside gsplat",
+    ]
+    if benchmark.gsplat_missing is not None:
+        parts.append(f"{NOT_RUN.capitalize()}: {benchmark.gsplat_missing}.")
+    else:
+        parts += [
+            "Forward and backward pass from the raw parameters, in turn in one process. gsplat's memory is "
+            "that of parameters, gradients and what autograd keeps, without moments.",
+            table(
+                ["splats", "ours", "gsplat forward", "gsplat backward", "gsplat / ours", "gsplat memory, MB"],
+                [_beside(row) for row in benchmark.rows],
+            ),
+        ]
+    parts += [
+        "## Errors against the float64 oracle",
+        "Largest / median, as in the benchmark of the CPU (docs/speed.md).",
+        table(
+            ["splats", "image", *GROUPS, "pixels", "not compared", "splats seen"],
+            [
+                [f"{row.case.title}, {name}", *accuracy_cells(side.accuracy)]
+                for row in benchmark.rows
+                for name, side in (("ours", row.ours), ("gsplat", row.gsplat))
+                if side is not None
+            ],
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _iteration(row: DeviceRow) -> list[str]:
+    return [
+        row.case.title,
+        f"{row.pairs:,}",
+        f"{row.reached:,}",
+        *(milliseconds(row.ours.times[part]) for part in (*PARTS, WHOLE)),
+        megabytes(row.ours.memory),
+    ]
+
+
+def _beside(row: DeviceRow) -> list[str]:
+    if row.gsplat is None or row.ratio is None:
+        return [row.case.title, *[NOT_RUN] * 5]
+    passes = sum(row.ours.times[part].median for part in ("forward", "backward"))
+    return [
+        row.case.title,
+        f"{passes:.2f}",
+        *(milliseconds(row.gsplat.times[part]) for part in ("forward", "backward")),
+        milliseconds(row.ratio),
+        megabytes(row.gsplat.memory),
+    ]

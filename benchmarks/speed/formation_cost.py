@@ -1,0 +1,221 @@
+"""What image formation costs a training step, and how near it is to the true exposure.
+
+Beside it the other way of putting a blur into the loss: the mean of N renders along the path, as in
+"BAD-Gaussians" (Zhao et al. 2024) and "Deblur-GS" (Chen & Liu 2024).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.speed.benchmark_results import Machine, describe_machine
+from benchmarks.speed.iteration import WHOLE, Iteration, use_threads
+from benchmarks.speed.random_scenes import surface_scene
+from benchmarks.speed.timing import Quartiles, ratio, take_turns
+from cleargs.formation.frame import FrameFormation, reach_of
+from cleargs.formation.motion import TWIST, FrameMotion
+from cleargs.formation.view import FormedView
+from cleargs.formation.warp import (
+    displacement_fields,
+    linear_curve,
+    srgb_curve,
+    through_curve,
+    times_slope,
+)
+from cleargs.progress import Reporter
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.losses import psnr
+
+PLAIN, FORMED = "sharp render", "formation"
+"""A step that takes the frame for sharp, and one through `cleargs.formation`."""
+
+CPU = torch.device("cpu")
+
+TRUTH_PER_PIXEL = 4
+"""Renders a pixel of blur whose mean is the truth."""
+
+
+@dataclass(frozen=True)
+class FormationPlan:
+    """What to measure."""
+
+    gaussians: int = 50_000
+    width: int = 640
+    height: int = 360
+    lengths: tuple[float, ...] = (3.0, 10.0, 30.0)
+    """Blurs, mean pixels."""
+    renders: tuple[int, ...] = (3, 5, 9, 17)
+    threads: int = 1
+    rounds: int = 7
+    repetitions: int = 3
+
+
+@dataclass(frozen=True)
+class FormationRow:
+    """One blur: every way of a step by its name, `PLAIN`, `FORMED` or ``N renders``."""
+
+    length: float
+    times: dict[str, Quartiles]
+    """ms a step."""
+    ratio: dict[str, Quartiles]
+    """Time over that of `PLAIN`, round by round."""
+    psnr: dict[str, float]
+    """Of the image against the true exposure, dB."""
+
+
+@dataclass(frozen=True)
+class FormationBenchmark:
+    """All rows, and where they were measured."""
+
+    machine: Machine
+    plan: FormationPlan
+    rows: list[FormationRow]
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain values."""
+        return asdict(self)
+
+
+def plan_of(*, quick: bool, threads: int) -> FormationPlan:
+    """The measurement to quote, or a small one of the same kind."""
+    if quick:
+        return FormationPlan(2_000, 96, 54, (3.0, 10.0), (3, 9), threads, rounds=2, repetitions=1)
+    return FormationPlan(threads=threads)
+
+
+def run(plan: FormationPlan, reporter: Reporter) -> FormationBenchmark:
+    """Measure every blur of the plan, its ways taking turns."""
+    load = os.getloadavg()[0]
+    use_threads(plan.threads)
+    gaussians, camera = surface_scene(plan.gaussians, plan.width, plan.height)
+    rows = []
+    with reporter.task("measuring", len(plan.lengths)) as task:
+        for length in plan.lengths:
+            rows.append(_row(length, plan, gaussians, camera))
+            task.update(done=len(rows), note=f"{length:g} px")
+    return FormationBenchmark(describe_machine(load), plan, rows)
+
+
+def motion_of(length: float, median_depth: float) -> FrameMotion:
+    """A step to the right and a turn, half of the blur each at the median depth; pixels."""
+    blur = np.zeros(TWIST)
+    blur[0] = blur[4] = 0.5 * length
+    return FrameMotion(blur=blur, median_depth=median_depth)
+
+
+def poses_along(camera: Camera, motion: FrameMotion, count: int) -> list[Camera]:
+    """The cameras at ``count`` instants of the exposure, the middles of equal parts of it."""
+    cameras = []
+    for t in (np.arange(count) + 0.5) / count - 0.5:
+        moved = np.eye(4)
+        moved[:3, :3] = cv2.Rodrigues(-t * motion.blur[3:] / camera.fx)[0]
+        moved[:3, 3] = -t * motion.blur[:3] * motion.median_depth / camera.fx
+        cameras.append(replace(camera, world_to_camera=moved @ camera.world_to_camera))
+    return cameras
+
+
+def _row(length: float, plan: FormationPlan, gaussians: Gaussians, camera: Camera) -> FormationRow:
+    ways = _ways(length, plan.renders, gaussians, camera)
+    truth = _truth(length, gaussians, camera)
+    clocks = take_turns(
+        {name: partial(way.run_several, plan.repetitions) for name, way in ways.items()}, plan.rounds
+    )
+    taken = {name: clock.by_round(WHOLE) for name, clock in clocks.items()}
+    return FormationRow(
+        length,
+        times={name: clock.quartiles()[WHOLE] for name, clock in clocks.items()},
+        ratio={name: ratio(values, taken[PLAIN]) for name, values in taken.items()},
+        psnr={name: psnr(way.image(), truth, None) for name, way in ways.items()},
+    )
+
+
+def _ways(
+    length: float, counts: Sequence[int], gaussians: Gaussians, camera: Camera
+) -> Mapping[str, Iteration]:
+    motion = motion_of(length, _median_depth(gaussians, camera))
+    return {
+        PLAIN: Iteration(gaussians, camera),
+        FORMED: _FormedStep(gaussians, camera, motion),
+        **{f"{n} renders": _MeanOfRenders(gaussians, camera, motion, n) for n in counts},
+    }
+
+
+def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
+    """The exposure [H, W, 3] as the mean of many renders along the true path, sRGB."""
+    motion = motion_of(length, _median_depth(gaussians, camera))
+    engine, total = Engine(), np.zeros((camera.height, camera.width, 3))
+    poses = poses_along(camera, motion, max(9, round(TRUTH_PER_PIXEL * length)))
+    for pose in poses:
+        total += through_curve(engine.forward(gaussians, pose).image, linear_curve(CPU))[0].numpy()
+    return through_curve(torch.from_numpy((total / len(poses)).astype(np.float32)), srgb_curve(CPU))[0]
+
+
+def _median_depth(gaussians: Gaussians, camera: Camera) -> float:
+    return float(np.median(_depth(Engine(), gaussians, camera)))
+
+
+def _depth(engine: Engine, gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
+    rendered = engine.forward(gaussians, camera, depth=True)
+    assert rendered.depth is not None
+    depth: NDArray[np.float32] = rendered.depth.numpy() / np.maximum(rendered.alpha.numpy(), 1e-3)
+    return depth
+
+
+class _FormedStep(Iteration):
+    """A step through `FormedView`, its motion known."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion) -> None:
+        super().__init__(gaussians, camera)
+        depth = torch.from_numpy(_depth(self.engine, gaussians, camera))
+        fields = displacement_fields(motion, camera, depth, torch.ones_like(depth))
+        frame = FrameFormation(0, motion, "blur", reach_px=reach_of(fields))
+        self._formed = FormedView(camera, 1.0, formation=frame)
+
+    def image(self) -> Tensor:
+        render = self.engine.forward(self.gaussians, self._formed.camera, depth=True)
+        return self._formed.forward(render)
+
+    def backward(self, slope: Tensor) -> Gaussians:
+        return self.engine.backward(self._formed.backward(slope))
+
+
+class _MeanOfRenders(Iteration):
+    """A step on the mean in linear light of renders along the path."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion, count: int) -> None:
+        super().__init__(gaussians, camera)
+        self._poses = poses_along(camera, motion, count)
+        self._engines = [Engine() for _ in self._poses]
+
+    def image(self) -> Tensor:
+        total = torch.zeros(self.camera.height, self.camera.width, 3)
+        self._slopes = []
+        for engine, pose in zip(self._engines, self._poses, strict=True):
+            light, slope = through_curve(engine.forward(self.gaussians, pose).image, linear_curve(CPU))
+            total += light
+            self._slopes.append(slope)
+        mean, self._slope_of_mean = through_curve(total / len(self._poses), srgb_curve(CPU))
+        return mean
+
+    def backward(self, slope: Tensor) -> Gaussians:
+        light = times_slope(slope, self._slope_of_mean) / len(self._poses)
+        found = [
+            engine.backward(times_slope(light, of_render))
+            for engine, of_render in zip(self._engines, self._slopes, strict=True)
+        ]
+        for name, total in found[0].tensors().items():
+            for other in found[1:]:
+                total += other.tensors()[name]
+        return found[0]

@@ -1,0 +1,106 @@
+"""One training iteration: forward pass, loss, backward pass, Adam."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from benchmarks.speed.probe import timed_kernels
+from benchmarks.speed.random_scenes import random_image
+from benchmarks.speed.timing import Clock
+from cleargs.splat.adam import Moments, step_gaussians
+from cleargs.splat.camera import Camera
+from cleargs.splat.engine import Engine
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
+from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.losses import photometric_loss
+
+PARTS = ("forward", "loss", "backward", "adam")
+WHOLE = "iteration"
+
+SSIM_LAMBDA = 0.2
+
+
+def use_threads(count: int) -> None:
+    """Kernels and torch run on ``count`` threads from now on."""
+    set_threads(count)
+    torch.set_num_threads(count)
+
+
+class Iteration:
+    """A scene, a target image and everything that training keeps from step to step.
+
+    Adam's rate is 0: it does all its work, and the scene stays the one whose error is measured.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device | str = "cpu") -> None:
+        self.gaussians = gaussians.to(device)
+        self.camera = camera
+        self.engine = Engine(device)
+        self._target = random_image(camera.width, camera.height).to(device)
+        self._slope = torch.empty_like(self._target)
+        self._moments = Moments.zeros(self.gaussians)
+        self._rates: dict[str, float | Tensor] = dict.fromkeys(self.gaussians.tensors(), 0.0)
+        self._step = 0
+
+    def run(self, clock: Clock) -> None:
+        """One iteration, a repetition on ``clock``: PARTS and WHOLE."""
+        self._step += 1
+        with clock.repetition(), clock.time(WHOLE):
+            with clock.time("forward"):
+                image = self.image()
+            with clock.time("loss"):
+                slope = self.differentiate(image)
+            with clock.time("backward"):
+                gradients = self.backward(slope)
+            with clock.time("adam"):
+                step_gaussians(self.gaussians, gradients, self._moments, self._rates, step=self._step)
+
+    def image(self) -> Tensor:
+        """What is compared with the target: [H, W, 3]."""
+        return self.engine.forward(self.gaussians, self.camera).image
+
+    def backward(self, slope: Tensor) -> Gaussians:
+        """Gradients of the parameters for that of the loss by `image` [H, W, 3]."""
+        return self.engine.backward(slope)
+
+    def differentiate(self, image: Tensor) -> Tensor:
+        """The gradient of the loss by the image [H, W, 3]."""
+        return photometric_loss(image, self._target, ssim_lambda=SSIM_LAMBDA, gradient=self._slope).grad_image
+
+    def run_several(self, repetitions: int, clock: Clock) -> None:
+        """Several iterations."""
+        for _ in range(repetitions):
+            self.run(clock)
+
+    def run_on(self, threads: int, repetitions: int, clock: Clock) -> None:
+        """Several iterations on so many threads, every kernel timed as well."""
+        use_threads(threads)
+        with timed_kernels(clock):
+            self.run_several(repetitions, clock)
+
+    def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
+        """Copies, on the CPU, of the rendered image [H, W, 3] and of the gradients for dL/d(image)
+        [H, W, 3]."""
+        image = self.image().clone()
+        gradients = self.backward(grad_image.to(image.device)).clone()
+        return image.cpu(), gradients.to("cpu")
+
+
+class _OpenRasteriser(CpuRasteriser):
+    """The CPU rasteriser with a view of what lies between its passes."""
+
+    @property
+    def frame(self) -> Frame:
+        assert self._frame is not None
+        return self._frame
+
+
+def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
+    """Packed splats, (tile, splat) pairs and each pixel's last contributor of a view (SH degree 3)."""
+    rasteriser = _OpenRasteriser()
+    rasteriser.forward(
+        gaussians, camera, sh_count=16, background=(0.0, 0.0, 0.0), antialias=False, depth=False
+    )
+    return rasteriser.frame

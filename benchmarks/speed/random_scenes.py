@@ -1,0 +1,58 @@
+"""Scenes and images to measure on, next to `cleargs.splat.pace.random_scene`."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cleargs.splat.camera import Camera
+from cleargs.splat.constants import SH_C0
+from cleargs.splat.gaussians import Gaussians
+
+
+def surface_scene(
+    count: int, width: int, height: int, *, near: float = 3.0, far: float = 6.0, seed: int = 0
+) -> tuple[Gaussians, Camera]:
+    """About ``count`` opaque splats of SH degree 3 on a textured slanted wall and on a box before it.
+
+    Unlike a random scene it has surfaces and a depth edge, as what is filmed has. The wall goes on behind the
+    box and beyond the view.
+    """
+    rng = np.random.default_rng(seed)
+    focal = 0.87 * width
+    beyond, box = 0.15, 0.4  # of the view's sides
+    spacing = np.sqrt(width * height * ((1 + 2 * beyond) ** 2 + box**2) / count)
+    parts = []
+    for low, high, front in ((-beyond, 1 + beyond, False), (0.5 - box / 2, 0.5 + box / 2, True)):
+        sides = [np.arange(low * side, high * side, spacing) for side in (width, height)]
+        grid = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
+        u, v = (grid + rng.uniform(0, spacing, grid.shape)).T
+        z = np.full(len(u), near) if front else far * (1 + 0.3 * (u / width - 0.5))
+        cells = np.stack([u // 12, v // 12], 1).astype(int) + 1000 * front
+        shade = ((cells[:, :1] * 37 + cells[:, 1:] * 101) % np.array([7, 11, 13])) / np.array(
+            [8, 12, 14]
+        ) + 0.1
+        parts.append(np.column_stack([(u - width / 2) / focal * z, (v - height / 2) / focal * z, z, shade]))
+    means, colours = np.split(np.concatenate(parts), [3], axis=1)
+    scales = np.repeat(0.6 * spacing * means[:, 2:] / focal, 3, axis=1)
+    sh = np.zeros((len(means), 16, 3))
+    sh[:, 0] = (colours - 0.5) / SH_C0
+    gaussians = Gaussians(
+        _float32(means),
+        _float32(np.log(scales)),
+        _float32(rng.normal(size=(len(means), 4))),
+        _float32(np.full(len(means), np.log(0.95 / 0.05))),
+        _float32(sh),
+    )
+    return gaussians, Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
+
+
+def random_image(width: int, height: int, seed: int = 1) -> Tensor:
+    """An image [H, W, 3] of independent values in [0, 1)."""
+    return _float32(np.random.default_rng(seed).uniform(size=(height, width, 3)))
+
+
+def _float32(array: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32))

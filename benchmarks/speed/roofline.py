@@ -1,0 +1,42 @@
+"""How near each kernel comes to what the machine allows (Williams et al. 2009)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from benchmarks.speed.peaks import Peaks
+from benchmarks.speed.timing import Quartiles
+from benchmarks.speed.work import Work
+
+
+@dataclass(frozen=True)
+class Roof:
+    """A kernel under its roof: its least time is that of its operations or bytes at the machine's peak."""
+
+    kernel: str
+    operations: float
+    bytes: float
+    milliseconds: float
+    bound: Literal["operations", "bytes"]
+    fraction: float  # least time / time; above 1 where caches serve bytes faster than memory would
+
+
+def roof(kernel: str, work: Work, milliseconds: float, peaks: Peaks) -> Roof:
+    """The roof of one kernel."""
+    by_operations = work.operations / (peaks.gflops * 1e6)
+    by_bytes = work.bytes / (peaks.gbytes * 1e6)
+    return Roof(
+        kernel=kernel,
+        operations=work.operations,
+        bytes=work.bytes,
+        milliseconds=milliseconds,
+        bound="operations" if by_operations >= by_bytes else "bytes",
+        fraction=max(by_operations, by_bytes) / milliseconds,
+    )
+
+
+def roofline(work: Mapping[str, Work], times: Mapping[str, Quartiles], peaks: Peaks) -> list[Roof]:
+    """Every kernel by the median of its times."""
+    return [roof(name, work[name], times[name].median, peaks) for name in work]

@@ -1,0 +1,30 @@
+"""A comparison made by hand, with names that try to break its page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from report_run import FinishedRun
+
+from benchmarks.comparison.findings import Compared, compare_scenes
+from benchmarks.comparison.scenes import Recipe, existing
+from cleargs.evaluate.config import EvalOptions
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.store import Store
+from cleargs.progress import SilentReporter
+
+HOSTILE = "<img src=x onerror='window.hacked = 1'>"
+HELD_OUT = (1, 2, 4, 5)
+
+
+def compare_runs(root: Path) -> tuple[Path, Compared]:
+    """Two runs of one capture, judged on the frames that they held out; the folder of the comparison."""
+    runs = [FinishedRun(root, name, HELD_OUT) for name in (HOSTILE, "second")]
+    (runs[1].folder / "consolidate/manifest.json").unlink()  # its scene is that of g0
+    (runs[1].folder / "rivr/manifest.json").unlink()
+    out = root / "out"
+    out.mkdir()
+    recipe = Recipe(runs[0].dag, "default", (), "cpu", 1, EvalOptions(lpips=(), scorers=()))
+    with DigestMemo(root / "digests.sqlite") as memo:
+        made = [existing(run.folder, run.dag, None) for run in runs]
+        return out, compare_scenes(out, made, recipe, Store(root, memo), SilentReporter())

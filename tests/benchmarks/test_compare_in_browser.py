@@ -1,0 +1,67 @@
+"""The page of a comparison in a real browser, wide and on a phone, light and dark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import CHROMIUM, NO_CHROMIUM, Opened
+from compared_runs import HOSTILE, compare_runs
+
+from benchmarks.comparison.page import write_comparison
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+
+SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, compared = compare_runs(tmp_path_factory.mktemp("compare"))
+    return write_comparison(out, compared, [HOSTILE], [HOSTILE], [HOSTILE])
+
+
+@pytest.fixture(params=SIZES)
+def size(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def opened(made: Path, browser: Any, size: str) -> Iterator[Opened]:
+    scheme = "light" if size == "wide" else "dark"
+    page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
+    yield Opened(page, made.as_uri())
+    page.close()
+
+
+def test_a_page_fits_its_screen_and_asks_for_nothing_else(opened: Opened, size: str) -> None:
+    page = opened.page
+    page.evaluate("for (const image of document.images) image.loading = 'eager'")
+    page.wait_for_function("[...document.images].every((image) => !image.src || image.naturalWidth > 50)")
+    assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size]["width"]
+    assert opened.complaints == [] and opened.strangers() == []
+    assert page.evaluate("window.hacked") is None
+
+
+def test_a_pose_opens_under_a_slider_by_keyboard(browser: Any, made: Path) -> None:
+    page = browser.new_page(viewport=SIZES["wide"])
+    opened = Opened(page, made.as_uri())
+    page.locator(".tile").nth(1).press("Enter")
+    assert page.locator("#inspector").is_visible()
+    assert page.locator("#tag-left").inner_text() == "Reference"
+    assert page.locator("#tag-right").inner_text() == HOSTILE
+    first = page.locator("#inspector-title").inner_text()
+    page.locator("#slider").focus()
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("document.querySelector('.overlay').style.getPropertyValue('--cut')") == "49%"
+    page.locator(".close").focus()
+    page.keyboard.press("ArrowRight")
+    title = page.locator("#inspector-title").inner_text()
+    assert title != first
+    assert page.locator("#tag-right").inner_text() == HOSTILE, "the variant stays from pose to pose"
+    assert page.locator("#right").get_attribute("alt") == f"{title}: {HOSTILE}"
+    page.keyboard.press("Escape")
+    assert not page.locator("#inspector").is_visible() and opened.complaints == []
+    page.close()

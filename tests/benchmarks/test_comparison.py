@@ -1,0 +1,298 @@
+"""`compare` on a tiny capture: shared stages are made once, and a second call makes nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.commands import invoke
+from benchmarks.comparison import findings
+from benchmarks.comparison.cells import Cell
+from benchmarks.comparison.choices import judge_choices
+from benchmarks.comparison.equal_work import Work, decide_work
+from benchmarks.comparison.scenes import Made, Recipe, evaluated, existing, view_sets
+from cleargs.capture.tables import load_frames
+from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.errors import InputError
+from cleargs.evaluate import evaluate, metric_set
+from cleargs.evaluate.config import EvalOptions
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.session import opened_store
+from cleargs.pipeline.store import STORE_FOLDER
+from cleargs.progress import SilentReporter
+from cleargs.splat.effort import budget_from_pixels
+from cleargs.splat.initialise import sh_degree_from_views
+from cleargs.synth.synthetic_capture import make_capture
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = {
+    "ingest.max_features": "512",
+    "rva.tau_R": "0.95",  # so that binary and graded weights differ from one another and from 1
+    "g0.steps": "12",
+    "g0.min_points": "400",
+    "g0.budget": "500",
+    "rivr.distil.steps": "6",
+    "consolidate.distil.steps": "6",
+}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "room"
+    make_capture(folder, "mixed", frames=6, width=160, height=90, seed=3, reporter=SilentReporter())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("comparison") / "table"
+    assert compare(capture, "-o", str(folder), "--variants", "all-view,drop-blurry,rva,full") == 0
+    return folder
+
+
+TOTAL = 12 + 6 + 6
+"""Steps of the whole method with these settings; the recipe `smoke` has one round."""
+
+
+def compare(capture: Path, *more: str) -> int:
+    settings = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
+    return invoke(
+        ["compare", str(capture), "--workflow", "smoke", "--quiet", "--lpips", "alex", *settings, *more]
+    )
+
+
+def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
+    found = json.loads((out / "comparison.json").read_text())
+    assert found["failures"] == []
+    cells = {(cell["variant"], cell["views"]): cell for cell in found["cells"]}
+    assert cells.keys() == {
+        (name, views)
+        for name in ("all-view", "drop-blurry", "rva", "full")
+        for views in ("observed", "novel")
+    }
+    for cell in cells.values():
+        assert cell["column"] == "mixed"
+        # Two dozen steps make no good scene, but one that shows the room: its mean colour alone gives 12 dB.
+        assert 12.0 < cell["means"]["psnr"] < 40.0
+        assert (out / cell["evaluation"] / "eval.json").is_file()
+        assert (cell["steps"], cell["sh_degree"]) == (TOTAL, 1)
+        assert cell["cpu_seconds"] > 0.0 and 0.05 < cell["peak_memory_gb"] < 10.0
+    assert len({cell["gaussians"] for cell in cells.values()}) == 1
+    assert cells["rva", "observed"]["evaluation"] != cells["all-view", "observed"]["evaluation"]
+    for name in ("comparison.md", "comparison.png", "sheet.png"):
+        assert (out / name).stat().st_size > 0
+
+
+def test_the_page_shows_every_variant_at_every_pose(out: Path) -> None:
+    text = (out / "report/index.html").read_text()
+    poses = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])["frames"]
+    assert [len(pose["layers"]) for pose in poses] == [
+        6,
+        6,
+        6,
+        5,
+        5,
+        5,
+    ]  # filmed at the poses of the path only
+    assert "All were trained for as many steps" in text
+    for page in (text, (out / "comparison.md").read_text()):
+        assert "Training poses: the scenes were trained on the frames filmed from here" in page
+
+
+def test_variants_share_what_they_agree_on(out: Path) -> None:
+    stored = {stage: list((out / ".store" / stage).iterdir()) for stage in ("ingest", "rva", "g0")}
+    assert len(stored["ingest"]) == 1
+    assert len(stored["rva"]) == 3  # all views, binary weights, graded weights
+    assert len(stored["g0"]) == 4  # that of `full` has fewer steps than that of `rva`
+    cells = json.loads((out / "comparison.json").read_text())["cells"]
+    shared = {cell["variant"]: cell["shared_seconds"] for cell in cells}
+    assert shared["all-view"] == 0.0
+    assert shared["full"] > shared["rva"] > 0.0
+
+
+def test_roles_and_choices_stand_beside_the_cells(out: Path) -> None:
+    found = json.loads((out / "comparison.json").read_text())
+    roles = {scene["variant"]: scene["frames"] for scene in found["roles"]}
+    assert all(sum(frames.values()) == 6 for frames in roles.values())
+    assert roles["all-view"]["strong"] == 6
+    assert roles["drop-blurry"]["suppressed"] > 0
+    assert roles["rva"] == roles["full"]
+    (scene,) = found["choices"]
+    assert scene["variant"] == "full" and scene["rows"]
+    for row in scene["rows"]:
+        assert {"render", "restored", "observed"} <= row["psnr"].keys() and row["chosen"] in row["psnr"]
+    text = (out / "comparison.md").read_text()
+    assert "| all-view G0 | 24 |" in text and "best by PSNR" in text
+
+
+def test_a_frame_without_truth_is_judged_by_nobody(capture: Path, out: Path, tmp_path: Path) -> None:
+    shutil.copytree(capture, tmp_path / "room")
+    run = out / "room-0" / "full"
+    judged = {row.frame_id for row in judge_choices(run, tmp_path / "room", None)}
+    lost = min(judged)
+    stem = Path({frame.frame_id: frame.name for frame in load_frames(run / "ingest")}[lost]).stem
+    (tmp_path / "room" / "truth" / "observed" / "images" / f"{stem}.png").unlink()
+    assert {row.frame_id for row in judge_choices(run, tmp_path / "room", None)} == judged - {lost}
+
+
+def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
+    config = load_config(installed(), "default", ("g0.budget=7",), 0)
+    frames = 6 * 160 * 90
+    open_ = decide_work(load_config(installed(), "default", (), 0), out / "room-0" / "rva" / "ingest", None)
+    assert open_ == Work(3800, 6, budget_from_pixels(frames, 10**6), sh_degree_from_views(6))
+    assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == Work(50, 6, 7, 0)
+
+
+def test_steps_sets_the_total_of_all(capture: Path, out: Path) -> None:
+    assert compare(capture, "-o", str(out), "--variants", "all-view,full", "--steps", "20") == 0
+    cells = json.loads((out / "comparison.json").read_text())["cells"]
+    assert {cell["steps"] for cell in cells} == {20}
+    assert compare(capture, "-o", str(out), "--variants", "all-view,drop-blurry,rva,full") == 0
+
+
+def test_the_same_command_again_makes_nothing(capture: Path, out: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (out / ".store").rglob("manifest.json")}
+    judged = {path: path.stat().st_mtime_ns for path in (out / "evaluations").rglob("eval.json")}
+    table = (out / "comparison.json").read_bytes()
+    assert compare(capture, "-o", str(out), "--variants", "all-view,drop-blurry,rva,full") == 0
+    assert before == {path: path.stat().st_mtime_ns for path in (out / ".store").rglob("manifest.json")}
+    assert judged == {path: path.stat().st_mtime_ns for path in (out / "evaluations").rglob("eval.json")}
+    assert (out / "comparison.json").read_bytes() == table
+
+
+def test_finished_runs_stand_side_by_side(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
+    more = ["-o", str(tmp_path / "runs"), "--lpips", "alex", "--quiet", "--json"]
+    assert invoke(["compare", *runs, *more]) == 0
+    cells = json.loads(capsys.readouterr().out)["cells"]
+    old = json.loads((out / "comparison.json").read_text())["cells"]
+    means = {(cell["variant"], cell["views"]): cell["means"] for cell in old}
+    for cell in cells:
+        assert cell["means"] == means[cell["variant"], cell["views"]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        (["--variants", "all-veiw"], "did you mean all-view"),
+        (["--seeds", "one"], "whole numbers"),
+        (["--lpips", "squeeze"], "choose among"),
+    ],
+)
+def test_bad_arguments(
+    arguments: list[str], cause: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(capture, "-o", str(tmp_path / "out"), *arguments) == 2
+    assert cause in capsys.readouterr().err
+
+
+def test_a_capture_without_truth_or_held_out_frames_is_refused(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    (bare / "images").symlink_to(capture / "images")
+    (bare / "transforms.json").symlink_to(capture / "transforms.json")
+    assert compare(bare, "-o", str(tmp_path / "out"), "--variants", "all-view") == 2
+    assert "sharpest:8" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "bare-0").exists(), "nothing was made for it"
+
+
+def test_two_captures_of_one_name_are_refused(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other" / "room").mkdir(parents=True)
+    code = invoke(["compare", str(capture), str(tmp_path / "other" / "room"), "-o", str(tmp_path / "out")])
+    assert code == 2
+    assert "two captures are called room" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--steps", "100"], ["--set", "g0.steps=9"], ["--quality", "draft"]])
+def test_options_without_effect_on_finished_runs_are_refused(
+    option: list[str], out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", *option]) == 2
+    assert f"{option[0]}: finished runs are compared as they are" in capsys.readouterr().err
+
+
+def test_two_runs_of_one_name_are_refused(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They would be one row of the tables, and one of them lost."""
+    other = tmp_path / "other"
+    shutil.copytree(out / "room-0", other / "room-0", symlinks=True)
+    runs = [str(out / "room-0" / "rva"), str(other / "room-0" / "rva")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "two runs are called rva" in capsys.readouterr().err
+
+
+def test_runs_of_two_captures_of_one_name_are_refused(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their scenes would be paired as if they showed the same."""
+    other = tmp_path / "house2"
+    shutil.copytree(out / "room-0", other, symlinks=True)
+    (other / "rva").rename(other / "rva2")
+    noted = other / "rva2" / RUN_FILE
+    twin = tmp_path / "room"
+    twin.mkdir()
+    text = noted.read_text()
+    place = re.search(r'"([^"]*/room)"', text)
+    assert place is not None
+    noted.write_text(text.replace(place[1], str(twin)))
+    runs = [str(out / "room-0" / "all-view"), str(other / "rva2")]
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", "--stale"]) == 2
+    assert "two captures of these runs are called room" in capsys.readouterr().err
+
+
+def test_metrics_whose_weights_came_later_are_measured(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What an earlier call could not measure is not taken for what there is."""
+    run = out / "room-0" / "all-view"
+    dag, options = installed(), EvalOptions(lpips=(), scorers=("clarity-net",))
+
+    def kept_weights() -> dict[str, str]:
+        recipe = Recipe(dag, "smoke", (), "cpu", 1, options)
+        with opened_store(out / STORE_FOLDER) as store:
+            made = existing(run, dag, None)
+            return evaluated(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[0].weights
+
+    whole = metric_set.load_metrics(options)
+    bare = replace(whole, scorers={}, weights={}, unavailable={"clarity-net": "not installed"})
+    monkeypatch.setattr(metric_set, "load_metrics", lambda options: bare)
+    monkeypatch.setattr(evaluate, "load_metrics", lambda options: bare)
+    assert kept_weights() == {}
+    monkeypatch.undo()
+    assert kept_weights() == whole.weights
+
+
+def test_a_scene_that_cannot_be_judged_ends_none_of_the_others(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    judged = findings.judge
+
+    def judge(folder: Path, made: Made, *rest: Any) -> list[Cell]:
+        if made.variant.name == "all-view":
+            raise InputError("two images are called 0001", hint="give each a name of its own")
+        return judged(folder, made, *rest)
+
+    monkeypatch.setattr(findings, "judge", judge)
+    runs = [str(out / "room-0" / name) for name in ("all-view", "rva", "full")]
+    code = invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--lpips", "none", "--quiet", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert {cell["variant"] for cell in document["cells"]} == {"rva", "full"}
+    assert "two images are called 0001" in document["failures"][0]
+    assert code == DONE_IN_PART

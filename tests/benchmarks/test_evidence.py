@@ -1,0 +1,307 @@
+"""`python -m benchmarks evidence`: the frozen list, the page, and a tiny page made twice."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.commands import invoke
+from benchmarks.comparison import results_page as results
+from benchmarks.comparison.cells import Cell
+from benchmarks.comparison.evidence import Workshop, minutes, read_evidence
+from benchmarks.comparison.kept_sections import KeptSection
+from benchmarks.comparison.origin import version_of_source
+from benchmarks.comparison.results_page import Origin, losses, results_page
+from benchmarks.comparison.scenes import Recipe, Sample
+from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
+from cleargs.errors import ConfigError
+from cleargs.evaluate.config import EvalOptions
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.session import opened_store
+from cleargs.progress import SilentReporter
+
+TINY = """
+[test]
+rooms = [100, 101]
+protocols = ["mixed", "flood"]
+worlds = []
+videos = ["kitchen"]
+
+[tuning]
+rooms_below = 100
+
+[[quick]]
+name = "rooms"
+title = "Motion blur"
+kind = "rooms"
+protocols = ["mixed", "flood"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+factors = [1, 2]
+variants = ["all-view", "full"]
+settings = ["g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "rivr.rounds=1"]
+
+[[quick]]
+name = "aligned"
+title = "Motion blur, colours aligned"
+kind = "rooms"
+protocols = ["mixed"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view", "full"]
+settings = ["g0.min_points=400", "g0.budget=500", "ingest.max_features=512", "rivr.rounds=1"]
+align_colour = true
+
+[[quick]]
+name = "videos"
+title = "Real videos"
+kind = "video"
+captures = ["kitchen"]
+seeds = [0]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view", "full"]
+
+[[full]]
+name = "rooms"
+title = "Rooms"
+kind = "rooms"
+protocols = ["mixed"]
+seeds = [100]
+frames = 6
+size = [96, 54]
+steps = 24
+variants = ["all-view"]
+"""
+ORIGIN = Origin("python -m benchmarks evidence -o OUT", "default", False, read_evidence().quick)
+
+
+def test_the_test_set_is_no_tuning_set() -> None:
+    evidence = read_evidence()
+    assert min(evidence.test.rooms) >= evidence.tuning.rooms_below == 100
+    for section in (*evidence.quick, *evidence.full):
+        find_variants(section.variants)
+        if section.kind != "video":
+            assert set(section.seeds) <= set(evidence.test.rooms)
+    for sections in (evidence.quick, evidence.full):
+        assert len({section.name for section in sections}) == len(sections)
+        assert {"all-view", "rva", "formation", "full"} <= set(sections[0].variants)
+        assert len(sections[0].seeds) >= 5  # what the page claims first
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "cause"),
+    [
+        ("rooms = [100, 101]", "rooms = [99, 100]", "tuning set"),
+        ("seeds = [100]", "seeds = [7]", "7 is not in the test set"),
+        ('captures = ["kitchen"]', 'captures = ["garden"]', "garden is not in the test set"),
+        ("frames = 6", "pictures = 6", "quick.0"),
+    ],
+)
+def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: str, tmp_path: Path) -> None:
+    path = tmp_path / "list.toml"
+    path.write_text(TINY.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=cause):
+        read_evidence(path)
+
+
+def test_what_a_section_before_it_has_made_takes_no_time(tmp_path: Path) -> None:
+    blur = read_evidence().quick[0]
+    with opened_store(tmp_path / "store") as store:
+        recipe = Recipe(installed(), "default", (), "cpu", 2, EvalOptions())
+        shop = Workshop(tmp_path, None, recipe, store, SilentReporter())
+        alone, again, more = minutes(
+            [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], shop
+        )
+        assert again == 0.0 and 0.0 < more < alone / len(blur.variants)
+        (twice,) = minutes([blur.model_copy(update={"seeds": (*blur.seeds, 105, 106, 107, 108, 109)})], shop)
+        assert twice == pytest.approx(2 * alone)
+
+
+def test_prose_states_no_number() -> None:
+    template = Path(results.__file__).with_name("results.md").read_text(encoding="utf-8")
+    # Digits within names (G0, 3DGS, gs2e-medium) are no numbers.
+    assert re.findall(r"(?<![\w.-])\d[\d.,]*(?![\w-])", template) == []
+
+
+def test_questions_ask_for_variants() -> None:
+    names = {variant.name for variant in VARIANTS}
+    assert {name for _, *asked in QUESTIONS for name in asked} <= names
+
+
+def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
+    return Cell(
+        column="mixed",
+        sample=sample,
+        variant=variant,
+        views="observed",
+        means={"psnr": psnr, "lpips_vgg": lpips},
+        images=4,
+        seconds=2.0,
+        shared_seconds=1.0,
+        gaussians=10,
+        steps=100,
+        sh_degree=1,
+        cpu_seconds=4.0,
+        peak_memory_gb=0.5,
+        evaluation=f"evaluations/{variant}-{sample}-{psnr}",
+    )
+
+
+def found(*gains: float, version: str = "0.1.0, abc") -> KeptSection:
+    """The whole method gains so much PSNR in each sample, and always 0.1 of LPIPS."""
+    cells = []
+    for number, gain in enumerate(gains):
+        cells.append(cell("all-view", f"s{number}", 20.0 + number, 0.4))
+        cells.append(cell("full", f"s{number}", 20.0 + number + gain, 0.3 + 0.001 * number))
+    (section, *_) = read_evidence().quick
+    return KeptSection(
+        section=section,
+        version=version,
+        machine="cpu, 2 threads",
+        missing=("phone: no protocol is called 'phone'",),
+        cells=tuple(cells),
+        roles=(),
+        choices=(),
+    )
+
+
+def test_losses_come_first_and_say_how_sure_they_are() -> None:
+    ((section, sure),) = losses([found(-1.0, -1.1, -0.9)])
+    assert section == "Motion blur"
+    assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
+    ((_, chance),) = losses([found(-1.0, 0.5, -0.2)])
+    assert chance.verdict == "none"
+    ((_, single),) = losses([found(-1.0)])
+    assert single.verdict == "one sample"
+    assert losses([found(1.0, 1.1, 0.9)]) == []
+    ordered = [loss.verdict for _, loss in losses([found(-1.0, 0.5), found(-1.5), found(-1.0, -1.1, -0.9)])]
+    assert ordered == ["sure", "one sample", "none"]
+
+
+def test_scenes_that_two_sections_share_count_once() -> None:
+    whole, part, other = found(-1.0, -1.1, -0.9), found(-1.0), found(-2.0)
+    assert len(losses([whole, whole, part])) == 1
+    assert len(losses([whole, other])) == 2
+    page = results_page([whole, part], ORIGIN)
+    assert "1 of 2 comparisons, 1 of them sure." in page
+    assert "| the whole method, against all-view training | 0 / 1 / 0 | not made |" in page
+
+
+def test_scenes_judged_again_with_their_colours_aligned_do_not_count() -> None:
+    plain, again = found(-1.0, -1.1, -0.9), found(-2.0, -2.1, -1.9)
+    again = again.model_copy(update={"section": plain.section.model_copy(update={"align_colour": True})})
+    assert losses([plain, again]) == losses([plain])
+
+
+def test_the_page_of_a_few_cells() -> None:
+    page = results_page([found(-1.0, -1.1, -0.9)], ORIGIN)
+    assert "1 of 2 comparisons, 1 of them sure." in page
+    row = "| Motion blur | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
+    assert row in page
+    assert page.index(row) < page.index("## In short") < page.index("## Motion blur")
+    assert (
+        "| the whole method, against all-view training | 0 / 1 / 0 | not made | not made | 1 / 0 / 0 |"
+        in page
+    )
+    assert "* phone: no protocol is called 'phone'" in page
+    assert "`python -m benchmarks evidence -o OUT --section blur`, version 0.1.0, abc" in page
+    assert "LPIPS (AlexNet) could not be measured" in page
+    assert "| mixed (n = 3) |" in page
+    assert "@" not in page, "every place of the template is filled"
+
+
+def test_a_section_that_could_not_be_made_stands_on_the_page() -> None:
+    nothing = found().model_copy(update={"missing": ("kitchen: it is not there",)})
+    page = results_page([nothing], ORIGIN)
+    assert "* kitchen: it is not there" in page and "Nothing of this section could be made" in page
+
+
+def test_the_page_says_which_sections_and_versions_it_is_made_of() -> None:
+    other = read_evidence().quick[1]
+    pair = [found(1.0), found(2.0, version="0.2.0, def").model_copy(update={"section": other})]
+    page = results_page(pair, ORIGIN)
+    absent = [section.title for section in ORIGIN.sections if section not in (pair[0].section, other)]
+    assert f"**Not made yet: {', '.join(absent)}.**" in page
+    command = "`python -m benchmarks evidence -o OUT --section blur --section mixed`"
+    command += ", version 0.1.0, abc and 0.2.0, def"
+    assert page.count(command) == 2, "under the losses and under the answers"
+    assert "`python -m benchmarks evidence -o OUT --section mixed`, version 0.2.0, def" in page
+    alone = replace(ORIGIN, sections=(pair[0].section, other))
+    whole = results_page(pair, alone)
+    assert "Not made yet" not in whole and "`python -m benchmarks evidence -o OUT`, version 0.1.0" in whole
+
+
+def test_the_version_names_the_source() -> None:
+    assert re.search(r"source [0-9a-f]{12}$", version_of_source())
+    assert version_of_source() == version_of_source()
+
+
+def make(out: Path, spec: Path, *more: str) -> int:
+    return invoke(["evidence", "-o", str(out), "--quick", "--list", str(spec), "--quiet", *more])
+
+
+@pytest.mark.slow
+def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, out = tmp_path / "list.toml", tmp_path / "out"
+    spec.write_text(TINY)
+    assert make(out, spec, "--dry-run") == 0
+    assert "min  on two quiet cores" in capsys.readouterr().out and not (out / "captures").exists()
+    # A maker that was killed leaves a capture under another name, which is not taken for done.
+    (out / "captures" / ".1-mixed-6x96x54-100" / "images").mkdir(parents=True)
+    assert make(out, spec) == 3, "done in part: a protocol and a video are missing"
+    page = (out / "results.md").read_bytes()
+    text = page.decode()
+    assert "* flood: no protocol is called 'flood'" in text
+    assert "* kitchen: it is a real capture, and --captures was not given" in text
+    assert "| mixed 1x | mixed 2x |" in text
+    assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
+    assert text.count("each image judged after the affine on sRGB that fits it to the truth best.") == 1
+    plain, aligned = (
+        KeptSection.model_validate_json((out / f"results/{name}.json").read_bytes())
+        for name in ("rooms", "aligned")
+    )
+    scenes = {(one.sample, one.variant, one.views): one for one in plain.cells if one.column == "mixed 1x"}
+    for one in aligned.cells:
+        same = scenes[one.sample, one.variant, one.views]
+        assert one.steps == same.steps and one.gaussians == same.gaussians
+        assert (one.means["psnr"] or 0.0) > (same.means["psnr"] or 0.0)
+    for name in ("results/rooms.png", "results/rooms-sheet.jpg", "results/rooms.json"):
+        assert (out / name).stat().st_size > 0
+    stored = {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
+    assert make(out, spec) == 3
+    assert stored == {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
+    assert (out / "results.md").read_bytes() == page
+
+    # A call for one section takes the others from beside the page; none that another list, or nobody, made.
+    (out / "results.md").unlink()
+    assert make(out, spec, "--section", "videos") == 3
+    assert (out / "results.md").read_bytes() == page
+    spec.write_text(TINY.replace("steps = 24", "steps = 25", 1))
+    capsys.readouterr()
+    assert make(out, spec, "--section", "videos") == 3
+    assert "rooms.json is of another list: the page leaves 'Motion blur' out" in capsys.readouterr().err
+    assert "**Not made yet: Motion blur.**" in (out / "results.md").read_text()
+
+
+def test_a_list_or_note_that_is_a_pipe_or_too_deep_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "deep.toml").write_text("[" * 200_000)
+    for name in ("pipe", "deep"):
+        with pytest.raises(ConfigError):
+            read_evidence(tmp_path / f"{name}.toml")
+        note = tmp_path / name / "truth" / "capture.json"
+        note.parent.mkdir(parents=True)
+        (tmp_path / f"{name}.toml").rename(note)
+        assert Sample(tmp_path / name, 0, None).column == name
