@@ -1,6 +1,6 @@
 """The restoration expert ClearGS ships: its network, its training and its export.
 
-    python -m cleargs.models.training.train_restorer --photos DIR --renders DIR --out restorer.onnx
+    python -m tools.train_models.train_restorer --photos DIR --renders DIR --out restorer.onnx
 
 trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
 renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A
@@ -29,9 +29,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cleargs.errors import InputError
-from cleargs.models.training.degrade import Image, degrade, handheld_degradation, shallow_focus
-from cleargs.models.training.graphics import graphic
-from cleargs.models.training.muon import Muon
+from tools.train_models.degrade import Image, degrade, handheld_degradation, shallow_focus
+from tools.train_models.graphics import graphic
+from tools.train_models.muon import Muon
 
 HELD_OUT = ("budgie", "elementary", "mate")
 """Photo sources that training never sees."""

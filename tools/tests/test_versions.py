@@ -11,7 +11,7 @@ import pytest
 
 from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.stage import Stage
-from cleargs.pipeline.versions import (
+from tools.versions import (
     Sources,
     complaints,
     current_lock,
@@ -27,7 +27,7 @@ def test_no_stage_changed_without_its_version() -> None:
     locked, now = read_lock(lock_path(sources)), current_lock(installed(), sources)
     assert complaints(locked, now) == [], "raise VERSION, or say why results stay the same; see the module"
     digests = [{name: entry["digest"] for name, entry in lock.items()} for lock in (locked, now)]
-    assert digests[0] == digests[1], "refresh the lock: python -m cleargs.pipeline.versions --update"
+    assert digests[0] == digests[1], "refresh the lock: python -m tools.versions --update"
 
 
 def test_real_stages_reach_their_rooms() -> None:

@@ -1,4 +1,4 @@
-"""Fetches the 3D viewer that reports carry: ``python -m cleargs.report.vendor`` in a checkout, with npm.
+"""Fetches the 3D viewer that reports carry: ``python -m tools.vendor_viewer`` in a checkout, with npm.
 
 SuperSplat Viewer (PlayCanvas, MIT) is one JavaScript module. It is kept compressed, as the reports hold it,
 with its licence and its version beside it. What npm hands out must have the digest below.
@@ -18,7 +18,7 @@ PACKAGE, VERSION = "@playcanvas/supersplat-viewer", "1.36.2"
 SHA512 = "L7w0BlagAonRHQg5qhaDyBB8zrRtiU9QgglNU3kUgsqHpokCAtuf9j4P0kxsUaQn61FZ1qJGkRKsOCbrLCDR0w=="
 """Of the package, base64, as npm states it."""
 
-VIEWER = Path(__file__).parent / "static" / "viewer"
+VIEWER = Path(__file__).parents[1] / "cleargs" / "report" / "static" / "viewer"
 _SOURCE_MAP = b"\n//# sourceMappingURL="
 
 

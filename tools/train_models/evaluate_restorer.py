@@ -1,6 +1,6 @@
 """The table of the restoration expert on photo sources that its training never saw.
 
-    python -m cleargs.models.training.evaluate_restorer --photos DIR [--expert FILE.onnx] [--crop 256]
+    python -m tools.train_models.evaluate_restorer --photos DIR [--expert FILE.onnx] [--crop 256]
 
 prints markdown: mean PSNR over the held-out photographs for each band of motion lengths, beside the blurred
 image itself, unsharp masking and Wiener deconvolution. Noise is at most 1/255,
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.expert import EMBEDDED, load_expert
-from cleargs.models.training.degrade import (
+from tools.train_models.degrade import (
     IDENTITY,
     Degradation,
     Image,
@@ -35,7 +35,7 @@ from cleargs.models.training.degrade import (
     degrade,
     motion_kernel,
 )
-from cleargs.models.training.train_restorer import list_photos, read_photo, source_of
+from tools.train_models.train_restorer import list_photos, read_photo, source_of
 
 BANDS = ((7, 11), (12, 16), (17, 21))
 """Shortest and longest motion in pixels of each band."""

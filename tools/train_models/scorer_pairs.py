@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.lpips import LpipsNetwork
-from cleargs.models.training.artefacts import KINDS, patches
-from cleargs.models.training.degrade import Image, convolve, disc_kernel
-from cleargs.models.training.graphics import graphic
+from tools.train_models.artefacts import KINDS, patches
+from tools.train_models.degrade import Image, convolve, disc_kernel
+from tools.train_models.graphics import graphic
 
 PATCH = 128  # side of a training patch, and of the tiles that the scorer averages over
 _MARGIN = 24  # degraded with the patch and cut away, so that no filter shows its border

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.models.training.degrade import (
+from tools.train_models.degrade import (
     Degradation,
     Image,
     Kernel,

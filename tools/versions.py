@@ -3,9 +3,9 @@
 The source of a stage is its module and every ClearGS module that it imports, also inside functions,
 transitively, as syntax trees without docstrings, comments and layout. ::
 
-    python -m cleargs.pipeline.versions                                what changed
-    python -m cleargs.pipeline.versions --update                       after VERSION was raised
-    python -m cleargs.pipeline.versions --update --no-change REASON    the results stay the same bytes
+    python -m tools.versions                                what changed
+    python -m tools.versions --update                       after VERSION was raised
+    python -m tools.versions --update --no-change REASON    the results stay the same bytes
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def lock_path(sources: Sources) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare with the lock file, or refresh it; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m cleargs.pipeline.versions", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.versions", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--update", action="store_true", help="write the lock file anew")
     parser.add_argument("--no-change", metavar="REASON", help="why the results stay the same bytes")

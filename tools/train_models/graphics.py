@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.models.training.degrade import Image
+from tools.train_models.degrade import Image
 
 _OVERSAMPLING = 2  # drawn larger and reduced, so that edges are as soft as a camera's
 

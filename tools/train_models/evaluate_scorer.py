@@ -1,6 +1,6 @@
 """How well the embedded scorers agree with LPIPS on photo sources that they have not seen.
 
-    python -m cleargs.models.training.evaluate_scorer --photos DIR
+    python -m tools.train_models.evaluate_scorer --photos DIR
 
 Whole photographs, reduced by a third, each with every artefact once. LPIPS is needed (`cleargs models install
 lpips`).
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from cleargs.models.lpips import Lpips
 from cleargs.models.scorer import CLARITY, NATURALNESS, load_scorer
-from cleargs.models.training import artefacts
-from cleargs.models.training.degrade import Degradation, Image, degrade, motion_kernel
-from cleargs.models.training.train_restorer import list_photos, read_photo
-from cleargs.models.training.train_scorer import spearman
+from tools.train_models import artefacts
+from tools.train_models.degrade import Degradation, Image, degrade, motion_kernel
+from tools.train_models.train_restorer import list_photos, read_photo
+from tools.train_models.train_scorer import spearman
 
 _VISIBLE = 0.02  # LPIPS from which on a fault is called visible
 _REDUCTION = 0.67

@@ -1,4 +1,4 @@
-"""The page docs/api.md, from the docstrings: ``python -m cleargs.api_page > docs/api.md``."""
+"""The page docs/api.md, from the docstrings: ``python -m tools.api_page > docs/api.md``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INTRODUCTION = """\
 when they are first asked for: the import itself takes a moment, and training needs neither pycolmap nor
 OpenImageIO. `examples/` has scripts to start from.
 
-This page is made from the source: `python -m cleargs.api_page > docs/api.md`.
+This page is made from the source: `python -m tools.api_page > docs/api.md`.
 """
 
 

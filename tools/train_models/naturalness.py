@@ -1,6 +1,6 @@
-"""Fit the statistics scorer on the pairs that ``training.train_scorer`` has made.
+"""Fit the statistics scorer on the pairs that ``train_scorer`` has made.
 
-    python -m cleargs.models.training.naturalness --work DIR --out cleargs/models/naturalness.toml
+    python -m tools.train_models.naturalness --work DIR --out cleargs/models/naturalness.toml
 
 Ridge regression of LPIPS on the quadratic's terms, where the differences to the clean version of the same
 content count beside the values: RIVR compares versions of one content only. Takes minutes (the features),
@@ -18,8 +18,8 @@ import tomli_w
 from numpy.typing import NDArray
 
 from cleargs.models.naturalness import Quadratic, features, terms
-from cleargs.models.training.scorer_pairs import Pairs, load_pairs
-from cleargs.models.training.train_scorer import report
+from tools.train_models.scorer_pairs import Pairs, load_pairs
+from tools.train_models.train_scorer import report
 
 _RIDGE = 100.0
 _DIFFERENCES = 1.0  # weight of the differences to the clean version
@@ -60,7 +60,7 @@ def main(work: Path, out: Path) -> None:
     predicted = np.apply_along_axis(model, -1, pair_features(test)).astype(np.float32)
     click.echo("\n".join(report(predicted, test)))
     out.write_text(
-        "# Written by cleargs.models.training.naturalness.\n" + tomli_w.dumps(model.model_dump()), "utf-8"
+        "# Written by tools.train_models.naturalness.\n" + tomli_w.dumps(model.model_dump()), "utf-8"
     )
 
 

@@ -1,4 +1,4 @@
-"""The no-reference scorers, their tiles, and how they are trained."""
+"""The no-reference scorers and their tiles."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.models.information import information
-from cleargs.models.lpips import LpipsNetwork
 from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected, features, terms
 from cleargs.models.scorer import CLARITY, NATURALNESS, InformedScorer, LearnedScorer, Scorer, load_scorer
 from cleargs.models.tile_mean import mean_over_tiles
-from cleargs.models.training import artefacts
-from cleargs.models.training.degrade import disc_kernel, motion_kernel
-from cleargs.models.training.naturalness import fit
-from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, load_pairs, make_pairs
-from cleargs.models.training.train_scorer import QualityNet, predict, train
+from tools.train_models import artefacts
 
 Image = NDArray[np.float32]
 
@@ -211,7 +205,7 @@ def test_unknown_scorers(tmp_path: Path) -> None:
 
 
 def test_a_restorer_is_no_scorer() -> None:
-    weights = Path(__file__).parents[1] / "cleargs" / "models" / "weights" / "restorer.onnx"
+    weights = Path(__file__).parents[2] / "cleargs" / "models" / "weights" / "restorer.onnx"
     with pytest.raises(InputError, match="one score"):
         LearnedScorer(weights)
 
@@ -244,95 +238,5 @@ def test_features_tell_direction_of_change(leaves: Image) -> None:
     assert features(noisy)[neighbour] < features(tile)[neighbour] < features(blurred)[neighbour]
 
 
-def test_ridge_fit_finds_a_quadratic() -> None:
-    rng = np.random.default_rng(0)
-    figures = rng.standard_normal((400, 4, 3))
-    truth = 0.3 * figures[..., 0] - 0.2 * figures[..., 1] * figures[..., 2] + 0.1
-    model = fit(figures, truth.astype(np.float32))
-    found = np.apply_along_axis(model, -1, figures)
-    # The ridge shrinks a little, and features are cut at four deviations.
-    assert np.abs(found - truth).mean() < 0.05 * np.abs(truth).mean()
-
-
 def test_the_shipped_statistics_load() -> None:
     assert StatisticsScorer().name == NATURALNESS
-
-
-# --- artefacts
-
-
-@pytest.mark.parametrize("kind", KIND_NAMES)
-def test_artefacts_are_seeded_images(leaves: Image, kind: str) -> None:
-    patch = leaves[:96, :96]
-    made = [artefacts.KINDS[kind](patch, np.random.default_rng(7)) for _ in range(2)]
-    assert np.array_equal(*made)
-    assert made[0].shape == patch.shape and made[0].dtype == np.float32
-    assert made[0].min() >= 0.0 and made[0].max() <= 1.0
-    assert np.array_equal(made[0], patch) == (kind == "clean")
-
-
-def test_fuse_is_the_paper_s_third_candidate(leaves: Image) -> None:
-    soft = cv2.GaussianBlur(leaves, (0, 0), 2.0)
-    expected = np.clip(soft + leaves - cv2.GaussianBlur(leaves, (0, 0), 2.0), 0, 1)
-    assert np.abs(artefacts.fuse(soft, leaves, 2.0) - expected).max() < 1e-5
-
-
-def test_wiener_undoes_a_known_blur(leaves: Image) -> None:
-    kernel = disc_kernel(1.5)
-    grey = np.repeat(leaves.mean(axis=2, keepdims=True), 3, axis=2)
-    blurred = cv2.filter2D(grey, -1, kernel, borderType=cv2.BORDER_REFLECT)
-    back = artefacts.wiener(blurred, kernel, 1e-4)
-    assert np.abs(back - grey).mean() < 0.3 * np.abs(blurred - grey).mean()
-
-
-def test_ghost_shifts_the_second_exposure() -> None:
-    image = np.zeros((40, 60, 3), np.float32)
-    image[20, 30] = 1.0
-    seen = artefacts.ghost(image, 5.0, -3.0, 0.25)
-    assert set(zip(*np.nonzero(seen[..., 0]), strict=True)) == {(20, 30), (17, 35)}
-    assert seen[20, 30, 0] > seen[17, 35, 0] > 0.0
-
-
-def test_motion_kernel_is_shared_with_the_restorer() -> None:
-    assert motion_kernel(np.random.default_rng(0), 9.0).sum() == pytest.approx(1.0, abs=1e-5)
-
-
-# --- training
-
-
-@pytest.fixture(scope="module")
-def pairs_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("pairs")
-    torch.manual_seed(0)
-    photos = []
-    for seed in range(2):
-        photos.append(folder / f"leaves_{seed}.png")
-        cv2.imwrite(str(photos[-1]), (dead_leaves(seed, 240, 320)[..., ::-1] * 255).astype(np.uint8))
-    network = LpipsNetwork(
-        "alex"
-    ).eval()  # random weights measure some distance, which is all that is needed here
-    for head in network.heads.parameters():
-        head.data.abs_()
-    make_pairs(photos, network, folder / "train", contents=4, versions=4, seed=0)
-    return folder
-
-
-def test_pairs(pairs_folder: Path) -> None:
-    pairs = load_pairs(pairs_folder / "train")
-    assert pairs.images.shape == (8, 4, PATCH, PATCH, 3)
-    assert (pairs.targets[:, 0] == 0.0).all() and (pairs.kinds[:, 0] == 0).all()
-    assert (pairs.targets[:, 1:] > 0.0).all() and (pairs.kinds[:, 1:] > 0).all()
-    assert len({image.tobytes() for image in pairs.images[:, 0]}) == 8  # no content twice
-
-
-def test_training_steps_and_resumes_nothing_by_chance(pairs_folder: Path, tmp_path: Path) -> None:
-    pairs = load_pairs(pairs_folder / "train")
-    nets = [train(pairs, seconds=600.0, epochs=2, seed=3, checkpoint=tmp_path / "net.pt") for _ in range(2)]
-    first, second = (predict(net, pairs) for net in nets)
-    assert first.shape == pairs.targets.shape and (first >= 0.0).all()
-    # Seeded; the rate follows the clock only where time runs out first.
-    assert np.allclose(first, second, atol=1e-3)
-    untrained = QualityNet().eval()
-    assert not np.allclose(first, predict(untrained, pairs), atol=1e-4)
-    saved = torch.load(tmp_path / "net.pt", weights_only=True)
-    assert torch.equal(saved["head.1.weight"], nets[1].state_dict()["head.1.weight"])

@@ -1,8 +1,7 @@
-"""The tile runner, ONNX experts, the synthetic degradations and the shipped restoration network."""
+"""The tile runner, ONNX experts and the shipped restoration network."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
-from cleargs.media.colour import linear_from_srgb
 from cleargs.models.expert import OnnxExpert, expert_path, load_expert
 from cleargs.models.onnx import OnnxModel
 from cleargs.models.tiling import apply_tiled, plan_axis
-from cleargs.models.training import degrade as degradations
-from cleargs.models.training.degrade import Degradation, degrade, motion_kernel
+from tools.train_models.degrade import Degradation, degrade, motion_kernel
 
 Image = NDArray[np.float32]
 
@@ -209,85 +206,3 @@ def test_a_model_that_changes_the_size_is_refused(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(expert, "_model", FakeModel(np.zeros((1, 3, 128, 128), np.float32)))
     with pytest.raises(InputError, match="maps"):
         expert.restore(noise_image(64, 64))
-
-
-def test_maxim_equals_its_reference_vectors() -> None:
-    root = Path(os.environ.get("CLEARGS_CAPTURES", Path(__file__).parents[1] / "../shared/captures"))
-    folder = root.parent / "models"
-    if not (folder / "maxim_gopro_stage1_256.onnx").exists():
-        pytest.skip(f"no MAXIM model in {folder}")
-    vectors = np.load(folder / "maxim_gopro_stage1_io.npz")
-    expert = OnnxExpert(folder / "maxim_gopro_stage1_256.onnx")
-    restored = expert.restore(vectors["input_nhwc"][0])
-    expected = np.clip(vectors["output_nchw"][0].transpose(1, 2, 0), 0, 1)
-    np.testing.assert_allclose(restored, expected, atol=1e-4)
-
-
-# --- degradations ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("length", [0.5, 3.0, 7.0, 14.0, 21.0])
-def test_motion_kernels(length: float) -> None:
-    for seed in range(20):
-        kernel = motion_kernel(np.random.default_rng(seed), length)
-        assert kernel.shape[0] == kernel.shape[1]
-        assert kernel.shape[0] % 2 == 1
-        assert kernel.min() >= 0
-        assert kernel.sum() == pytest.approx(1.0, abs=1e-5)
-        y, x = np.mgrid[: kernel.shape[0], : kernel.shape[0]] - kernel.shape[0] // 2
-        # Centred on its mass, so that blur does not shift the image.
-        assert np.hypot((kernel * x).sum(), (kernel * y).sum()) < 1e-3
-        points = np.argwhere(kernel > 1e-6)
-        extent = np.linalg.norm(points[:, None] - points[None], axis=-1).max()
-        # Bilinear splatting widens a path by less than the diagonal of a pixel at each end.
-        assert length - 1 <= extent <= length + 2 * np.sqrt(2)
-
-
-def test_kernels_are_a_function_of_the_seed() -> None:
-    first, again, other = (motion_kernel(np.random.default_rng(seed), 15.0) for seed in (4, 4, 5))
-    np.testing.assert_array_equal(first, again)
-    assert first.shape != other.shape or not np.array_equal(first, other)
-
-
-def test_disc_kernel() -> None:
-    kernel = degradations.disc_kernel(3.0)
-    assert kernel.sum() == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(kernel, kernel.T, atol=1e-7)
-    assert kernel[3, 3] == 0 or kernel.shape[0] > 7  # nothing outside the disc is cut off
-
-
-def test_blur_keeps_light() -> None:
-    # Away from the borders all light of a bright window stays: the linear mean is kept, that of sRGB is not.
-    image = np.full((96, 96, 3), 0.05, np.float32)
-    image[40:56, 40:56] = 0.9
-    kernel = motion_kernel(np.random.default_rng(1), 15.0)
-    blurred = degrade(image, Degradation(kernel=kernel, quantise=False), np.random.default_rng(2))
-    light = linear_from_srgb(image).mean(dtype=np.float64)
-    assert linear_from_srgb(blurred).mean(dtype=np.float64) == pytest.approx(light, rel=1e-4)
-    assert blurred.mean() > image.mean() * 1.05
-
-
-def test_degradation_is_seeded_and_quantised() -> None:
-    image = drawing(64, 64)
-    degradation = Degradation(noise=1 / 255)
-    first, again, other = (degrade(image, degradation, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-    np.testing.assert_allclose(first * 255, np.round(first * 255), atol=1e-3)
-    # One code value of noise plus rounding (1/12): the deviation is sqrt(1 + 2/12) code values at most.
-    assert 0.9 < (first - image).std() * 255 < 1.2
-
-
-def test_blur_that_varies_goes_from_one_kernel_to_the_other() -> None:
-    image = noise_image(64, 64)
-    kernel = degradations.disc_kernel(3.0)
-    out = degrade(image, Degradation(second=kernel, quantise=False), np.random.default_rng(0))
-    error = np.abs(out - image).mean(axis=(0, 2))
-    assert error[:4].mean() < 0.2 * error[-4:].mean()
-
-
-def test_jpeg_is_mild_but_not_nothing() -> None:
-    image = drawing(64, 64)
-    coded = degradations.jpeg(image, 90)
-    assert coded.shape == image.shape
-    assert 28 < psnr(coded, image) < 60

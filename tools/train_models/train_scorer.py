@@ -1,7 +1,7 @@
 """Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one
 alone.
 
-    python -m cleargs.models.training.train_scorer --photos DIR --work DIR --out scorer.onnx
+    python -m tools.train_models.train_scorer --photos DIR --work DIR --out scorer.onnx
 
 The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times
 as much and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models
@@ -27,8 +27,8 @@ from torch.nn import functional
 
 from cleargs.models.lpips import load_network, weights_file
 from cleargs.models.registry import model_dir
-from cleargs.models.training.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
-from cleargs.models.training.train_restorer import HELD_OUT, source_of
+from tools.train_models.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
+from tools.train_models.train_restorer import HELD_OUT, source_of
 
 _GROUPS_PER_BATCH = 8
 _SHOWN = 4  # versions of a group in one batch
