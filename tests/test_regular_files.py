@@ -14,9 +14,8 @@ from cleargs.evaluate.comparison import Sample
 from cleargs.evaluate.eval_report import read_report
 from cleargs.evaluate.evidence import read_evidence
 from cleargs.media.image import image_size
-from cleargs.models.fetch import read_checked
-from cleargs.models.model_folder import read_receipt
-from cleargs.models.registry import find_model
+from cleargs.models.install import read_checked
+from cleargs.models.registry import find_model, read_receipt
 from cleargs.report.report_json import noted
 from cleargs.rva.item_cache import ItemCache
 
@@ -35,7 +34,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     ),
     "published weights": (
         "weights",
-        lambda folder: read_checked(folder / "weights", find_model("maxim-gopro").source),
+        lambda folder: read_checked(folder / "weights", find_model("lpips").source),
     ),
     "table of frames": ("frames.parquet", load_frames),
     "size of an image": ("a.png", lambda folder: image_size(folder / "a.png")),

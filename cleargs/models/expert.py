@@ -1,7 +1,7 @@
 """The frozen restoration expert of RIVR: an image in, a sharper image of the same size out.
 
 Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embedded default is the network of
-`cleargs.models.training.train_restorer`.
+`tools/train_models/train_restorer.py`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError, did_you_mean
 from cleargs.models.batches import in_batches
-from cleargs.models.model_folder import installable, installed_file, verify
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import load_registry
+from cleargs.models.registry import installable, installed_file, load_registry, verify
 from cleargs.models.tiling import Image, apply_tiled, map_tiled
 from cleargs.plugins import load_part, plugins
 

@@ -21,10 +21,9 @@ import numpy as np
 from cleargs.errors import InputError, did_you_mean
 from cleargs.models.batches import in_batches
 from cleargs.models.information import information
-from cleargs.models.model_folder import installable, installed_file, verify
 from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import load_registry
+from cleargs.models.registry import installable, installed_file, load_registry, verify
 from cleargs.models.tile_mean import Image, cover, mean_over_tiles
 from cleargs.plugins import load_part, plugins
 

@@ -1,8 +1,10 @@
 """The conversions at the published architectures' full size, with random weights: time, memory, and the
 largest difference to PyTorch. And what each model that can be had costs to run.
 
-  .venv-convert/bin/python tests/models/full_size.py restormer nafnet musiq clip-iqa    # converted here
-  .venv/bin/python tests/models/full_size.py maxim-gopro embedded clarity-net ...      # as installed
+Converted here, and as installed::
+
+  .venv-convert/bin/python -m tools.convert_models.full_size restormer nafnet musiq clip-iqa
+  .venv/bin/python -m tools.convert_models.full_size embedded clarity-net lpips ...
 
 Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md has the
 figures.
@@ -56,7 +58,7 @@ def checkpoint(network: nn.Module) -> bytes:
 
 def published(name: str) -> nn.Module:
     """The published architecture with random weights, none of which leaves the image as it is."""
-    from cleargs.models.convert.torchvision_stub import mend_torchvision
+    from tools.convert_models.torch_export import mend_torchvision
 
     mend_torchvision()
     torch.manual_seed(0)
@@ -88,10 +90,10 @@ def published(name: str) -> nn.Module:
 
 def convert(name: str, path: Path) -> dict[str, Any]:
     """Convert the random network and compare it with PyTorch."""
-    from cleargs.models.convert import restorer, scorers
     from cleargs.models.expert import OnnxExpert
     from cleargs.models.musiq import MusiqScorer
     from cleargs.models.scorer import LearnedScorer
+    from tools.convert_models import restorer, scorers
 
     network, start = published(name), time.process_time()
     tile = image(256, 256)
@@ -154,7 +156,7 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
             return metric.distance(one, one[::-1].copy())
 
     else:
-        work = load_expert(name).restore if name == "embedded" or "maxim" in name else load_scorer(name).score
+        work = load_expert(name).restore if name == "embedded" else load_scorer(name).score
     first = image(256, 256)
     work(first)
     start = time.process_time()
@@ -179,7 +181,7 @@ def main(names: list[str]) -> None:
                 else ["--convert", "--cost"]
             )
             for kind in kinds:
-                command = [sys.executable, __file__, kind, name, str(path)]
+                command = [sys.executable, "-m", "tools.convert_models.full_size", kind, name, str(path)]
                 figures |= json.loads(
                     subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1]
                 )

@@ -14,9 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from cleargs.errors import InputError
-from cleargs.models.convert.environment import first_line
-from cleargs.models.convert.torch_onnx import export
-from cleargs.models.convert.torchvision_stub import mend_torchvision
+from tools.convert_models.torch_export import export, first_line, mend_torchvision
 
 
 def convert(checkpoint: bytes, path: Path, tile: int = 256) -> None:

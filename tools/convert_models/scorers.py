@@ -18,10 +18,8 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from cleargs.errors import InputError
-from cleargs.models.convert.environment import first_line
-from cleargs.models.convert.torch_onnx import export
-from cleargs.models.convert.torchvision_stub import mend_torchvision
 from cleargs.models.musiq import PATCH
+from tools.convert_models.torch_export import export, first_line, mend_torchvision
 
 
 def convert(kind: str, checkpoint: bytes, path: Path) -> None:

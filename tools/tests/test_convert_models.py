@@ -1,12 +1,14 @@
 """PyTorch checkpoints to ONNX: equality with torch on randomly initialised weights of the real architectures.
 
 These need the packages of the environment for conversions (`make convert-env`); they run in
-``.venv-convert/bin/python -m pytest tests/models``.
+``make test-convert``.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,14 +20,14 @@ import torch
 from click.testing import CliRunner
 from torch import nn
 
-from cleargs.cli.models import models
 from cleargs.errors import InputError
-from cleargs.models import install as installer
-from cleargs.models.convert.environment import require
 from cleargs.models.expert import OnnxExpert, load_expert
 from cleargs.models.musiq import MusiqScorer, patches
-from cleargs.models.registry import find_model
+from cleargs.models.registry import find_model, read_receipt, verify
 from cleargs.models.scorer import LearnedScorer
+from tools.convert_models import restorer, scorers
+from tools.convert_models.__main__ import install_checkpoint, main
+from tools.convert_models.torch_export import mend_torchvision, require
 
 SIZES = [(270, 480), (200, 90), (64, 300)]  # landscape, portrait, a strip
 
@@ -71,9 +73,6 @@ def nafnet() -> nn.Module:
 @needs_spandrel
 @pytest.mark.parametrize(("build", "key"), [(restormer, "params"), (nafnet, None)])
 def test_restorers_equal_torch(build: Callable[[], nn.Module], key: str | None, tmp_path: Path) -> None:
-    from cleargs.models.convert import restorer
-    from cleargs.models.convert.torchvision_stub import mend_torchvision
-
     mend_torchvision()
     torch.manual_seed(0)
     network = build().eval()
@@ -89,28 +88,24 @@ def test_restorers_equal_torch(build: Callable[[], nn.Module], key: str | None, 
 
 @needs_spandrel
 def test_restormer_installs_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from cleargs.models.convert.torchvision_stub import mend_torchvision
-
     mend_torchvision()
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path / "models"))
     torch.manual_seed(0)
     file = tmp_path / "motion_deblurring.pth"
     file.write_bytes(checkpoint(restormer(), "params"))
-    arguments = ["install", "restormer-motion", "--from", str(file), "--accept-licence"]
-    result = CliRunner().invoke(models, arguments)
+    result = CliRunner().invoke(main, ["restormer-motion", str(file), "--accept-licence"])
     assert result.exception is None, result.exception
     expert = load_expert("restormer-motion")
     assert expert.name == "restormer-motion"
-    assert CliRunner().invoke(models, ["verify", "restormer-motion"]).exception is None
+    verify(find_model("restormer-motion"), tmp_path / "models")
 
 
 @needs_spandrel
 def test_any_checkpoint_converts_to_a_file_of_its_own(tmp_path: Path) -> None:
     torch.manual_seed(0)
     (tmp_path / "own.pth").write_bytes(checkpoint(nafnet()))
-    result = CliRunner().invoke(
-        models, ["convert", str(tmp_path / "own.pth"), str(tmp_path / "own.onnx"), "--tile", "64"]
-    )
+    arguments = [str(tmp_path / "own.onnx"), str(tmp_path / "own.pth"), "--tile", "64"]
+    result = CliRunner().invoke(main, arguments)
     assert result.exception is None, result.exception
     restored = load_expert(str(tmp_path / "own.onnx")).restore(image(70, 100))
     assert restored.shape == (70, 100, 3)
@@ -119,8 +114,6 @@ def test_any_checkpoint_converts_to_a_file_of_its_own(tmp_path: Path) -> None:
 @needs_spandrel
 @pytest.mark.parametrize("data", [b"", b"no checkpoint", checkpoint(nn.Linear(3, 4))])
 def test_other_files_are_refused(data: bytes, tmp_path: Path) -> None:
-    from cleargs.models.convert import restorer
-
     with pytest.raises(InputError, match="no checkpoint of a known architecture") as caught:
         restorer.convert(data, tmp_path / "restorer.onnx")
     assert "\n" not in str(caught.value)
@@ -132,9 +125,58 @@ def test_what_the_environment_lacks_is_named(tmp_path: Path, monkeypatch: pytest
         require("json", "no_such_package", purpose="converting")
     assert "make convert-env" in caught.value.hint
 
-    monkeypatch.setattr("cleargs.models.convert.environment.find_spec", lambda name: None)
+    monkeypatch.setattr("tools.convert_models.torch_export.find_spec", lambda name: None)
     with pytest.raises(InputError, match="converting musiq needs pyiqa"):  # before the file is looked for
-        installer.install(find_model("musiq"), tmp_path, tmp_path / "none.pth", licence_accepted=True)
+        install_checkpoint(find_model("musiq"), tmp_path, tmp_path / "none.pth", licence_accepted=True)
+
+
+# --- installation -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def converted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Converters that need no package."""
+
+    def convert(data: bytes, path: Path, *_: object) -> None:
+        path.write_bytes(b"converted " + data)
+
+    monkeypatch.setattr("tools.convert_models.__main__.require", lambda *packages, purpose: None)
+    monkeypatch.setattr(restorer, "convert", convert)
+
+
+@pytest.mark.parametrize("name", ["restormer-motion", "musiq", "clip-iqa"])
+def test_licence_must_be_accepted(name: str, tmp_path: Path, converted: None) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    refused = CliRunner().invoke(main, [name, str(tmp_path / "file"), "--dir", str(tmp_path / "models")])
+    assert isinstance(refused.exception, InputError)
+    assert "--accept-licence" in refused.exception.hint
+    assert find_model(name).licence in refused.stderr and find_model(name).licence in str(refused.exception)
+    assert not (tmp_path / "models").exists()
+
+
+def test_other_checkpoint_is_refused(tmp_path: Path, converted: None) -> None:
+    (tmp_path / "file").write_bytes(b"something else")
+    with pytest.raises(InputError, match="SHA-256 differs"):
+        install_checkpoint(find_model("musiq"), tmp_path / "models", tmp_path / "file", licence_accepted=True)
+
+
+def test_receipt_holds_the_digests(tmp_path: Path, converted: None) -> None:
+    checkpoint = tmp_path / "motion_deblurring.pth"
+    checkpoint.write_bytes(b"weights")
+    model, folder = find_model("restormer-motion"), tmp_path / "models"
+    written = install_checkpoint(model, folder, checkpoint, licence_accepted=True)
+    assert [path.name for path in written] == ["restormer-motion.onnx", "restormer-motion.receipt.json"]
+    verify(model, folder)
+    receipt = json.loads(written[1].read_text("utf-8"))
+    assert receipt["source_sha256"] == hashlib.sha256(b"weights").hexdigest()
+
+    written[0].write_bytes(b"converted otherwise")
+    with pytest.raises(InputError, match="damaged"):
+        verify(model, folder)
+    written[1].write_text("[]", "utf-8")
+    assert read_receipt(model, folder) == {}
+    with pytest.raises(InputError, match="damaged"):
+        verify(model, folder)
 
 
 # --- scorers ----------------------------------------------------------------------------------------------
@@ -142,9 +184,6 @@ def test_what_the_environment_lacks_is_named(tmp_path: Path, monkeypatch: pytest
 
 @needs_pyiqa
 def test_musiq_equals_pyiqa(tmp_path: Path) -> None:
-    from cleargs.models.convert import scorers
-    from cleargs.models.convert.torchvision_stub import mend_torchvision
-
     mend_torchvision()
     from pyiqa.archs.musiq_arch import MUSIQ
 
@@ -178,9 +217,6 @@ def test_patches_are_pyiqas(size: tuple[int, int]) -> None:
 
 @needs_pyiqa
 def test_clip_iqa_equals_pyiqa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from cleargs.models.convert import scorers
-    from cleargs.models.convert.torchvision_stub import mend_torchvision
-
     mend_torchvision()
     from pyiqa.archs import clip_model, clipiqa_arch
 
@@ -206,8 +242,6 @@ def test_clip_iqa_equals_pyiqa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @needs_pyiqa
 @pytest.mark.parametrize("kind", ["musiq", "clip-iqa"])
 def test_other_weights_are_refused(kind: str, tmp_path: Path) -> None:
-    from cleargs.models.convert import scorers
-
     with pytest.raises(InputError, match=f"not the weights of {kind}") as caught:
         scorers.convert(kind, checkpoint(nn.Linear(3, 4)), tmp_path / "scorer.onnx")
     assert "\n" not in str(caught.value)

