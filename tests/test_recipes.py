@@ -177,7 +177,7 @@ EMBEDDED = {
         (
             "default",
             "rivr.primary_scorer=clarity",
-            "no scorer is called 'clarity'",
+            "there is no scorer 'clarity'",
             "did you mean clarity-net?",
         ),
         ("default", "rivr.expert=none.onnx", "none.onnx", "check the path"),

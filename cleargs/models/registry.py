@@ -13,7 +13,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
+from cleargs.plugins import plugins
 from cleargs.record import Record
 from cleargs.untrusted import open_regular, read_json
 
@@ -138,24 +139,39 @@ def state(model: Model, directory: Path) -> State:
     return "incomplete" if any(present) else "not installed"
 
 
-def installable(name: str, role: Role) -> Model | None:
-    """The registry's entry of that name and role, unless it comes with ClearGS."""
-    found = (model for model in load_registry() if model.name == name and model.role == role)
-    return next((model for model in found if model.shipped is None), None)
+def registered(name: str, role: Role) -> Model | None:
+    """The registry's entry of that name and role."""
+    return next((model for model in load_registry() if (model.name, model.role) == (name, role)), None)
 
 
-def installed_file(name: str, role: Role) -> Path | None:
-    """The absolute path of the installed model of that name and role; None if the registry has none such.
+def model_file(spec: str, role: Role) -> Path | None:
+    """The file, absolute, with the weights of the expert or scorer that a setting names.
 
-    Raises InputError when it is not installed. Its content is not checked (see `verify`).
+    spec: the name of a model of the registry, a path (it need not exist), or the name of a part that another
+    package brings: None, as the version of that package stands in the keys of the store instead.
+
+    Raises InputError for any other name, and when a model of the registry is not installed. The content is
+    not checked (see `verify`).
     """
-    model = installable(name, role)
-    if model is None:
+    model = registered(spec, role)
+    if model is not None and model.shipped is not None:
+        return Path(__file__).absolute().parent / model.shipped
+    if model is not None:
+        path = (model_dir() / model.files[0].name).absolute()
+        if not path.is_file():
+            raise InputError(f"the model {spec} is not installed", hint=model.install_hint)
+        return path
+    brought = plugins("experts" if role == "expert" else "scorers")
+    if spec in brought:
         return None
-    path = (model_dir() / model.files[0].name).absolute()
-    if not path.is_file():
-        raise InputError(f"the model {name} is not installed", hint=model.install_hint)
-    return path
+    path = Path(spec).absolute()
+    if path.name != spec or path.suffix or path.exists():
+        return path
+    names = [*(model.name for model in load_registry() if model.role == role), *brought]
+    raise InputError(
+        f"there is no {role} {spec!r}",
+        hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
+    )
 
 
 def verify(model: Model, directory: Path) -> None:

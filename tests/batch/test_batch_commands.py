@@ -58,8 +58,8 @@ def test_a_scene_whose_folder_belongs_to_another_input(
 @pytest.mark.parametrize(
     ("setting", "name", "words"),
     [
-        ("rivr.primary_scorer", "nonesuch", "no scorer is called 'nonesuch'"),
-        ("rivr.expert", "nonesuch", "no restoration expert 'nonesuch'"),
+        ("rivr.primary_scorer", "nonesuch", "there is no scorer 'nonesuch'"),
+        ("rivr.expert", "nonesuch", "there is no expert 'nonesuch'"),
         ("rivr.expert", "nafnet-gopro", "the model nafnet-gopro is not installed"),
     ],
 )

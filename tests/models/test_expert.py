@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError, StageError
 from cleargs.models.expert import OnnxExpert, expert_path, load_expert
 from cleargs.models.onnx import OnnxModel
-from cleargs.models.tiling import apply_tiled, plan_axis
+from cleargs.models.tiling import Sides, map_tiled, plan_axis
 from tools.train_models.degrade import Degradation, degrade, motion_kernel
 
 Image = NDArray[np.float32]
@@ -39,6 +40,10 @@ def drawing(height: int, width: int, seed: int = 0) -> Image:
         cover = np.clip(0.5 - distance, 0.0, 1.0)[..., None]
         image = image * (1 - cover) + rng.uniform(0.05, 0.95, 3) * cover
     return image.astype(np.float32)
+
+
+def apply_tiled(function: Callable[[Image], Image], image: Image, fixed: Sides = (None, None)) -> Image:
+    return map_tiled(lambda tiles: map(function, tiles), image, fixed=fixed)
 
 
 def psnr(image: Image, reference: Image) -> float:
@@ -101,9 +106,7 @@ def test_seams_are_smooth() -> None:
 
 def test_progress_counts_every_tile() -> None:
     calls: list[tuple[int, int]] = []
-    apply_tiled(
-        lambda t: t, noise_image(300, 300), fixed=(128, 128), threads=2, on_tile=lambda *c: calls.append(c)
-    )
+    map_tiled(lambda t: t, noise_image(300, 300), fixed=(128, 128), on_tile=lambda *c: calls.append(c))
     assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
     assert {total for _, total in calls} == {len(calls)}
 
@@ -139,7 +142,7 @@ def test_tiling_hardly_shows() -> None:
     # The network sees a bounded neighbourhood; away from tile borders it computes the same in any tile.
     image = drawing(192, 704)
     expert = OnnxExpert(expert_path("embedded"))
-    whole = expert._restore_tile(image)
+    whole = expert._restore(image[None])[0]
     assert psnr(expert.restore(image), np.clip(whole, 0, 1)) > 50
 
 
@@ -171,7 +174,7 @@ def test_motion_blur_is_reduced(length: float) -> None:
 def test_missing_file() -> None:
     with pytest.raises(InputError, match="does not exist") as caught:
         load_expert("no/such/model.onnx")
-    with pytest.raises(InputError, match="no restoration expert 'embeded'") as error:
+    with pytest.raises(InputError, match="there is no expert 'embeded'") as error:
         expert_path("embeded")
     assert error.value.hint == "did you mean embedded?"
     assert caught.value.hint
@@ -184,25 +187,17 @@ def test_file_that_is_no_model(tmp_path: Path) -> None:
         load_expert(str(path))
 
 
-class FakeModel:
-    """Stands in for the ONNX session: returns what it is told to."""
-
-    def __init__(self, output: NDArray[np.float32]) -> None:
-        self.output = output
-
-    def run(self, *tensors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        return [self.output]
-
-
 def test_values_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     expert = OnnxExpert(expert_path("embedded"))
-    monkeypatch.setattr(expert, "_model", FakeModel(np.full((1, 3, 64, 64), np.nan, np.float32)))
+    output = np.full((1, 3, 64, 64), np.nan, np.float32)
+    monkeypatch.setattr(expert._model, "run", lambda *_: [output])
     with pytest.raises(StageError, match="not finite"):
         expert.restore(noise_image(64, 64))
 
 
 def test_a_model_that_changes_the_size_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     expert = OnnxExpert(expert_path("embedded"))
-    monkeypatch.setattr(expert, "_model", FakeModel(np.zeros((1, 3, 128, 128), np.float32)))
+    output = np.zeros((1, 3, 128, 128), np.float32)
+    monkeypatch.setattr(expert._model, "run", lambda *_: [output])
     with pytest.raises(InputError, match="maps"):
         expert.restore(noise_image(64, 64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.information import information
 from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected, features, terms
-from cleargs.models.scorer import CLARITY, NATURALNESS, InformedScorer, LearnedScorer, Scorer, load_scorer
-from cleargs.models.tile_mean import mean_over_tiles
+from cleargs.models.scorer import (
+    CLARITY,
+    NATURALNESS,
+    InformedScorer,
+    LearnedScorer,
+    Scorer,
+    information,
+    load_scorer,
+)
+from cleargs.models.tiling import mean_over_tiles
 from tools.train_models import artefacts
 
 Image = NDArray[np.float32]
@@ -194,7 +202,7 @@ def test_unknown_scorers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="musik") as caught:
         load_scorer("musik")
     assert caught.value.hint == "did you mean musiq?"
-    with pytest.raises(InputError, match="no scorer is called 'best'") as caught:
+    with pytest.raises(InputError, match="there is no scorer 'best'") as caught:
         load_scorer("best")
     assert CLARITY in caught.value.hint and "musiq" in caught.value.hint
     with pytest.raises(InputError, match="does not exist"):
@@ -213,10 +221,15 @@ def test_a_restorer_is_no_scorer() -> None:
 def test_tiles_cover_the_image_and_keep_their_order() -> None:
     image = np.zeros((100, 250, 3), np.float32)
     image[-1, -1] = 1.0  # seen only if the last tile reaches the corner
-    assert mean_over_tiles(lambda tile: float(tile.max()), image, (100, 100)) == pytest.approx(1 / 3)
-    assert mean_over_tiles(lambda tile: float(tile.max()), image, (None, None)) == 1.0
+    assert mean_over_tiles(lambda tiles: (tile.max() for tile in tiles), image, (100, 100)) == 1 / 3
+    assert mean_over_tiles(lambda tiles: (tile.max() for tile in tiles), image, (None, None)) == 1.0
     shapes: list[tuple[int, ...]] = []
-    mean_over_tiles(lambda tile: shapes.append(tile.shape) or 0.0, image, (64, 128))  # type: ignore[func-returns-value]
+
+    def heights(tiles: Sequence[Image]) -> list[float]:
+        shapes.extend(tile.shape for tile in tiles)
+        return [len(tile) for tile in tiles]
+
+    assert mean_over_tiles(heights, image, (64, 128)) == 64
     assert shapes == [(64, 128, 3)] * 4
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.models.expert import EMBEDDED, load_expert
+from cleargs.models.expert import load_expert
 from tools.train_models.degrade import (
     IDENTITY,
     Degradation,
@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         return restore
 
-    experts = {spec: expert_method(spec) for spec in options.expert or [EMBEDDED]}
+    experts = {spec: expert_method(spec) for spec in options.expert or ["embedded"]}
     columns: list[tuple[str, list[Case], dict[str, Method]]] = []
     for band in BANDS:
         cases = make_cases(held_out, band, crop=options.crop, seed=options.seed, purpose=_PURPOSE_EVALUATION)
