@@ -9,7 +9,7 @@
 # make docs   the documentation as a site, in site/; a broken link is an error
 # make dist   wheel and sdist, in dist/
 # make test-gpu-kernels   the GPU kernels, without a GPU: in Triton's interpreter, and compiled ahead of time
-# make convert-env   .venv-convert, in which `cleargs models install` converts PyTorch checkpoints
+# make convert-env   .venv-convert, in which tools/convert_models converts PyTorch checkpoints
 # make test-convert  the tests of those conversions
 # make browser       what the tests of the report in a browser need beside Debian's chromium
 # make oracles       .oracles, npm's programs that read exported scenes in the tests
@@ -77,12 +77,12 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
-	$(BIN)/mypy cleargs stages benchmarks
+	$(BIN)/mypy cleargs stages benchmarks tools
 
 convert-env: .venv-convert/stamp
 
 test-convert: convert-env
-	.venv-convert/bin/python -m pytest tests/models
+	.venv-convert/bin/python -m pytest tools/tests/test_convert_models.py
 
 browser: .venv/browser.stamp
 

@@ -20,10 +20,7 @@ for package, name in FOLDERS.items():
         inside = path.relative_to(source)
         if path.is_dir() or path.suffix == ".pyc" or inside.as_posix() in NOT_INSTALLED:
             continue
-        if inside.parts[:2] == ("models", "training"):
-            assert not (folder / inside).exists(), f"{inside} trains weights and is installed"
-        else:
-            assert (folder / inside).is_file(), f"{package} lacks {inside}"
-assert find_spec("cleargs.models.training") is None
+        assert (folder / inside).is_file(), f"{package} lacks {inside}"
+assert find_spec("tools") is None
 assert version("cleargs") == cleargs.__version__, version("cleargs")
 print(f"cleargs {cleargs.__version__} is whole in {files('cleargs')}")

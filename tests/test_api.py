@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import cleargs as cg
-from cleargs.api_page import page
 from cleargs.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -41,11 +40,6 @@ def test_the_import_brings_nothing_heavy() -> None:
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_the_page_of_the_library_is_current() -> None:
-    """Made anew by: python -m cleargs.api_page > docs/api.md"""
-    assert page() == (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 
 
 def test_training_needs_no_capture_libraries() -> None:

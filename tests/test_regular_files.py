@@ -12,9 +12,8 @@ from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
 from cleargs.evaluate.eval_report import read_report
 from cleargs.media.image import image_size
-from cleargs.models.fetch import read_checked
-from cleargs.models.model_folder import read_receipt
-from cleargs.models.registry import find_model
+from cleargs.models.install import read_checked
+from cleargs.models.registry import find_model, read_receipt
 from cleargs.report.report_json import noted
 from cleargs.rva.item_cache import ItemCache
 
@@ -31,7 +30,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     ),
     "published weights": (
         "weights",
-        lambda folder: read_checked(folder / "weights", find_model("maxim-gopro").source),
+        lambda folder: read_checked(folder / "weights", find_model("lpips").source),
     ),
     "table of frames": ("frames.parquet", load_frames),
     "size of an image": ("a.png", lambda folder: image_size(folder / "a.png")),

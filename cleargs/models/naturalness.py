@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from functools import cached_property
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 import cv2
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.models.tile_mean import Image, mean_over_tiles
+from cleargs.models.tiling import Image, mean_over_tiles
 from cleargs.record import Record
 
 COEFFICIENTS = "naturalness.toml"
@@ -50,19 +50,18 @@ class StatisticsScorer:
 
     def __init__(self, name: str = "naturalness-stats") -> None:
         self.name = name
-        self._source = (files("cleargs.models") / COEFFICIENTS).read_bytes()
-        self._predict = Quadratic.model_validate(tomllib.loads(self._source.decode("utf-8")))
-
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of the coefficients."""
-        return hashlib.sha256(self._source).hexdigest()
+        source = (files("cleargs.models") / COEFFICIENTS).read_bytes()
+        self.digest = hashlib.sha256(source).hexdigest()
+        self._predict = Quadratic.model_validate(tomllib.loads(source.decode("utf-8")))
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """Between 0 and 100; the order is that of the predictions. See Scorer."""
-        predicted = mean_over_tiles(
-            lambda tile: self._predict(features(tile)), image, (_TILE, _TILE), threads
-        )
+        with ThreadPoolExecutor(threads) as pool:
+            predicted = mean_over_tiles(
+                lambda tiles: pool.map(lambda tile: self._predict(features(tile)), tiles),
+                image,
+                (_TILE, _TILE),
+            )
         return 100.0 * expected(1.0 - predicted)
 
 

@@ -1,14 +1,15 @@
 """ONNX models on onnxruntime: on the CPU one thread a call, so that results never depend on the thread count.
 
-Parallelism is the caller's: `OnnxModel.run` may be called from several threads at once (for instance one
-image tile each), and every call computes the same bits. On a GPU one caller gives it several tiles at once.
+Parallelism is over the items of `OnnxModel.map` (image tiles, say): on the CPU several threads take one item
+each, and every call computes the same bits; on a GPU one call takes several items.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.resources import files
@@ -25,6 +26,12 @@ from cleargs.untrusted import cause, read_bytes
 Device = Literal["cpu", "cuda"]
 
 CUDA_PROVIDER = "CUDAExecutionProvider"
+
+BATCH_PIXELS = 8 * 512 * 512
+"""Pixels of a batch, at most."""
+
+_EXHAUSTED = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
+"""How onnxruntime, CUDA and cuDNN say it; onnxruntime has no exception of its own for it."""
 
 _FATAL = 4
 _EXTERNAL_FOLDER = "session.model_external_initializers_file_folder_path"
@@ -130,6 +137,48 @@ class OnnxModel:
             ) from error
         return outputs
 
+    def map(
+        self,
+        function: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        items: Sequence[NDArray[np.float32]],
+        threads: int,
+    ) -> Iterator[Any]:
+        """The results of ``function`` for ``items`` [H, W, C] of one size, in their order.
+
+        function: maps a stack [N, H, W, C] to results [N, ...] by calling `run` once.
+        threads: items at once on the CPU. On a GPU a batch is as large as fits.
+        """
+        if self.takes_batches:
+            yield from in_batches(function, items)
+            return
+        with ThreadPoolExecutor(1 if self.device == "cuda" else threads) as pool:
+            yield from pool.map(lambda item: function(item[None])[0], items)
+
+
+def in_batches(
+    function: Callable[[NDArray[np.float32]], NDArray[np.float32]], items: Sequence[NDArray[np.float32]]
+) -> list[Any]:
+    """The results of ``function`` for ``items`` [H, W, ...] of one size, in their order.
+
+    A batch that the GPU's memory does not hold is tried again by halves. Raises StageError when a single item
+    is too large.
+    """
+    pixels = items[0].shape[0] * items[0].shape[1]
+    size = max(1, BATCH_PIXELS // pixels)
+    results: list[Any] = []
+    while len(results) < len(items):
+        batch = np.stack(items[len(results) : len(results) + size])
+        try:
+            results.extend(function(batch))
+        except MemoryError as error:
+            if len(batch) == 1:
+                raise StageError(
+                    f"the GPU's memory does not hold a network's work on {pixels} pixels",
+                    hint="free memory on the GPU, or use --device cpu",
+                ) from error
+            size = len(batch) // 2
+    return results
+
 
 def _unusable(path: Path, said: str) -> Exception:
     """The error for a file that makes no session, by what onnxruntime said."""
@@ -143,7 +192,7 @@ def _unusable(path: Path, said: str) -> Exception:
 
 
 def _lacks_memory(said: str) -> bool:
-    return any(words in said for words in ("bad_alloc", "Failed to allocate memory", "out of memory"))
+    return any(words in said.lower() for words in _EXHAUSTED)
 
 
 def _reason(said: str) -> str:

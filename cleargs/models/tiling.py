@@ -1,4 +1,4 @@
-"""An image-to-image function applied tile by tile, with overlap and blended seams.
+"""Images of any size, tile by tile: to an image of the same size, or to one figure.
 
 The tile grid and the blend depend on the image size alone, and tiles are added up in a fixed order: the
 result is bitwise the same for any number of threads.
@@ -8,21 +8,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.errors import InputError
+
 Image: TypeAlias = NDArray[np.float32]
+Sides: TypeAlias = tuple[int | None, int | None]
+"""Height and width of the tiles, None where they are free."""
 
 FREE_TILE = 512
 """Largest tile side in pixels where the model leaves it free."""
 
 MULTIPLE = 64
 """Free tile sides are multiples of this, which suits encoders that halve the image up to six times."""
+
+MIN_SIDE = 32
+"""Shortest side of an image that is scored, px."""
+
+_OUTSIDE = 1e-3
+"""How far values may lie outside [0, 1], by rounding: half floats near 1 are so far apart."""
+
+
+# -- image to image: overlapping tiles, blended --------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -53,10 +65,10 @@ def plan_axis(length: int, fixed: int | None) -> TileAxis:
     size = fixed or math.ceil((padded + (count - 1) * overlap) / count / step) * step
     # Starts on the multiple keep the encoder's grid the same in all tiles, so that neighbours agree.
     starts = tuple(round((padded - size) * k / max(count - 1, 1) / step) * step for k in range(count))
-    return TileAxis(padded, size, starts, _windows(padded, size, starts))
+    return TileAxis(padded, size, starts, _blend_weights(padded, size, starts))
 
 
-def _windows(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.float32]:
+def _blend_weights(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.float32]:
     """Blend weights [tiles, size]: raised-cosine ramps where neighbours overlap, normalised to sum to one."""
     windows = np.ones((len(starts), size), np.float64)
     for k, (left, right) in enumerate(pairwise(starts)):
@@ -72,30 +84,11 @@ def _windows(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[np.floa
     return windows.astype(np.float32)
 
 
-def apply_tiled(
-    function: Callable[[Image], Image],
-    image: Image,
-    *,
-    fixed: tuple[int | None, int | None] = (None, None),
-    threads: int = 1,
-    on_tile: Callable[[int, int], None] | None = None,
-) -> Image:
-    """The function's result on the whole image [H, W, 3], computed on tiles.
-
-    function: maps a tile [h, w, 3] to one of the same shape; several threads may call it at once.
-    threads: tiles computed at once.
-
-    For the rest see `map_tiled`.
-    """
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        return map_tiled(lambda tiles: pool.map(function, tiles), image, fixed=fixed, on_tile=on_tile)
-
-
 def map_tiled(
     function: Callable[[Sequence[Image]], Iterable[Image]],
     image: Image,
     *,
-    fixed: tuple[int | None, int | None] = (None, None),
+    fixed: Sides = (None, None),
     on_tile: Callable[[int, int], None] | None = None,
 ) -> Image:
     """The function's result on the whole image [H, W, 3], computed on tiles that it is given together.
@@ -110,17 +103,68 @@ def map_tiled(
     rows, columns = plan_axis(height, fixed[0]), plan_axis(width, fixed[1])
     padding = ((0, rows.padded - height), (0, columns.padded - width), (0, 0))
     padded = np.pad(image, padding, mode="reflect")
-    places = [(r, c) for r in range(len(rows.starts)) for c in range(len(columns.starts))]
-
-    def cut(row: int, column: int) -> tuple[slice, slice]:
-        y, x = rows.starts[row], columns.starts[column]
-        return slice(y, y + rows.size), slice(x, x + columns.size)
-
+    places = [
+        (
+            (slice(y, y + rows.size), slice(x, x + columns.size)),
+            rows.windows[row][:, None, None] * columns.windows[column][None, :, None],
+        )
+        for row, y in enumerate(rows.starts)
+        for column, x in enumerate(columns.starts)
+    ]
     result = np.zeros_like(padded)
-    tiles = function([padded[cut(*place)] for place in places])
-    for done, ((row, column), tile) in enumerate(zip(places, tiles, strict=True), start=1):
-        weight = rows.windows[row][:, None, None] * columns.windows[column][None, :, None]
-        result[cut(row, column)] += weight * tile
+    tiles = function([padded[place] for place, _ in places])
+    for done, ((place, weight), tile) in enumerate(zip(places, tiles, strict=True), start=1):
+        result[place] += weight * tile
         if on_tile is not None:
             on_tile(done, len(places))
     return np.ascontiguousarray(result[:height, :width])
+
+
+# -- image to figure: tiles that cover it --------------------------------------------------------------------
+
+
+def require_scorable(image: NDArray[Any]) -> None:
+    """Raise InputError for anything but [H, W, 3] float32 in [0, 1] of at least 32 pixels on each side.
+
+    A scorer would give other types and ranges a score too, a wrong one.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
+        raise InputError(
+            f"an image of shape {image.shape} cannot be scored",
+            hint=f"scorers take [H, W, 3] images of at least {MIN_SIDE} pixels on each side",
+        )
+    if image.dtype != np.float32:
+        raise InputError(
+            f"an image of {image.dtype} values cannot be scored",
+            hint="scorers take float32 sRGB in [0, 1]; divide 8-bit values by 255",
+        )
+    low, high = float(image.min()), float(image.max())
+    if not (low >= -_OUTSIDE and high <= 1.0 + _OUTSIDE):  # NaN fails both
+        raise InputError(
+            f"an image with values from {low:g} to {high:g} cannot be scored",
+            hint="scorers take finite sRGB values in [0, 1]",
+        )
+
+
+def mean_over_tiles(
+    figures: Callable[[Sequence[Image]], Iterable[float]], image: Image, sides: Sides
+) -> float:
+    """The mean of a figure over evenly spaced tiles [h, w, 3] that together cover ``image`` [H, W, 3].
+
+    figures: maps tiles, all of one size, to one figure for each, in their order.
+    sides: height and width of a tile, None for the whole side; a smaller image is one tile in that direction.
+
+    Raises InputError as `require_scorable` does.
+    """
+    require_scorable(image)
+    rows, columns = (_cover(length, side) for length, side in zip(image.shape, sides, strict=False))
+    tiles = [image[row, column] for row in rows for column in columns]
+    return float(np.mean(list(figures(tiles)), dtype=np.float64))
+
+
+def _cover(length: int, tile: int | None) -> list[slice]:
+    if tile is None or length <= tile:
+        return [slice(0, length)]
+    count = -(-length // tile)
+    starts = np.linspace(0, length - tile, count).round().astype(int).tolist()
+    return [slice(start, start + tile) for start in starts]

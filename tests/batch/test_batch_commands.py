@@ -58,9 +58,9 @@ def test_a_scene_whose_folder_belongs_to_another_input(
 @pytest.mark.parametrize(
     ("setting", "name", "words"),
     [
-        ("rivr.primary_scorer", "nonesuch", "no scorer is called 'nonesuch'"),
-        ("rivr.expert", "nonesuch", "no restoration expert 'nonesuch'"),
-        ("rivr.expert", "maxim-gopro", "the model maxim-gopro is not installed"),
+        ("rivr.primary_scorer", "nonesuch", "there is no scorer 'nonesuch'"),
+        ("rivr.expert", "nonesuch", "there is no expert 'nonesuch'"),
+        ("rivr.expert", "nafnet-gopro", "the model nafnet-gopro is not installed"),
     ],
 )
 def test_models_that_cannot_be_had_are_told_before_any_work(

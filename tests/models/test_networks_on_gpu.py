@@ -10,10 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import StageError
-from cleargs.models import batches
-from cleargs.models.batches import in_batches
 from cleargs.models.expert import OnnxExpert, expert_path
-from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, network_device
+from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, in_batches, network_device
 from cleargs.models.scorer import CLARITY, LearnedScorer, scorer_path
 
 Floats = NDArray[np.float32]
@@ -95,48 +93,49 @@ def items(count: int) -> list[Floats]:
 
 
 def test_batches_keep_the_order_and_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "PIXELS", 25)
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 25)
     sizes = []
 
     def run(batch: Floats) -> Floats:
         sizes.append(len(batch))
         return -batch
 
-    results = in_batches(run, items(10), 6)
+    results = in_batches(run, items(10))
     assert sizes == [4, 4, 2]
     assert [result[0, 0] for result in results] == [-number for number in range(10)]
     sizes.clear()
-    in_batches(run, items(2), 1000)
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 5)
+    in_batches(run, items(2))
     assert sizes == [1, 1]
 
 
 def test_a_batch_that_does_not_fit_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "PIXELS", 48)
+    monkeypatch.setattr("cleargs.models.onnx.BATCH_PIXELS", 48)
     tried = []
 
     def run(batch: Floats) -> Floats:
         tried.append(len(batch))
         if len(batch) > 2:
-            raise RuntimeError("Failed to allocate memory for requested buffer of size 8589934592")
+            raise MemoryError("Failed to allocate memory for requested buffer of size 8589934592")
         return batch
 
-    results = in_batches(run, items(5), 6)
+    results = in_batches(run, items(5))
     assert tried == [5, 2, 2, 1]
     assert [result[0, 0] for result in results] == list(range(5))
 
 
 def test_one_item_that_does_not_fit_and_other_failures_are_errors() -> None:
     def exhausted(batch: Floats) -> Floats:
-        raise RuntimeError("CUDA error: out of memory")
+        raise MemoryError("CUDA error: out of memory")
 
     def broken(batch: Floats) -> Floats:
         raise RuntimeError("invalid input name")
 
     with pytest.raises(StageError, match="does not hold") as caught:
-        in_batches(exhausted, items(3), 6)
+        in_batches(exhausted, items(3))
     assert "--device cpu" in caught.value.hint
     with pytest.raises(RuntimeError, match="invalid input"):
-        in_batches(broken, items(3), 6)
+        in_batches(broken, items(3))
 
 
 def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,8 +146,7 @@ def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.Monkey
     scorer = LearnedScorer(path, CLARITY, 64)
     monkeypatch.setattr("cleargs.models.tiling.FREE_TILE", 128)
     single, score = expert.restore(image), scorer.score(image)
-    monkeypatch.setattr(expert, "_batches", True)
-    monkeypatch.setattr(scorer, "_batches", True)
+    monkeypatch.setattr(OnnxModel, "takes_batches", True)
     counts: list[tuple[int, int]] = []
     together = expert.restore(image, on_tile=lambda *count: counts.append(count))
     assert len(counts) > 1

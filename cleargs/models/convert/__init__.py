@@ -1,1 +1,0 @@
-"""Conversion of published checkpoints to ONNX."""

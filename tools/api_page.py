@@ -1,0 +1,75 @@
+"""The page docs/api.md, from the docstrings: ``python -m tools.api_page > docs/api.md``."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+
+from pydantic import BaseModel
+
+import cleargs
+
+INTRODUCTION = """\
+# The library
+
+`import cleargs as cg` brings what the command line does to programs, {count} names in all. They are loaded
+when they are first asked for: the import itself takes a moment, and training needs neither pycolmap nor
+OpenImageIO. `examples/` has scripts to start from.
+
+This page is made from the source: `python -m tools.api_page > docs/api.md`.
+"""
+
+
+def page() -> str:
+    """The page, in the order of ``cleargs.__all__``."""
+    sections = (section(name) for name in cleargs.__all__)
+    return "\n".join([INTRODUCTION.format(count=len(cleargs.__all__)), *sections])
+
+
+def section(name: str) -> str:
+    """Heading, signature and docstring of one name; of a class, its fields and methods as well."""
+    found = getattr(cleargs, name)
+    source = inspect.getsource(found).splitlines()
+    node = ast.parse("\n".join(source)).body[0]
+    lines = [f"## {name}", "", *_text(found), ""]
+    if isinstance(node, ast.FunctionDef):
+        lines[2:2] = _code([_signature(node, source)])
+    elif issubclass(found, BaseModel):
+        lines += ["Its fields are settings: [settings.md](settings.md).", ""]
+    elif isinstance(node, ast.ClassDef):
+        fields = [item for item in node.body if isinstance(item, ast.AnnAssign)]
+        if fields:
+            lines += _code([source[item.lineno - 1].strip() for item in fields])
+        for item in _public(node):
+            method = inspect.getattr_static(found, item.name)
+            signature = item.name if isinstance(method, property) else _signature(item, source)
+            lines += [*_code([signature]), *_text(getattr(found, item.name)), ""]
+    return "\n".join(lines)
+
+
+def _public(node: ast.ClassDef) -> Iterator[ast.FunctionDef]:
+    for item in node.body:
+        if isinstance(item, ast.FunctionDef) and (item.name == "__getitem__" or item.name[0] != "_"):
+            yield item
+
+
+def _signature(node: ast.FunctionDef, source: list[str]) -> str:
+    """The call as it stands in ``source``, without ``self``."""
+    lines = source[node.lineno - 1 : node.body[0].lineno - 1]
+    text = "\n".join(line.removeprefix(" " * node.col_offset) for line in lines)
+    text = re.sub(r"\((\n?\s*)(self|cls)(, |,\s*\n\s*)?", r"(\1", text, count=1)
+    return text.removeprefix("def ").removesuffix(":")
+
+
+def _code(lines: list[str]) -> list[str]:
+    return ["```python", *lines, "```", ""]
+
+
+def _text(found: object) -> list[str]:
+    return (inspect.getdoc(found) or "").replace("``", "`").splitlines()
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,94 @@
+"""Install a model of the registry from its PyTorch checkpoint, or convert any restorer that spandrel reads::
+
+.venv-convert/bin/python -m tools.convert_models restormer-motion motion_deblurring.pth --accept-licence
+.venv-convert/bin/python -m tools.convert_models mine.onnx FILE.pth
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from cleargs.errors import CleargsError
+from cleargs.models.install import install
+from cleargs.models.registry import Model, find_model, model_dir
+from cleargs.untrusted import read_bytes
+from tools.convert_models import restorer, scorers
+from tools.convert_models.torch_export import require
+
+_PACKAGES = {
+    "spandrel": ("spandrel", "spandrel_extra_arches", "onnxscript"),
+    "musiq": ("pyiqa", "clip", "onnxscript"),
+    "clip-iqa": ("pyiqa", "clip", "onnxscript"),
+}
+"""What each converter imports."""
+
+
+@click.command()
+@click.argument("target", metavar="NAME|OUTPUT.onnx")
+@click.argument("checkpoint", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--accept-licence", is_flag=True, help="Accept a licence that is not for commercial use.")
+@click.option(
+    "--dir",
+    "directory",
+    envvar="CLEARGS_MODELS",
+    show_envvar=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="The folder of installed models.  [default: in the user's cache folder]",
+)
+@click.option(
+    "--tile",
+    type=click.IntRange(64, 1024),
+    default=256,
+    show_default=True,
+    help="Side in pixels of the tiles that OUTPUT.onnx will run on.",
+)
+def main(target: str, checkpoint: Path, accept_licence: bool, directory: Path | None, tile: int) -> None:
+    """Install the model NAME from its published CHECKPOINT, or write the restoration network of a CHECKPOINT,
+    of any architecture that spandrel reads, as OUTPUT.onnx, for rivr.expert=OUTPUT.onnx."""
+    if target.endswith(".onnx"):
+        require(*_PACKAGES["spandrel"], purpose=f"converting {checkpoint.name}")
+        restorer.convert(read_bytes(checkpoint), Path(target), tile)
+        click.echo(target)
+        return
+    model = find_model(target)
+    click.echo(f"licence of {model.name}: {model.licence}", err=True)
+    for path in install_checkpoint(
+        model, directory or model_dir(), checkpoint, licence_accepted=accept_licence
+    ):
+        click.echo(path)
+
+
+def install_checkpoint(
+    model: Model, directory: Path, checkpoint: Path, *, licence_accepted: bool = False
+) -> list[Path]:
+    """Convert the checkpoint into ``directory``; returns the files written.
+
+    Raises InputError as `install` does, and for a package that is missing from this environment.
+    """
+    require(*_PACKAGES.get(model.converter or "", ()), purpose=f"converting {model.name}")
+    if model.source is not None and not model.source.verified:
+        click.echo(
+            f"warning: the publisher of {model.source.label} states no whole digest: nothing shows that the "
+            "file is the published one. The digest of this file is noted, and later checks compare with it",
+            err=True,
+        )
+
+    def convert(data: bytes, folder: Path) -> None:
+        path = folder / model.files[0].name
+        if model.converter == "spandrel":
+            restorer.convert(data, path)
+        else:
+            scorers.convert(model.converter or "", data, path)
+
+    return install(model, directory, checkpoint, convert=convert, licence_accepted=licence_accepted)
+
+
+if __name__ == "__main__":
+    try:
+        main(prog_name="python -m tools.convert_models")
+    except CleargsError as error:
+        print(f"error: {error}\nhint: {error.hint}", file=sys.stderr)
+        sys.exit(error.exit_code)

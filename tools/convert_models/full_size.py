@@ -1,0 +1,195 @@
+"""The conversions at the published architectures' full size, with random weights: time, memory, and the
+largest difference to PyTorch. And what each model that can be had costs to run.
+
+Converted here, and as installed::
+
+  .venv-convert/bin/python -m tools.convert_models.full_size restormer nafnet musiq clip-iqa
+  .venv/bin/python -m tools.convert_models.full_size embedded clarity-net lpips ...
+
+Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md has the
+figures.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+SIZE = (540, 960)
+"""Of the image that times and memory are measured on, rows and columns."""
+
+
+def image(height: int, width: int) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Smooth noise of several scales, sRGB in [0, 1]."""
+    rng = np.random.default_rng([height, width])
+    planes = [
+        nn.functional.interpolate(
+            torch.from_numpy(rng.random((1, 3, height // s + 1, width // s + 1), np.float32)),
+            size=(height, width),
+            mode="bilinear",
+        )
+        for s in (1, 4, 16)
+    ]
+    mean: np.ndarray[Any, np.dtype[np.float32]] = (sum(planes) / 3)[0].permute(1, 2, 0).numpy()  # type: ignore[union-attr, index]
+    return np.ascontiguousarray(mean)
+
+
+def peak_gb() -> float:
+    """Most memory that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def checkpoint(network: nn.Module) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(network.state_dict(), buffer)
+    return buffer.getvalue()
+
+
+def published(name: str) -> nn.Module:
+    """The published architecture with random weights, none of which leaves the image as it is."""
+    from tools.convert_models.torch_export import mend_torchvision
+
+    mend_torchvision()
+    torch.manual_seed(0)
+    if name == "restormer":
+        from spandrel_extra_arches.architectures.Restormer.__arch.restormer_arch import Restormer
+
+        return Restormer().eval()  # dim 48, blocks 4 6 6 8, 4 of refinement: the motion deblurring one
+    if name == "nafnet":
+        from spandrel.architectures.NAFNet.__arch.NAFNet_arch import NAFNet
+
+        network = NAFNet(width=64, middle_blk_num=1, enc_blk_nums=[1, 1, 1, 28], dec_blk_nums=[1, 1, 1, 1])
+        for label, weights in network.named_parameters():
+            if label.endswith(("beta", "gamma")):
+                nn.init.normal_(weights, std=0.1)
+        return network.eval()
+    if name == "musiq":
+        from pyiqa.archs.musiq_arch import MUSIQ
+
+        return MUSIQ(pretrained=False).eval()
+    from pyiqa.archs import clip_model
+
+    # CLIP's RN50: images of 224 px, layers 3 4 6 3 of width 64; 77 tokens of text, width 512, 12 layers
+    clip = clip_model.CLIP(1024, 224, (3, 4, 6, 3), 64, 0, 77, 49408, 512, 8, 12).eval()
+    for weights in clip.visual.parameters():
+        if not weights.any():
+            nn.init.normal_(weights, std=0.3)
+    return clip
+
+
+def convert(name: str, path: Path) -> dict[str, Any]:
+    """Convert the random network and compare it with PyTorch."""
+    from cleargs.models.expert import OnnxExpert
+    from cleargs.models.musiq import MusiqScorer
+    from cleargs.models.scorer import LearnedScorer
+    from tools.convert_models import restorer, scorers
+
+    network, start = published(name), time.process_time()
+    tile = image(256, 256)
+    if name in ("restormer", "nafnet"):
+        restorer.convert(checkpoint(network), path)
+        took, held = time.process_time() - start, peak_gb()
+        with torch.no_grad():
+            expected = network(torch.from_numpy(tile).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy()
+        found: Any = OnnxExpert(path).restore(tile)
+        expected, scale = expected.clip(0, 1), float(np.abs(expected.clip(0, 1) - tile).max())
+    else:
+        if name == "musiq":
+            scorers.convert("musiq", checkpoint(network), path)
+            reference, scorer, factor = network, MusiqScorer(path), 1.0
+        else:
+            from pyiqa.archs import clipiqa_arch
+
+            clipiqa_arch.load = lambda backbone, device: network  # else it would download CLIP
+            scorers.convert("clip-iqa", b"", path)
+            reference, scorer, factor = clipiqa_arch.CLIPIQA().eval(), LearnedScorer(path), 100.0
+        took, held = time.process_time() - start, peak_gb()
+        sizes = [(270, 480), (200, 90), (64, 300), (256, 256)]
+        with torch.no_grad():
+            expected = np.array(
+                [
+                    factor * reference(torch.from_numpy(image(*size)).permute(2, 0, 1)[None]).item()
+                    for size in sizes
+                ]
+            )
+        found = np.array([scorer.score(image(*size)) for size in sizes])
+        scale = float(np.ptp(expected))
+    return {
+        "parameters_m": sum(weights.numel() for weights in network.parameters()) / 1e6,
+        "onnx_mb": path.stat().st_size / 1e6,
+        "conversion_s": took,
+        "conversion_gb": held,
+        "largest_difference": float(np.abs(found - expected).max()),
+        "what_the_network_changes": scale,
+    }
+
+
+def cost(name: str, path: Path | None) -> dict[str, Any]:
+    """Seconds a megapixel and memory of the model on one thread; ``path``: of a network converted here."""
+    from cleargs.models.expert import OnnxExpert, load_expert
+    from cleargs.models.lpips import Lpips
+    from cleargs.models.musiq import MusiqScorer
+    from cleargs.models.scorer import LearnedScorer, load_scorer
+
+    before, shown = peak_gb(), image(*SIZE)
+    if name in ("restormer", "nafnet"):
+        assert path is not None
+        work: Any = OnnxExpert(path).restore
+    elif name in ("musiq", "clip-iqa"):
+        assert path is not None
+        work = (MusiqScorer(path) if name == "musiq" else LearnedScorer(path)).score
+    elif name.startswith("lpips"):
+        metric = Lpips("vgg" if name == "lpips-vgg" else "alex")
+
+        def work(one: Any) -> Any:
+            return metric.distance(one, one[::-1].copy())
+
+    else:
+        work = load_expert(name).restore if name == "embedded" else load_scorer(name).score
+    first = image(256, 256)
+    work(first)
+    start = time.process_time()
+    work(shown)
+    seconds = time.process_time() - start
+    return {"seconds_a_megapixel": seconds / (SIZE[0] * SIZE[1] / 1e6), "memory_gb": peak_gb() - before}
+
+
+def main(names: list[str]) -> None:
+    if len(names) == 3 and names[0] in ("--convert", "--cost"):
+        torch.set_num_threads(1)
+        path = Path(names[2])
+        print(json.dumps(convert(names[1], path) if names[0] == "--convert" else cost(names[1], path)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            path = Path(folder) / f"{name}.onnx"
+            figures: dict[str, Any] = {"model": name}
+            kinds = (
+                ["--cost"]
+                if name not in ("restormer", "nafnet", "musiq", "clip-iqa")
+                else ["--convert", "--cost"]
+            )
+            for kind in kinds:
+                command = [sys.executable, "-m", "tools.convert_models.full_size", kind, name, str(path)]
+                figures |= json.loads(
+                    subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1]
+                )
+            print(
+                json.dumps({k: v if isinstance(v, str) else float(f"{v:.3g}") for k, v in figures.items()}),
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,319 @@
+"""Artefacts of sharpening, restoration and splatting, imitated on photographs.
+
+They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer: what it is asked
+to tell apart are renders of a Gaussian scene, restored frames and fusions of the two.
+
+Images are [H, W, 3] float32 sRGB in [0, 1], in and out; every random choice comes from the generator passed
+in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from tools.train_models.degrade import (
+    Degradation,
+    Image,
+    Kernel,
+    degrade,
+    disc_kernel,
+    jpeg,
+    motion_kernel,
+)
+
+
+def unsharp(image: Image, sigma: float, amount: float) -> Image:
+    """Unsharp masking: I + amount (I - blur_sigma(I)). Over-sharpening from an amount of about 1."""
+    return _clip(image + amount * (image - _gaussian(image, sigma)))
+
+
+def gibbs(image: Image, cutoff: float, gain: float) -> Image:
+    """Ringing: an abrupt low pass at ``cutoff`` cycles a pixel (0..0.5) with ``gain`` >= 1 just below it."""
+    f = _frequency(image.shape[0] * 2, image.shape[1] * 2)
+    response = np.where(f <= cutoff, 1.0 + (gain - 1.0) * (f / cutoff) ** 2, 0.0)
+    return _filter(image, response)
+
+
+def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
+    """Wiener deconvolution by ``kernel`` (odd, at most the size of the image) on the encoded values.
+
+    With a wrong kernel or too small a ``noise_to_signal`` it rings, as over-eager restorers do.
+    """
+    padded = np.zeros((image.shape[0] * 2, image.shape[1] * 2), np.float64)
+    radius = kernel.shape[0] // 2
+    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+    transfer = np.fft.rfft2(np.roll(padded, (-radius, -radius), axis=(0, 1)))
+    return _filter(image, np.conj(transfer) / (np.abs(transfer) ** 2 + noise_to_signal))
+
+
+def ghost(image: Image, dx: float, dy: float, share: float) -> Image:
+    """A second exposure, shifted by (dx, dy) pixels, that takes ``share`` of the (linear) light."""
+    linear = linear_from_srgb(image)
+    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
+    size = (image.shape[1], image.shape[0])
+    moved = cv2.warpAffine(linear, shift, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return srgb_from_linear(_clip((1.0 - share) * linear + share * moved))
+
+
+def splat(image: Image, rng: np.random.Generator, spacing: float, stretch: float) -> Image:
+    """The image as about one anisotropic Gaussian per ``spacing``² pixels can show it.
+
+    Gaussians lie along local edges, elongated by up to ``stretch``, with random footprints; a second pass
+    splats what the first one left over, as optimisation would. High frequencies are lost unevenly, edges
+    become brush strokes.
+    """
+    tensor = [_gaussian(t, 1.5) for t in _structure(image)]
+    height, width = image.shape[:2]
+    count = int(height * width / spacing**2)
+    out = np.zeros_like(image)
+    for _ in range(2):
+        x = rng.uniform(0, width, count)
+        y = rng.uniform(0, height, count)
+        column, row = x.astype(np.int64), y.astype(np.int64)
+        xx, xy, yy = (t[row, column] for t in tensor)
+        along = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2 + rng.normal(0.0, 0.2, count)
+        anisotropy = np.sqrt((xx - yy) ** 2 + 4 * xy**2) / (xx + yy + 1e-6)
+        size = spacing * rng.lognormal(-0.35, 0.35, count)
+        elongation = 1.0 + (stretch - 1.0) * anisotropy * rng.random(count)
+        footprint = np.stack([x, y, along, size * np.sqrt(elongation), size / np.sqrt(elongation)], axis=1)
+        residual = image - out
+        colours = _gaussian(residual, 0.4 * spacing)[row, column]
+        out = out + _splat_mean(footprint, colours, height, width)
+    return _clip(out)
+
+
+def floaters(image: Image, rng: np.random.Generator, count: int, needle_share: float) -> Image:
+    """``count`` stray Gaussians in front of the image: soft blobs, and needles for a share of them."""
+    out = image.copy()
+    height, width = image.shape[:2]
+    for _ in range(count):
+        if rng.random() < needle_share:
+            major, minor = rng.uniform(6.0, 30.0), rng.uniform(0.4, 1.2)
+        else:
+            major = rng.uniform(2.0, 14.0)
+            minor = major * rng.uniform(0.3, 1.0)
+        footprint = np.array(
+            [rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, np.pi), major, minor]
+        )
+        source = image[rng.integers(height), rng.integers(width)]
+        colour = np.clip(source + rng.normal(0.0, 0.15, 3), 0.0, 1.0).astype(np.float32)
+        window, weight = _footprint(footprint, height, width)
+        alpha = (rng.uniform(0.2, 0.95) * weight)[..., None].astype(np.float32)
+        out[window] += alpha * (colour - out[window])
+    return out
+
+
+def fuse(render: Image, restored: Image, sigma: float) -> Image:
+    """RIVR's third candidate: clip(R + D - blur_sigma(D))."""
+    return _clip(render + restored - _gaussian(restored, sigma))
+
+
+def motion(image: Image, rng: np.random.Generator) -> Image:
+    """Motion blur of 1.5-20 px with sensor noise of at most 1/255."""
+    kernel = motion_kernel(rng, _log_uniform(rng, 1.5, 20.0))
+    return degrade(image, Degradation(kernel, noise=rng.uniform(0.0, 1.0 / 255.0)), rng)
+
+
+def defocus(image: Image, rng: np.random.Generator) -> Image:
+    """Disc or Gaussian-like blur with radius 0.6-6 px."""
+    radius = _log_uniform(rng, 0.6, 6.0)
+    if rng.random() < 0.5:
+        return _gaussian(image, 0.6 * radius)
+    return degrade(image, Degradation(disc_kernel(radius)), rng)
+
+
+def noise(image: Image, rng: np.random.Generator) -> Image:
+    """White or slightly smoothed (demosaicked) noise of 2-32/255."""
+    level = _log_uniform(rng, 2.0, 32.0) / 255.0
+    grain = rng.standard_normal(image.shape, np.float32)
+    if rng.random() < 0.4:
+        grain = _gaussian(grain, rng.uniform(0.4, 1.0))
+        grain /= grain.std()
+    return _clip(image + np.float32(level) * grain)
+
+
+def ringing(image: Image, rng: np.random.Generator) -> Image:
+    """Gibbs ringing, or deconvolution of a sharp image by a kernel that never blurred it."""
+    if rng.random() < 0.5:
+        return gibbs(image, rng.uniform(0.12, 0.4), rng.uniform(1.0, 2.5))
+    kernel = (
+        motion_kernel(rng, rng.uniform(2.0, 9.0))
+        if rng.random() < 0.5
+        else disc_kernel(rng.uniform(0.8, 3.0))
+    )
+    return wiener(image, kernel, _log_uniform(rng, 0.01, 0.3))
+
+
+def oversharp(image: Image, rng: np.random.Generator) -> Image:
+    """Unsharp masking from barely visible to harsh."""
+    return unsharp(image, _log_uniform(rng, 0.6, 4.0), _log_uniform(rng, 0.4, 5.0))
+
+
+def ghosting(image: Image, rng: np.random.Generator) -> Image:
+    """One or two faint shifted copies, 2-16 px away."""
+    for _ in range(int(rng.integers(1, 3))):
+        angle, distance = rng.uniform(0, 2 * np.pi), _log_uniform(rng, 2.0, 16.0)
+        image = ghost(image, distance * np.cos(angle), distance * np.sin(angle), rng.uniform(0.12, 0.5))
+    return image
+
+
+def blocks(image: Image, rng: np.random.Generator) -> Image:
+    """JPEG at quality 8-80."""
+    return jpeg(image, int(_log_uniform(rng, 8.0, 80.0)))
+
+
+def rendered(image: Image, rng: np.random.Generator) -> Image:
+    """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
+    front."""
+    out = splat(image, rng, _log_uniform(rng, 2.2, 7.0), rng.uniform(1.5, 8.0))
+    if rng.random() < 0.5:
+        share = patches(image.shape[0], image.shape[1], rng)
+        out = out + share * (_gaussian(image, rng.uniform(0.3, 4.0)) - out)
+    if rng.random() < 0.5:
+        out = floaters(out, rng, int(rng.integers(1, 12)), rng.random())
+    return out
+
+
+def stray(image: Image, rng: np.random.Generator) -> Image:
+    """Floaters and needles over a sharp or slightly soft image."""
+    soft = _gaussian(image, rng.uniform(0.2, 1.2)) if rng.random() < 0.6 else image
+    return floaters(soft, rng, int(_log_uniform(rng, 2.0, 40.0)), rng.random())
+
+
+def restored(image: Image, rng: np.random.Generator) -> Image:
+    """A blurred image after restoration: too timid, about right, or ringing."""
+    length = rng.uniform(2.0, 14.0)
+    kernel = motion_kernel(rng, length) if rng.random() < 0.7 else disc_kernel(length / 4)
+    blurred = degrade(image, Degradation(kernel, noise=rng.uniform(0.0, 1.0 / 255.0)), rng)
+    if rng.random() < 0.4:
+        return unsharp(blurred, _log_uniform(rng, 0.8, 4.0), _log_uniform(rng, 0.3, 3.0))
+    return wiener(blurred, kernel, _log_uniform(rng, 0.001, 0.1))
+
+
+def fused(image: Image, rng: np.random.Generator) -> Image:
+    """A splat-like render with the detail of a restored frame added; now and then slightly misaligned."""
+    detail = restored(image, rng)
+    if rng.random() < 0.4:
+        shift = np.array([[1, 0, rng.normal(0, 1.5)], [0, 1, rng.normal(0, 1.5)]], np.float32)
+        detail = cv2.warpAffine(
+            detail, shift, (image.shape[1], image.shape[0]), borderMode=cv2.BORDER_REFLECT_101
+        ).astype(np.float32)
+    return fuse(rendered(image, rng), detail, _log_uniform(rng, 0.8, 5.0))
+
+
+def mixed(image: Image, rng: np.random.Generator) -> Image:
+    """Two or three of the other artefacts in a random order."""
+    names = rng.choice(len(_SIMPLE), size=int(rng.integers(2, 4)), replace=False)
+    for index in names:
+        image = _SIMPLE[int(index)](image, rng)
+    return image
+
+
+_SIMPLE: tuple[Callable[[Image, np.random.Generator], Image], ...] = (
+    motion, defocus, noise, ringing, oversharp, ghosting, blocks, rendered, stray,
+)  # fmt: skip
+
+KINDS: dict[str, Callable[[Image, np.random.Generator], Image]] = {
+    "clean": lambda image, rng: image,
+    "motion": motion,
+    "defocus": defocus,
+    "noise": noise,
+    "ringing": ringing,
+    "oversharp": oversharp,
+    "ghosting": ghosting,
+    "blocks": blocks,
+    "rendered": rendered,
+    "stray": stray,
+    "restored": restored,
+    "fused": fused,
+    "mixed": mixed,
+}
+
+
+def _clip(image: NDArray[np.floating]) -> Image:
+    return np.asarray(np.clip(image, 0.0, 1.0), np.float32)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _gaussian(image: Image, sigma: float) -> Image:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), np.float32)
+
+
+def _frequency(height: int, width: int) -> NDArray[np.float64]:
+    return np.asarray(np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]), np.float64)
+
+
+def _filter(image: Image, response: NDArray[np.floating] | NDArray[np.complexfloating]) -> Image:
+    """Filter in the Fourier domain of the mirrored image, so that its borders do not wrap around."""
+    height, width = image.shape[:2]
+    mirrored = np.pad(image, ((0, height), (0, width), (0, 0)), mode="symmetric")
+    spectrum = np.fft.rfft2(mirrored, axes=(0, 1)) * response[..., None]
+    return _clip(np.fft.irfft2(spectrum, s=mirrored.shape[:2], axes=(0, 1))[:height, :width])
+
+
+def _structure(image: Image) -> tuple[Image, Image, Image]:
+    luma = image.mean(axis=2)
+    gx, gy = cv2.Sobel(luma, cv2.CV_32F, 1, 0), cv2.Sobel(luma, cv2.CV_32F, 0, 1)
+    return gx * gx, gx * gy, gy * gy
+
+
+def patches(height: int, width: int, rng: np.random.Generator) -> Image:
+    """A smooth random mask with values from 0 to 1. [H, W, 1]"""
+    coarse = rng.standard_normal((height, width), np.float32)
+    field = _gaussian(coarse, rng.uniform(8.0, 32.0))
+    return _clip(0.5 + field / (field.std() + 1e-9))[..., None]
+
+
+def _footprint(
+    gaussian: NDArray[
+        np.float64
+    ],  # [5] x, y, angle of the major axis, its deviation, the minor axis' deviation
+    height: int,
+    width: int,
+) -> tuple[tuple[slice, slice], NDArray[np.float64]]:
+    """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the
+    centre."""
+    x, y, angle, major, minor = gaussian
+    c, s = np.cos(angle), np.sin(angle)
+    reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)
+    rows = slice(max(0, int(y - reach_y)), min(height, int(y + reach_y) + 1))
+    columns = slice(max(0, int(x - reach_x)), min(width, int(x + reach_x) + 1))
+    dy = np.arange(rows.start, rows.stop)[:, None] + 0.5 - y
+    dx = np.arange(columns.start, columns.stop)[None, :] + 0.5 - x
+    u, v = (c * dx + s * dy) / major, (c * dy - s * dx) / minor
+    return (rows, columns), np.exp(-0.5 * (u * u + v * v))
+
+
+@njit(cache=True)  # numpy takes half a second a patch
+def _splat_mean(
+    gaussians: NDArray[np.float64],  # [N, 5] as in _footprint
+    colours: Image,  # [N, 3]
+    height: int,
+    width: int,
+) -> Image:
+    """The weighted mean of the colours of all Gaussians at every pixel. [H, W, 3]"""
+    total = np.zeros((height, width, 3), np.float64)
+    weights = np.full((height, width, 1), 1e-6)
+    for n in range(gaussians.shape[0]):
+        x, y, angle, major, minor = gaussians[n]
+        c, s = np.cos(angle), np.sin(angle)
+        reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)
+        for row in range(max(0, int(y - reach_y)), min(height, int(y + reach_y) + 1)):
+            for column in range(max(0, int(x - reach_x)), min(width, int(x + reach_x) + 1)):
+                dx, dy = column + 0.5 - x, row + 0.5 - y
+                u, v = (c * dx + s * dy) / major, (c * dy - s * dx) / minor
+                weight = np.exp(-0.5 * (u * u + v * v))
+                weights[row, column, 0] += weight
+                for channel in range(3):
+                    total[row, column, channel] += weight * colours[n, channel]
+    mean: Image = (total / weights).astype(np.float32)
+    return mean
