@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,6 +18,24 @@ from cleargs.files import atomic_path
 def column(name: str, kind: pa.DataType, meaning: str, *, nullable: bool = False) -> pa.Field:
     """A field whose ``meaning`` (with its unit and range) travels in the file."""
     return pa.field(name, kind, nullable=nullable, metadata={"meaning": meaning})
+
+
+def schema_of(row: type) -> pa.Schema:
+    """Return the schema of the table whose rows are instances of the dataclass ``row``.
+
+    A field ``Annotated[TYPE, MEANING]`` is a column, nullable where None is allowed. A field without a
+    meaning is not a column. An Arrow type before the meaning replaces the usual int32, float64, bool or text.
+    """
+    hints = get_type_hints(row, include_extras=True)
+    return pa.schema([_column(name, hint) for name, hint in hints.items() if get_origin(hint) is Annotated])
+
+
+def _column(name: str, hint: Any) -> pa.Field:
+    annotation, *kind, meaning = get_args(hint)
+    members = get_args(annotation) if get_origin(annotation) is UnionType else (annotation,)
+    plain = str if get_origin(members[0]) is Literal else members[0]
+    usual = {int: pa.int32(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
+    return column(name, kind[0] if kind else usual[plain], meaning, nullable=NoneType in members)
 
 
 def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:

@@ -18,14 +18,13 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import plugin_versions
 from cleargs.plugins import plugins
-from cleargs.progress import SilentReporter
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trainer, train
+from cleargs.splat.trainer import Trainer
 from cleargs.splat.views import View
 
 PARTS = Path(__file__).parents[1] / "examples" / "parts"
@@ -63,14 +62,14 @@ def test_nothing_is_imported_before_it_is_named(parts: Path) -> None:
     for name in [name for name in sys.modules if name.startswith("cleargs_parts")]:
         del sys.modules[name]
     assert list(plugins("evaluators")) == ["contrast"]
-    config = load_config(installed(), "default", ["rva.evaluator=contrast", "g0.strategy=prune-only"])
+    config = load_config(installed(), "default", ["rva.evaluator=contrast"])
     assert config.sections["rva"].evaluator == "contrast"
     assert not any(name.startswith("cleargs_parts") for name in sys.modules)
 
 
 @pytest.mark.parametrize(
     ("setting", "wrong", "near"),
-    [("rva.evaluator", "kontrast", "contrast"), ("g0.strategy", "prune_only", "prune-only")],
+    [("rva.evaluator", "kontrast", "contrast"), ("ingest.layout", "listet", "listed")],
 )
 def test_an_unknown_name_is_refused_with_the_nearest(
     setting: str, wrong: str, near: str, parts: Path
@@ -91,13 +90,12 @@ def test_without_the_package_its_names_are_unknown() -> None:
 
 
 def test_the_version_of_the_package_is_in_the_key(parts: Path) -> None:
-    overrides = ["rva.evaluator=contrast", "rivr.tiebreak_scorer=gradient", "rivr.distil.strategy=prune-only"]
+    overrides = ["rva.evaluator=contrast", "rivr.tiebreak_scorer=gradient"]
     sections = load_config(installed(), "default", overrides).sections
     assert plugin_versions(sections["g0"]) == {}
     assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.0"}
     assert plugin_versions(sections["rivr"]) == {
         "cleargs-parts for tiebreak_scorer=gradient": "1.0",
-        "cleargs-parts for distil.strategy=prune-only": "1.0",
     }
     install(parts, "1.1")
     assert plugin_versions(sections["rva"]) == {"cleargs-parts for evaluator=contrast": "1.1"}
@@ -172,23 +170,6 @@ def toy_views(scene: Scene, dim: float = 0.0) -> list[View]:
         pixels = (image * (1.0 - dim * ((x * x + y * y) / 2))[..., None]).astype(np.float32)
         made.append(View(number, camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
     return made
-
-
-def test_strategy(parts: Path, tmp_path: Path) -> None:
-    scene = toy()
-    scene.gaussians.logit_opacities[:10] = -9.0  # faint: to be removed
-    config = TrainConfig(
-        steps=6, strategy="prune-only", refine_every=1 / 3, refine_start=0.0, opacity_reg=0.0
-    )
-    trained = train(
-        scene,
-        toy_views(scene),
-        config,
-        seed=(0,),
-        checkpoint=tmp_path / "checkpoint",
-        reporter=SilentReporter(),
-    )
-    assert trained.scene.gaussians.num == 20
 
 
 def test_formation(parts: Path) -> None:

@@ -9,41 +9,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.parquet import column, read_table
+from cleargs.parquet import column, read_table, schema_of
 
 _POSE = "world to camera (COLMAP, OpenCV axes); null when unregistered"
+_Size = Annotated[int, "of the undistorted image, px"]
+_Focal = Annotated[float, "focal length, px"]
+_Centre = Annotated[float, "principal point, px; the centre of the first pixel is 0.5"]
+_Rotation = Annotated[float | None, f"rotation, {_POSE}"]
+_Translation = Annotated[float | None, f"translation, {_POSE}"]
 
-FRAMES = pa.schema(
-    [
-        column("frame_id", pa.int32(), "position in the capture, from 0, without gaps"),
-        column("name", pa.string(), "name in the input: file path, or video name and frame number"),
-        column("image", pa.string(), "undistorted PNG, relative to this folder"),
-        column("time_s", pa.float64(), "presentation time, s; null without a clock", nullable=True),
-        column("width", pa.int32(), "of the undistorted image, px"),
-        column("height", pa.int32(), "of the undistorted image, px"),
-        column("fx", pa.float64(), "focal length, px"),
-        column("fy", pa.float64(), "focal length, px"),
-        column("cx", pa.float64(), "principal point, px; the centre of the first pixel is 0.5"),
-        column("cy", pa.float64(), "principal point, px; the centre of the first pixel is 0.5"),
-        column("qw", pa.float64(), f"rotation, {_POSE}", nullable=True),
-        column("qx", pa.float64(), f"rotation, {_POSE}", nullable=True),
-        column("qy", pa.float64(), f"rotation, {_POSE}", nullable=True),
-        column("qz", pa.float64(), f"rotation, {_POSE}", nullable=True),
-        column("tx", pa.float64(), f"translation, {_POSE}", nullable=True),
-        column("ty", pa.float64(), f"translation, {_POSE}", nullable=True),
-        column("tz", pa.float64(), f"translation, {_POSE}", nullable=True),
-        column("registered", pa.bool_(), "whether the frame has a pose"),
-        column("n_points", pa.int32(), "sparse points that the frame observes"),
-        column("split", pa.string(), "train, or test (held out: has a pose, enters nothing else)"),
-        column("placed", pa.string(), "how the pose was found, or why there is none", nullable=True),
-    ]
-)
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a prepared capture. Images are pinhole: undistorted, resized, PNG."""
+
+    frame_id: Annotated[int, "position in the capture, from 0, without gaps"]
+    name: Annotated[str, "name in the input: file path, or video name and frame number"]
+    image: Annotated[str, "undistorted PNG, relative to this folder"]
+    time_s: Annotated[float | None, "presentation time, s; null without a clock"]
+    width: _Size
+    height: _Size
+    fx: _Focal
+    fy: _Focal
+    cx: _Centre
+    cy: _Centre
+    qw: _Rotation
+    qx: _Rotation
+    qy: _Rotation
+    qz: _Rotation
+    tx: _Translation
+    ty: _Translation
+    tz: _Translation
+    registered: Annotated[bool, "whether the frame has a pose"]
+    n_points: Annotated[int, "sparse points that the frame observes"]
+    split: Annotated[Literal["train", "test"], "train, or test (held out: has a pose, enters nothing else)"]
+    placed: Annotated[str | None, "how the pose was found, or why there is none"]
+    mask: str | None
+    """No column: path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None."""
+
+
+FRAMES = schema_of(Frame)
 
 POINTS = pa.schema(
     [
@@ -65,37 +76,6 @@ OBSERVATIONS = pa.schema(
         column("point_id", pa.int64(), "sparse point that it observes (the paper's P_i), once a pair"),
     ]
 )
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame of a prepared capture. Images are pinhole: undistorted, resized, PNG."""
-
-    frame_id: int
-    name: str
-    image: str
-    """Path relative to the ingest folder, ``images/000012.png``."""
-    mask: str | None
-    """Path relative to the ingest folder, ``masks/000012.png`` (0 = ignore), or None."""
-    time_s: float | None
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    qw: float | None
-    qx: float | None
-    qy: float | None
-    qz: float | None
-    tx: float | None
-    ty: float | None
-    tz: float | None
-    registered: bool
-    n_points: int
-    split: Literal["train", "test"]
-    placed: str | None
-    """How the pose was found, or why there is none; None in runs of older versions."""
 
 
 @dataclass(frozen=True)

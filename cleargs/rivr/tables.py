@@ -5,84 +5,59 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pyarrow as pa
 
-from cleargs.parquet import column, read_table, write_table
+from cleargs.parquet import read_table, schema_of, write_table
 from cleargs.rivr.candidates import Chosen, Source
 
-
-def _scores(role: str, use: str) -> list[pa.Field]:
-    meaning = f"{role} score, 0-100, higher is better, of"
-    return [
-        column(f"{role}_metric", pa.string(), f"name of the scorer that {use}"),
-        column(f"{role}_render", pa.float32(), f"{meaning} the render R_t"),
-        column(f"{role}_restored", pa.float32(), f"{meaning} the restored observation D_t"),
-        column(f"{role}_fused", pa.float32(), f"{meaning} the fusion F_t; null without it", nullable=True),
-        column(
-            f"{role}_observed",
-            pa.float32(),
-            f"{meaning} the raw frame O_t; null with rivr.keep_raw=false",
-            nullable=True,
-        ),
-    ]
-
-
-SELECTION = pa.schema(
-    [
-        column("round", pa.int32(), "from 1"),
-        column("frame_id", pa.int32(), "target frame t"),
-        column(
-            "exr",
-            pa.string(),
-            "layers render, restored, fused, observed, deblurred, explained; below the rivr folder",
-        ),
-        *_scores("primary", "decides"),
-        *_scores("tiebreak", "decides among the candidates within rivr.margin of the best primary score"),
-        column(
-            "restored_from", pa.string(), "what the expert restored to D_t: observation, deblurred or render"
-        ),
-        column("blur_px", pa.float32(), "mean way of the pixels while exposed, as undone", nullable=True),
-        column("skew_px", pa.float32(), "their mean way from the first to the last row", nullable=True),
-        column("chosen", pa.string(), "render, restored or fused; observed: the raw frame needs no repair"),
-        column("accepted", pa.bool_(), "whether the chosen candidate became a pseudo observation"),
-        column("reason", pa.string(), "why it was chosen, or why there is no pseudo observation"),
-    ]
-)
-
-REPAIRS = pa.schema(
-    [
-        column("frame_id", pa.int32(), "frame with an accepted repair"),
-        column("round", pa.int32(), "its latest accepted round, from 1"),
-        column("exr", pa.string(), "layered EXR, relative to the rivr folder"),
-        column("chosen", pa.string(), "layer that supervises: render, restored or fused"),
-    ]
-)
+_NAME = "name of the scorer that decides"
+_SCORE = "score, 0-100, higher is better, of"
+_FUSED = "the fusion F_t; null without it"
+_OBSERVED = "the raw frame O_t; null with rivr.keep_raw=false"
 
 
 @dataclass(frozen=True)
 class Selection:
     """One row of ``rivr/selection.parquet``. Scores are float32 values, as the EXR holds them."""
 
-    round: int
-    frame_id: int
-    exr: str
-    primary_metric: str
-    primary_render: float
-    primary_restored: float
-    primary_fused: float | None
-    primary_observed: float | None
-    tiebreak_metric: str
-    tiebreak_render: float
-    tiebreak_restored: float
-    tiebreak_fused: float | None
-    tiebreak_observed: float | None
-    restored_from: Source
-    blur_px: float | None
-    skew_px: float | None
-    chosen: Chosen
-    accepted: bool
-    reason: str
+    round: Annotated[int, "from 1"]
+    frame_id: Annotated[int, "target frame t"]
+    exr: Annotated[
+        str, "layers render, restored, fused, observed, deblurred, explained; below the rivr folder"
+    ]
+    primary_metric: Annotated[str, _NAME]
+    primary_render: Annotated[float, pa.float32(), f"primary {_SCORE} the render R_t"]
+    primary_restored: Annotated[float, pa.float32(), f"primary {_SCORE} the restored observation D_t"]
+    primary_fused: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_FUSED}"]
+    primary_observed: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_OBSERVED}"]
+    tiebreak_metric: Annotated[
+        str, f"{_NAME} among the candidates within rivr.margin of the best primary score"
+    ]
+    tiebreak_render: Annotated[float, pa.float32(), f"tiebreak {_SCORE} the render R_t"]
+    tiebreak_restored: Annotated[float, pa.float32(), f"tiebreak {_SCORE} the restored observation D_t"]
+    tiebreak_fused: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_FUSED}"]
+    tiebreak_observed: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_OBSERVED}"]
+    restored_from: Annotated[Source, "what the expert restored to D_t: observation, deblurred or render"]
+    blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
+    skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]
+    chosen: Annotated[Chosen, "render, restored or fused; observed: the raw frame needs no repair"]
+    accepted: Annotated[bool, "whether the chosen candidate became a pseudo observation"]
+    reason: Annotated[str, "why it was chosen, or why there is no pseudo observation"]
+
+
+@dataclass(frozen=True)
+class Repair:
+    """One row of ``consolidate/repairs.parquet``."""
+
+    frame_id: Annotated[int, "frame with an accepted repair"]
+    round: Annotated[int, "its latest accepted round, from 1"]
+    exr: Annotated[str, "layered EXR, relative to the rivr folder"]
+    chosen: Annotated[Chosen, "layer that supervises: render, restored or fused"]
+
+
+SELECTION, REPAIRS = schema_of(Selection), schema_of(Repair)
 
 
 def write_selection(path: Path, rows: list[Selection]) -> None:

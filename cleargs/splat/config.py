@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cleargs.plugins import require_known
 from cleargs.record import Unit
 from cleargs.splat.effort import Quality, steps_from_frames
-
-STRATEGIES = ("mcmc", "adaptive")
-"""Densification strategies that ship with ClearGS."""
 
 
 class FormationConfig(BaseModel):
@@ -45,30 +41,6 @@ class FormationConfig(BaseModel):
         le=1,
         description="difference of colour (sRGB, mean of a neighbourhood; 0.05, say) beyond which pixels "
         "that stay unexplained count less: for captures with people or things that move; 0: never",
-    )
-
-
-class AdaptiveConfig(BaseModel):
-    """The strategy ``adaptive``. Lengths are shares of the scene's radius; the values are those of 3DGS."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    grad: float = Field(
-        2e-4,
-        gt=0,
-        description="mean gradient by the place on a screen of 2 by 2 from which a Gaussian is copied",
-    )
-    dense: float = Field(
-        0.01, ge=0, description="largest scale of one that is copied as it is; a larger one is split in two"
-    )
-    large: float = Field(
-        0.1, gt=0, description="scale above which one is removed, once opacities have been lowered"
-    )
-    reset: float = Field(
-        0.1,
-        ge=0,
-        le=1,
-        description="share of the schedule after which opacities are lowered again; 0: never",
     )
 
 
@@ -118,13 +90,6 @@ class TrainConfig(BaseModel):
     coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
 
     densify: bool = Field(True, description="let the strategy change the number and places of the Gaussians")
-    strategy: str = Field(
-        "mcmc",
-        json_schema_extra={"plugin": "strategies"},
-        description="how the Gaussians change; mcmc: cut where the error is, up to the budget; adaptive: "
-        "cloned and split by their gradients on the screen, as in 3DGS; or one that another package brings",
-    )
-    adaptive: AdaptiveConfig = Field(AdaptiveConfig(), description="the strategy adaptive")
     budget: int | None = Field(
         None,
         ge=1,
@@ -234,11 +199,6 @@ class TrainConfig(BaseModel):
         if self.begin >= self.end:
             raise ValueError(f"the schedule cannot end at {self.end} where it begins at {self.begin}")
         return self
-
-    @field_validator("strategy")
-    @classmethod
-    def _strategy_is_known(cls, name: str) -> str:
-        return require_known("strategies", name, STRATEGIES)
 
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19

@@ -36,7 +36,7 @@ from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.strategy import make_strategy
+from cleargs.splat.strategy.mcmc import MCMC
 from cleargs.splat.train_log import TrainLog
 from cleargs.splat.views import ImageCache, View, require_views
 
@@ -159,7 +159,7 @@ class Trainer:
         self._before = 0 if moments is None else config.first
         self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
         assert config.budget is not None  # decided above
-        self._strategy = make_strategy(config, config.budget, seed)
+        self._strategy = MCMC(config, config.budget, seed)
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
         self._meter = backend_for(self._device).meter(config.ssim_lambda)
@@ -207,8 +207,6 @@ class Trainer:
         if config.densify and self._strategy.wants_errors(at + 1):
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
         gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
-        if config.densify:
-            self._strategy.observe(self._engine, camera)
         backend_for(self._device).regularise(
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
         )

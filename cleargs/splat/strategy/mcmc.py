@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from cleargs.random_streams import Stream
 from cleargs.splat.backend import backend_for
-from cleargs.splat.strategy.base import Strategy
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,8 +51,12 @@ PART = 0.7
 longest axis: together they spread about as far (0.7² + 0.7² = 0.98)."""
 
 
-class MCMC(Strategy):
-    """See the module. It remembers the errors since the last refinement."""
+class MCMC:
+    """Change the number and the places of the Gaussians of a training, of which there may be ``budget``.
+
+    Random numbers are drawn afresh from (seed, `Stream`, step), and what is remembered from step to step is
+    in `state`: a resumed training is the same training. Steps count from 1, along the schedule.
+    """
 
     def __init__(self, config: TrainConfig, budget: int, seed: Sequence[int]) -> None:
         self._config = config
@@ -62,7 +65,10 @@ class MCMC(Strategy):
         self._errors: Tensor | None = None  # [N]
 
     def wants_errors(self, step: int) -> bool:
-        """In the last steps up to a refinement."""
+        """Return whether `add_errors` is to be called in this step: in the last ones up to a refinement.
+
+        It costs the step another backward pass.
+        """
         config = self._config
         interval = config.refine_interval
         refined = -(-step // interval) * interval
@@ -72,11 +78,19 @@ class MCMC(Strategy):
         )
 
     def add_errors(self, errors: Tensor) -> None:
-        """Summed over the steps."""
+        """Add what each Gaussian contributes to squared errors of this step's frame: [N], at least 0.
+
+        The sum over the pixels of the squared difference (times the frame's weight) times the Gaussian's
+        share in the pixel.
+        """
         self._errors = errors.clone() if self._errors is None else self._errors + errors
 
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
-        """Cut what takes part in errors; without any there is nothing to do."""
+        """Cut what takes part in errors; without any there is nothing to do.
+
+        Called every ``refine_interval`` steps between ``refine_start`` and ``refine_stop``. Returns the
+        Gaussians to continue with and their moments; those given must not be used again.
+        """
         errors, self._errors = self._errors, None
         if errors is None:
             return gaussians, moments
@@ -91,7 +105,7 @@ class MCMC(Strategy):
         )
 
     def after_step(self, gaussians: Gaussians, rate: float, step: int) -> None:
-        """Add the noise of a step to the means."""
+        """Add the noise of a step to the means, whose learning rate is ``rate``."""
         config = self._config
         if config.noise > 0.0:
             backend_for(gaussians.device).add_position_noise(
