@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +101,26 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
         points.append(struct.pack("<Q3d3BdQ", point_id, *xyz, *colour, error, len(track)))
         points.append(b"".join(struct.pack("<ii", *element) for element in track))
     write_bytes(folder / "points3D.bin", b"".join(points))
+
+
+def moved(
+    model: SparseModel,
+    *,
+    scale: float,
+    rotation: NDArray[np.float64],  # [3, 3]
+    translation: NDArray[np.float64],  # [3]
+) -> SparseModel:
+    """``model`` under x -> scale rotation x + translation; every point keeps its place in every image."""
+
+    def pose(before: Pose) -> Pose:
+        turned = before.rotation @ rotation.T
+        return Pose(turned, -turned @ (scale * rotation @ before.centre + translation))
+
+    return replace(
+        model,
+        images={key: replace(image, pose=pose(image.pose)) for key, image in model.images.items()},
+        xyz=scale * model.xyz @ rotation.T + translation,
+    )
 
 
 def _require_whole(folder: Path) -> None:
