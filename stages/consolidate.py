@@ -65,8 +65,9 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """The training, and two looks at the frames that are held back."""
-    from cleargs.capture.cost import capture_size, pace
     from cleargs.splat.effort import training_cost
+
+    from .cost import capture_size, pace
 
     seconds, memory = training_cost(context.config.distil, *capture_size(context))
     return Estimate(

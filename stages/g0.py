@@ -38,8 +38,9 @@ def preflight(config: G0Config) -> None:
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
     buffers."""
-    from cleargs.capture.cost import capture_size, pace, sparse_points
     from cleargs.splat.effort import training_cost
+
+    from .cost import capture_size, pace, sparse_points
 
     config = context.config
     count, megapixels = capture_size(context)

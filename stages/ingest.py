@@ -3,13 +3,53 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.capture import layout
-from cleargs.capture.config import IngestConfig
+from pydantic import Field, field_validator
+
+from cleargs.capture.config import CaptureConfig, SfmConfig
+from cleargs.capture.sources import externals as capture_externals
 from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
+
+
+class IngestConfig(SfmConfig, CaptureConfig):
+    """How a capture becomes undistorted frames with poses and sparse points."""
+
+    max_size: int = Field(
+        960,
+        ge=64,
+        description="long side of the published images, px; never enlarged. Images, masks and videos of more "
+        "than 2^28 pixels are refused",
+    )
+    feature_size: int = Field(
+        960, ge=64, description="long side at which features are found, px; never enlarged, at least max_size"
+    )
+    holdout: str = Field(
+        "none",
+        description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "
+        "N registered frames in a row) | names, stems or patterns such as eval_*, separated by commas",
+    )
+
+    @field_validator("holdout", mode="before")
+    @classmethod
+    def _a_number_may_be_a_name(cls, value: object) -> object:
+        return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    @field_validator("holdout")
+    @classmethod
+    def _known_holdout(cls, value: str) -> str:
+        # Letters before a colon are meant for a rule; a frame may be named by a time of day.
+        if re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
+            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
+        if value in ("every:1", "sharpest:1"):
+            raise ValueError(f"{value} would hold out every frame")
+        if not value.strip(" ,"):
+            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
+        return value
+
 
 VERSION = 8
 CONFIG = IngestConfig
@@ -31,7 +71,7 @@ _FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 0.85, 0.2
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:
     """The files and folders of the capture that are read."""
-    return layout.externals(source, config)
+    return capture_externals(source, config)
 
 
 def preflight(config: IngestConfig) -> None:
@@ -40,9 +80,10 @@ def preflight(config: IngestConfig) -> None:
 
 def estimate(context: StageContext[IngestConfig]) -> Estimate:
     """From the number of frames, their size, and the number of pairs to match."""
-    from cleargs.capture.cost import pace
     from cleargs.capture.prepare import reduced_size
     from cleargs.capture.sources import frame_size, open_capture
+
+    from .cost import pace
 
     config = context.config
     capture = open_capture(context.source, config)

@@ -78,8 +78,9 @@ def preflight(config: RivrConfig) -> None:
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
     one), making and scoring candidates 2 s (two cores). Every group leaves a scene."""
-    from cleargs.capture.cost import capture_size, pace
     from cleargs.splat.effort import training_cost
+
+    from .cost import capture_size, pace
 
     config = context.config
     frames, megapixels = capture_size(context)

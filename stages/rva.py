@@ -38,7 +38,7 @@ def preflight(config: RvaConfig) -> None:
 
 def estimate(context: StageContext[RvaConfig]) -> Estimate:
     """Cues take nearly all of the time; memory is a handful of images a thread, and a model in process."""
-    from cleargs.capture.cost import capture_size
+    from .cost import capture_size
 
     config = context.config
     frames, megapixels = capture_size(context)

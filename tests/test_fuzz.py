@@ -24,12 +24,11 @@ from hypothesis import strategies as st
 
 from cleargs.batch.scenes import read_scenes
 from cleargs.capture.cameras import Pose, pinhole
-from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import externals
-from cleargs.capture.llff import read_poses_bounds
+from cleargs.capture.layouts.llff import read_poses_bounds
+from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.transforms import read_transforms
-from cleargs.capture.world import Similarity
+from cleargs.capture.poses import Similarity
+from cleargs.capture.sources import externals
 from cleargs.errors import CleargsError
 from cleargs.files import write_json
 from cleargs.formation.exposure import EXPOSURE
@@ -49,6 +48,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
+from cleargs.stages.ingest import IngestConfig
 
 EXAMPLES = int(os.environ.get("CLEARGS_FUZZ", "60"))
 

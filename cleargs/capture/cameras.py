@@ -7,14 +7,17 @@ parameters that were checked: COLMAP's failed checks would end the process.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
+
+if TYPE_CHECKING:
+    from cleargs.capture.colmap import pycolmap
 
 SINGLE_FOCAL = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
@@ -95,6 +98,9 @@ class Camera:
         return Camera(self.model, width, height, params)
 
     def colmap(self) -> pycolmap.Camera:
+        """As pycolmap has it (loaded when it is first needed: every run looks up its inputs)."""
+        from cleargs.capture.colmap import pycolmap
+
         return pycolmap.Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
         )

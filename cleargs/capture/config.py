@@ -1,21 +1,19 @@
-"""Settings of the ingest stage."""
+"""Settings of the functions here. The stage's own, `cleargs.stages.ingest`, inherits them."""
 
 from __future__ import annotations
 
-import re
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from cleargs.plugins import require_known
+from cleargs.record import Record
 
 SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 
-class IngestConfig(BaseModel):
-    """How a capture becomes undistorted frames with poses and sparse points."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class CaptureConfig(Record):
+    """How an input is read, and which of its frames are taken."""
 
     fps: float | None = Field(
         None,
@@ -29,17 +27,6 @@ class IngestConfig(BaseModel):
         ge=3,
         description="most frames to take, evenly; of a video, the sharpest nearby",
     )
-    max_size: int = Field(
-        960,
-        ge=64,
-        description="long side of the published images, px; never enlarged. Images, masks and videos of more "
-        "than 2^28 pixels are refused",
-    )
-    holdout: str = Field(
-        "none",
-        description="test frames: none | every:N (frames 0, N, 2N, ...) | sharpest:N (the sharpest of every "
-        "N registered frames in a row) | names, stems or patterns such as eval_*, separated by commas",
-    )
     layout: str = Field(
         "auto",
         json_schema_extra={"key": False, "plugin": "layouts"},  # what is read in consequence is in the key
@@ -48,6 +35,16 @@ class IngestConfig(BaseModel):
     poses: Literal["auto", "sfm"] = Field(
         "auto", description="auto: the input's poses where it has them; sfm: ignore its poses and cameras"
     )
+
+    @field_validator("layout")
+    @classmethod
+    def _layout_is_known(cls, name: str) -> str:
+        return require_known("layouts", name, ("auto",))
+
+
+class SfmConfig(Record):
+    """How poses and sparse points are found."""
+
     refine_above: float = Field(
         0.6,
         ge=0,
@@ -59,9 +56,6 @@ class IngestConfig(BaseModel):
     )
     shared_camera: bool = Field(
         True, description="SfM: one camera for all frames of a size; false: a camera a frame"
-    )
-    feature_size: int = Field(
-        960, ge=64, description="long side at which features are found, px; never enlarged, at least max_size"
     )
     max_features: int = Field(
         4096, ge=256, le=65536, description="SIFT features a frame, the largest scales first"
@@ -83,25 +77,3 @@ class IngestConfig(BaseModel):
     min_registered: float = Field(
         0.30, ge=0, le=1, description="share of frames that must get a pose, or the stage fails"
     )
-
-    @field_validator("layout")
-    @classmethod
-    def _layout_is_known(cls, name: str) -> str:
-        return require_known("layouts", name, ("auto",))
-
-    @field_validator("holdout", mode="before")
-    @classmethod
-    def _a_number_may_be_a_name(cls, value: object) -> object:
-        return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-    @field_validator("holdout")
-    @classmethod
-    def _known_holdout(cls, value: str) -> str:
-        # Letters before a colon are meant for a rule; a frame may be named by a time of day.
-        if re.match(r"[A-Za-z]+:", value) and not re.fullmatch(r"(every|sharpest):[1-9]\d*", value):
-            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
-        if value in ("every:1", "sharpest:1"):
-            raise ValueError(f"{value} would hold out every frame")
-        if not value.strip(" ,"):
-            raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
-        return value

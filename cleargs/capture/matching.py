@@ -1,8 +1,12 @@
-"""Pairs of frames are matched by processes of one thread each: ``python -m cleargs.capture.matching``.
+"""Which frames are matched with which, and how: by processes of one thread each.
+
+Pairs are all with all, or neighbours and distant frames that look alike. That needs no vocabulary from
+elsewhere: the words are clustered from the capture's own descriptors.
 
 COLMAP's own threads do not always find the same matches: with two of them 2 of 76 runs over the same features
 differed (pycolmap 4.2.1), with one none of 60. Each process works through its share of the pairs in a copy of
-the database; what was matched is gathered in the end, or by the next run when this one is killed.
+the database (``python -m cleargs.capture.matching``); what was matched is gathered in the end, or by the next
+run when this one is killed.
 """
 
 from __future__ import annotations
@@ -11,10 +15,13 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
@@ -23,6 +30,81 @@ from cleargs.children import module_command
 _PAIRS_PER_BLOCK = 200
 """COLMAP indexes the features of a frame anew in each block (a tenth of the time), and keeps nothing of one
 that it did not finish."""
+
+
+N_WORDS = 32
+"""Words of the vocabulary: VLAD works with few."""
+
+_SAMPLE = 20_000
+_ROUNDS = 8
+_MAX_IMAGES = 2**31 - 1
+"""COLMAP numbers a pair of images by the id of the first, times this, plus that of the second."""
+
+
+def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
+    """Every pair (i, j) with i < j."""
+    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+
+
+def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
+    """Each frame with its ``overlap`` next ones, and with those 2^k on for k < overlap (COLMAP's quadratic
+    overlap), which bridges stretches too blurred to match."""
+    steps = set(range(1, overlap + 1)) | {2**power for power in range(overlap)}
+    return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
+
+
+def loop_pairs(
+    descriptors: Sequence[NDArray[np.uint8]],  # each [K, 128]
+    candidates: int,
+    min_gap: int,
+    seed: int,
+) -> list[tuple[int, int]]:
+    """Each frame with the ``candidates`` frames at least ``min_gap`` away whose content is most alike.
+
+    VLAD (Jégou et al. 2010): residuals to the nearest word, summed per word, signed square root, normalised.
+    Word coordinates are kept whole, so that all large sums are of integers: exact in any order.
+    """
+    count = len(descriptors)
+    if candidates == 0 or count <= min_gap or not any(len(rows) for rows in descriptors):
+        return []
+    words = _vocabulary(np.concatenate(list(descriptors)), seed)
+    signatures = np.stack([_vlad(rows, words) for rows in descriptors])
+    similarity = np.round(signatures @ signatures.T, 9)
+    pairs: set[tuple[int, int]] = set()
+    for i in range(count):
+        # Stable, so that ties go to the earlier frame.
+        far = [j for j in np.argsort(-similarity[i], kind="stable").tolist() if abs(i - j) >= min_gap]
+        pairs.update((min(i, j), max(i, j)) for j in far[:candidates])
+    return sorted(pairs)
+
+
+def _vocabulary(rows: NDArray[np.uint8], seed: int) -> NDArray[np.float64]:  # [N_WORDS, 128]
+    """k-means on a sample of descriptors, centres rounded to whole numbers."""
+    random = np.random.default_rng(seed)
+    sample = rows[random.permutation(len(rows))[:_SAMPLE]].astype(np.float64)
+    words = sample[:N_WORDS].copy()
+    for _ in range(_ROUNDS):
+        nearest = _nearest(sample, words)
+        for word in range(len(words)):
+            members = sample[nearest == word]
+            if len(members):
+                words[word] = np.rint(members.sum(axis=0) / len(members))
+    return words
+
+
+def _nearest(rows: NDArray[np.float64], words: NDArray[np.float64]) -> NDArray[np.intp]:
+    return np.asarray(np.argmin((words**2).sum(axis=1) - 2 * rows @ words.T, axis=1))
+
+
+def _vlad(rows: NDArray[np.uint8], words: NDArray[np.float64]) -> NDArray[np.float64]:
+    values = rows.astype(np.float64)
+    nearest = _nearest(values, words)
+    sums = np.zeros_like(words)
+    for word in range(len(words)):
+        sums[word] = (values[nearest == word] - words[word]).sum(axis=0)
+    rooted = np.sign(sums) * np.sqrt(np.abs(sums))
+    norm = float(np.linalg.norm(rooted))
+    return (rooted / norm if norm > 0 else rooted).ravel()
 
 
 def match_pairs(
@@ -95,6 +177,43 @@ def _gather(database: Path, share: Path) -> None:
 def _remove(share: Path) -> None:
     for leftover in share.parent.glob(f"{share.stem}.*"):
         leftover.unlink()
+
+
+def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
+    """Copy COLMAP's ``database`` but for the features of these images and their matches."""
+    for leftover in copy.parent.glob(f"{copy.name}*"):
+        leftover.unlink()
+    listed = ", ".join(str(int(image_id)) for image_id in image_ids)
+    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+        source.backup(target)
+        for table in ("keypoints", "descriptors"):
+            target.execute(f"DELETE FROM {table} WHERE image_id IN ({listed})")
+        for table in ("matches", "two_view_geometries"):
+            target.execute(
+                f"DELETE FROM {table} WHERE pair_id / {_MAX_IMAGES} IN ({listed}) "
+                f"OR pair_id % {_MAX_IMAGES} IN ({listed})"
+            )
+        target.commit()
+
+
+def why_missing(database: Path, missing: Collection[int]) -> dict[int, str]:
+    """Why COLMAP gave none of the images of these ids a pose."""
+    with pycolmap.Database.open(database) as opened:
+        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+        features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in missing}
+    matched: set[int] = set()
+    for pair_id, count in zip(pair_ids, inliers, strict=True):
+        pair = pycolmap.pair_id_to_image_pair(pair_id)
+        if count and any(image_id not in features for image_id in pair):
+            matched.update(pair)
+    return {
+        image_id: "too few points in common with placed frames"
+        if image_id in matched
+        else "matches no placed frame"
+        if count
+        else "no features"
+        for image_id, count in features.items()
+    }
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera
-from cleargs.capture.sources import Capture, SourceFrame
+from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import image_size, read_alpha, read_mask, read_rgb, write_mask, write_rgb

@@ -17,10 +17,10 @@ import numpy as np
 from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.child import run_child
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.config import IngestConfig
+from cleargs.capture.config import SfmConfig
 from cleargs.capture.model import ModelImage, SparseModel, read_model
+from cleargs.capture.poses import Similarity, normalise
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.world import Similarity, normalise
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
@@ -62,7 +62,7 @@ def reconstruct(
     frames: Sequence[WorkFrame],
     given: SparseModel | None,
     folder: Path,
-    config: IngestConfig,
+    config: SfmConfig,
     seed: int,
     threads: int,
     reporter: Reporter,
@@ -114,7 +114,7 @@ def reconstruct(
     return Reconstruction(model, similarity, missed, refined, _placed_by_input(frames, refined))
 
 
-def _check_registered(registered: int, total: int, config: IngestConfig, reporter: Reporter) -> None:
+def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
     if registered < max(3, config.min_registered * total):
         raise StageError(f"only {registered} of {total} frames could be placed in space", hint=_ADVICE)
     if registered < WARN_REGISTERED * total:
@@ -134,7 +134,7 @@ class _Job:
     masked: bool
 
 
-def _sfm_job(frames: Sequence[WorkFrame], config: IngestConfig) -> _Job:
+def _sfm_job(frames: Sequence[WorkFrame], config: SfmConfig) -> _Job:
     """All frames of one size share a camera; without ``shared_camera`` each has its own."""
     owners = [f"{frame.width}x{frame.height}" if config.shared_camera else frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
@@ -150,7 +150,7 @@ def _sfm_job(frames: Sequence[WorkFrame], config: IngestConfig) -> _Job:
     )
 
 
-def _starting_camera(frame: WorkFrame, config: IngestConfig) -> Camera:
+def _starting_camera(frame: WorkFrame, config: SfmConfig) -> Camera:
     """COLMAP's first guess: focal length 1.2 long sides, no distortion."""
     focal = 1.2 * max(frame.width, frame.height)
     guess = pycolmap.Camera.create_from_model_name(1, config.camera_model, focal, frame.width, frame.height)
@@ -175,7 +175,7 @@ def _triangulation_job(frames: Sequence[WorkFrame], poses: Sequence[Pose]) -> _J
 
 
 def _run(
-    job: _Job, folder: Path, config: IngestConfig, seed: int, threads: int, reporter: Reporter
+    job: _Job, folder: Path, config: SfmConfig, seed: int, threads: int, reporter: Reporter
 ) -> SparseModel:
     """Let COLMAP do the job, unless a killed run got as far as the model."""
     if (model := _resumed(folder, reporter, posed=job.poses is not None)) is None:

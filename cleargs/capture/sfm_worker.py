@@ -25,9 +25,14 @@ from numpy.typing import NDArray
 
 from cleargs.capture.child import ChildChannel
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.matching import match_pairs
-from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
-from cleargs.capture.sfm_missing import copy_without_features, why_missing
+from cleargs.capture.matching import (
+    copy_without_features,
+    exhaustive_pairs,
+    loop_pairs,
+    match_pairs,
+    sequential_pairs,
+    why_missing,
+)
 from cleargs.files import make_folder, sync, sync_tree
 
 _MIN_MODEL = 10

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.capture import Capture
+from cleargs.capture.layouts.video import video_frame
 from cleargs.capture.prepare import reduced
-from cleargs.capture.sources import Capture, video_frame
 from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline

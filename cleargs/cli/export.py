@@ -111,8 +111,7 @@ def export(
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
     warning = require_fresh(dag, run, (stage,), stale=stale)
-    from cleargs.capture.model import read_model, write_model
-    from cleargs.capture.moved import moved
+    from cleargs.capture.model import moved, read_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.splat.cameras_json import cameras_json

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
-from cleargs.capture.world import Similarity
+from cleargs.capture.poses import Similarity
 from cleargs.errors import InputError
 
 LARGE_RESIDUAL = 0.02

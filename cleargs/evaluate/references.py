@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose
-from cleargs.capture.layout import mask_folder
-from cleargs.capture.sources import masks_of, name_below_images, natural_key
+from cleargs.capture.capture import SourceFrame
+from cleargs.capture.folders import mask_folder, masks_of, name_below_images, natural_key
+from cleargs.capture.layouts.transforms import read_transforms
+from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import Frame, load_frames, load_points
-from cleargs.capture.transforms import TransformsFrame, read_transforms
 from cleargs.capture.undistort import Undistorter, undistorter
-from cleargs.capture.world import Similarity
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
@@ -229,7 +229,7 @@ def _about_there(camera: Camera, frame: Frame) -> bool:
 class _Listed:
     """An entry of transforms.json."""
 
-    frame: TransformsFrame
+    frame: SourceFrame
     mask: Path | None
     way: Undistorter | None
     """None without distortion."""
@@ -246,7 +246,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     entries = read_transforms(path, poses=True)
     if not entries:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
-    masks = masks_of(mask_folder(directory / "images"), [name_below_images(entry) for entry in entries])
+    masks = masks_of(mask_folder(directory / "images"), [name_below_images(entry.name) for entry in entries])
     undistorters: dict[Lens, Undistorter] = {}
     listed = []
     for entry in entries:
@@ -254,7 +254,7 @@ def _listed(directory: Path) -> dict[str, _Listed]:
         assert lens is not None  # asked for with poses=True
         if lens not in undistorters:
             undistorters[lens] = undistorter(lens, sys.maxsize)
-        mask = entry.mask or masks.get(name_below_images(entry))
+        mask = entry.mask or masks.get(name_below_images(entry.name))
         listed.append((stem_of(entry.name), _Listed(entry, mask, undistorters[lens])))
     return _by_stem(listed)
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import rigid_pose
-from cleargs.capture.world import Similarity
+from cleargs.capture.poses import Similarity, rigid_pose
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera
 from cleargs.untrusted import FAULTS, cause, read_json

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import Frame, load_frames
-from cleargs.capture.world import Similarity
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
 from cleargs.pipeline.manifest import linked_manifest

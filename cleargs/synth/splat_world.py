@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
-from cleargs.capture.transforms import read_transforms
 from cleargs.errors import InputError, StoreError
 from cleargs.media.colour import linear_from_srgb
 from cleargs.splat.camera import Camera

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cleargs.capture.config import IngestConfig
 from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
+from cleargs.stages.ingest import IngestConfig
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 PLANES = ((4.0, -3.0, -2.5, 6.0), (3.0, -1.4, -0.9, 1.5), (2.5, 0.3, -0.3, 1.3))

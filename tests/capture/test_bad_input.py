@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from cleargs.capture.config import IngestConfig
 from cleargs.capture.sources import open_capture
 from cleargs.capture.tables import load_points
 from cleargs.errors import CleargsError, ConfigError, InputError, StageError
 from cleargs.media.image import read_rgb
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
+from cleargs.stages.ingest import IngestConfig
 
 from .conftest import HEIGHT, WIDTH, Ingest, camera_to_world, write_transforms
 

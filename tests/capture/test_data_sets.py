@@ -12,15 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
-from cleargs.capture.config import IngestConfig
 from cleargs.capture.holdout import held_out
-from cleargs.capture.layout import externals
-from cleargs.capture.llff import read_llff, read_poses_bounds
+from cleargs.capture.layouts.llff import read_llff, read_poses_bounds
 from cleargs.capture.model import write_model
-from cleargs.capture.sources import Capture, open_capture
+from cleargs.capture.sources import Capture, externals, open_capture
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError
 from cleargs.pipeline.digest import named_files
+from cleargs.stages.ingest import IngestConfig
 
 from .conftest import FOCAL, HEIGHT, WIDTH, Ingest, camera_to_world
 from .test_parts import small_model

@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from cleargs.capture.config import IngestConfig
-from cleargs.capture.layout import externals
-from cleargs.capture.sources import open_capture
+from cleargs.capture.sources import externals, open_capture
 from cleargs.errors import InputError
 from cleargs.pipeline.digest import DigestMemo
+from cleargs.stages.ingest import IngestConfig
 
 from .conftest import Ingest
 

@@ -13,8 +13,7 @@ import pycolmap
 import pytest
 
 from cleargs.capture import matching
-from cleargs.capture.matching import match_pairs
-from cleargs.capture.pairs import exhaustive_pairs
+from cleargs.capture.matching import exhaustive_pairs, match_pairs
 
 NAMES = [f"view{index}.png" for index in range(4)]
 PAIRS = exhaustive_pairs(len(NAMES))

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Pose, pinhole
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.model import ModelImage, SparseModel, write_model
-from cleargs.capture.moved import moved
+from cleargs.capture.model import ModelImage, SparseModel, moved, write_model
 
 
 def test_every_point_keeps_its_place_in_every_image(tmp_path: Path) -> None:

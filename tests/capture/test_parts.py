@@ -17,11 +17,11 @@ from OpenImageIO import ImageOutput, ImageSpec
 from pydantic import ValidationError
 
 from cleargs.capture.cameras import Camera, Pose, pinhole
-from cleargs.capture.config import IngestConfig
 from cleargs.capture.holdout import held_out, holdout_hash
-from cleargs.capture.layout import externals
+from cleargs.capture.layouts.transforms import read_transforms
+from cleargs.capture.matching import exhaustive_pairs, loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.pairs import exhaustive_pairs, loop_pairs, sequential_pairs
+from cleargs.capture.poses import normalise
 from cleargs.capture.prepare import WorkFrame, _stencil, _upright
 from cleargs.capture.sfm import _sfm_job
 from cleargs.capture.sfm_worker import apply_exif_focal
@@ -29,19 +29,19 @@ from cleargs.capture.sharpest import sharpness
 from cleargs.capture.sources import (
     SourceFrame,
     choose_times,
+    externals,
     frame_key,
     masks_of,
     natural_key,
     open_capture,
     spread,
 )
-from cleargs.capture.transforms import read_transforms
 from cleargs.capture.undistort import undistorter
-from cleargs.capture.world import normalise
 from cleargs.errors import InputError, StoreError
 from cleargs.media.image import read_rgb
 from cleargs.media.video import Timeline
 from cleargs.parquet import column, read_table, write_table
+from cleargs.stages.ingest import IngestConfig
 
 from .conftest import HEIGHT, WIDTH, texture
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from cleargs.capture import sharpest as module
-from cleargs.capture.config import IngestConfig
 from cleargs.capture.sharpest import CHOICE, sharpest
 from cleargs.capture.sources import open_capture
 from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter
+from cleargs.stages.ingest import IngestConfig
 
 from .conftest import texture
 

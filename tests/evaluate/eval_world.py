@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Pose
+from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import FRAMES, load_frames
-from cleargs.capture.world import Similarity
 from cleargs.evaluate.config import EvalOptions
 from cleargs.formation.exposure import Exposure, write_exposure
 from cleargs.media.image import to_uint8, write_mask, write_rgb

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose
-from cleargs.capture.world import Similarity
+from cleargs.capture.poses import Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate.alignment import align_cameras, umeyama
 from cleargs.evaluate.colour_alignment import apply_affine, fit_affine

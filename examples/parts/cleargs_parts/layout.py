@@ -3,18 +3,18 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.capture.config import IngestConfig
-from cleargs.capture.sources import Capture, SourceFrame, spread
+from cleargs.capture.capture import Capture, External, SourceFrame
+from cleargs.capture.config import CaptureConfig
+from cleargs.capture.folders import spread
 from cleargs.errors import InputError
-from cleargs.pipeline.stage import External
 
 
-def externals(source: Path, config: IngestConfig) -> Mapping[str, External]:
+def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
     """All files that are read: their content is in the key of the stage."""
     return {"list": source / "list.txt", "images": {name: source / name for name in _names(source)}}
 
 
-def open_capture(source: Path, config: IngestConfig) -> Capture:
+def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """Frames without cameras and poses, which SfM then finds; a SourceFrame may bring both."""
     names = _names(source)
     frames = tuple(SourceFrame(name, source / name) for name in spread(names, config.max_frames))

@@ -3,35 +3,48 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, Pose, pinhole
-from cleargs.capture.layout import POSES_BOUNDS, image_folders
+from cleargs.capture.cameras import pinhole
+from cleargs.capture.capture import Capture, External, SourceFrame
+from cleargs.capture.config import CaptureConfig
+from cleargs.capture.folders import chosen, image_files, image_folders, mask_externals
 from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
-from cleargs.media import IMAGE_SUFFIXES
 from cleargs.untrusted import FAULTS, cause, open_regular
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
 """NumPy lets errors of Python's tokenizer through where the header is damaged."""
 
 
-@dataclass(frozen=True)
-class LlffView:
-    """One row of poses_bounds.npy with its image."""
-
-    path: Path
-    camera: Camera
-    """Pinhole of the image's size when the poses were made; images may be smaller in the same proportions."""
-    pose: Pose
+POSES_BOUNDS = "poses_bounds.npy"
+"""LLFF's file of poses."""
 
 
-def read_llff(root: Path) -> list[LlffView]:
+def detect(source: Path, *, poses: bool) -> bool:
+    """See `ShippedLayout.detect`."""
+    return poses and (source / POSES_BOUNDS).is_file()
+
+
+def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
+    """See `Layout.externals`."""
+    folders = {folder.name: folder for folder in image_folders(source)}
+    return {"poses_bounds": source / POSES_BOUNDS, **folders, **mask_externals(source)}
+
+
+def open_capture(source: Path, config: CaptureConfig) -> Capture:
+    """See `Layout.open_capture`; in the order of the rows, every N-th of which is a test view of these data
+    sets."""
+    frames = read_llff(source)
+    return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
+
+
+def read_llff(root: Path) -> list[SourceFrame]:
     """The images of ``root`` with their cameras, in the order of the rows.
 
     Row i belongs to image i by sorted file name (not natural order), which is how LLFF writes the file and
@@ -40,7 +53,9 @@ def read_llff(root: Path) -> list[LlffView]:
     Raises InputError for a damaged file, a count that fits no folder, NaN and cameras that are none.
     """
     table = read_poses_bounds(root / POSES_BOUNDS)
-    folders = {folder: _images(folder) for folder in image_folders(root)}
+    folders = {
+        folder: sorted(image_files(folder), key=lambda path: path.name) for folder in image_folders(root)
+    }
     paths = next((files for files in folders.values() if len(files) == len(table)), None)
     if paths is None:
         counts = ", ".join(f"{folder.name}/ {len(files)}" for folder, files in folders.items())
@@ -49,7 +64,7 @@ def read_llff(root: Path) -> list[LlffView]:
             f"({counts or 'no images/ there'})",
             hint="put back the images that the poses were made from, or set ingest.poses=sfm",
         )
-    return [_view(row, path) for row, path in zip(table, paths, strict=True)]
+    return [_frame(row, path) for row, path in zip(table, paths, strict=True)]
 
 
 def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
@@ -72,12 +87,7 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
         ) from error
 
 
-def _images(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
-    return sorted((path for path in files if not path.name.startswith(".")), key=lambda path: path.name)
-
-
-def _view(row: NDArray[np.float64], path: Path) -> LlffView:
+def _frame(row: NDArray[np.float64], path: Path) -> SourceFrame:
     hint = f"correct its row of {POSES_BOUNDS}, remove both row and image, or set ingest.poses=sfm"
     # Columns: the camera's down, right and back axes in the world, its centre, and (height, width, focal).
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
@@ -85,4 +95,6 @@ def _view(row: NDArray[np.float64], path: Path) -> LlffView:
         raise InputError(f"the camera of {path.name} in {POSES_BOUNDS} is not finite", hint=hint)
     pose = rigid_pose(np.column_stack([right, -down, back, centre]), path.name, hint)
     size = round(float(width)), round(float(height))
-    return LlffView(path, pinhole(*size, float(focal), float(focal), size[0] / 2, size[1] / 2), pose)
+    # Images may be smaller, in the same proportions.
+    camera = pinhole(*size, float(focal), float(focal), size[0] / 2, size[1] / 2)
+    return SourceFrame(path.name, path, camera=camera, pose=pose)

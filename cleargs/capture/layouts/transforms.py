@@ -11,37 +11,75 @@ from typing import Any
 import numpy as np
 
 from cleargs.capture.cameras import Camera, Pose
-from cleargs.capture.listing import read_listing
+from cleargs.capture.capture import Capture, External, SourceFrame
+from cleargs.capture.config import CaptureConfig
+from cleargs.capture.folders import chosen, frame_key, mask_externals, name_below_images
 from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
-from cleargs.media.image import read_rgb
-from cleargs.untrusted import FAULTS, cause
+from cleargs.media import IMAGE_SUFFIXES
+from cleargs.untrusted import FAULTS, cause, read_json
 
 _FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
 
 
 @dataclass(frozen=True)
-class TransformsFrame:
-    """One entry of ``frames``."""
+class _Entry:
+    """One entry of ``frames`` and the files that it names."""
 
-    name: str
-    """``file_path`` as listed, with the extension of the file found."""
-    path: Path
+    values: Mapping[str, Any]
+    image: Path | None
+    """None where there is none."""
     mask: Path | None
-    camera: Camera | None
-    pose: Pose | None
+    """None where it names none, or there is none."""
 
 
-def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
+@dataclass(frozen=True)
+class _Listing:
+    """A transforms.json."""
+
+    common: Mapping[str, Any]
+    """All that stands beside ``frames``."""
+    entries: tuple[_Entry, ...]
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Every file that the entries name and that is there, by its name in the listing."""
+        images = {entry.values["file_path"]: entry.image for entry in self.entries}
+        masks = {entry.values.get("mask_path"): entry.mask for entry in self.entries}
+        return {str(name): file for name, file in {**masks, **images}.items() if file is not None}
+
+
+def detect(source: Path, *, poses: bool) -> bool:
+    """See `ShippedLayout.detect`: it lists images, with or without poses."""
+    return (source / "transforms.json").is_file()
+
+
+def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
+    """See `Layout.externals`. Raises InputError where the file cannot be read."""
+    file = source / "transforms.json"
+    return {"transforms": file, "images": _read_listing(file).files, **mask_externals(source)}
+
+
+def open_capture(source: Path, config: CaptureConfig) -> Capture:
+    """See `Layout.open_capture`."""
+    frames = read_transforms(source / "transforms.json", poses=config.poses == "auto")
+    frames.sort(key=lambda frame: frame_key(frame.name))
+    names = [name_below_images(frame.name) for frame in frames]
+    return Capture("transforms", chosen(frames, source, config.max_frames, names), len(frames))
+
+
+def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
     """The frames that ``path`` lists, in its order; without ``poses``, only their images.
+
+    A frame's name is its ``file_path`` as listed, with the extension of the file found.
 
     Further entries, such as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``,
     are passed over.
 
     Raises InputError for damaged JSON, missing images, missing or NaN poses, unknown cameras.
     """
-    listing = read_listing(path)
+    listing = _read_listing(path)
     missing = [entry.values["file_path"] for entry in listing.entries if entry.image is None]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
@@ -61,7 +99,7 @@ def read_transforms(path: Path, *, poses: bool) -> list[TransformsFrame]:
             )
         camera = _camera({**listing.common, **entry.values}, entry.image) if poses else None
         pose = _pose(entry.values, name) if poses else None
-        frames.append(TransformsFrame(name, entry.image, entry.mask, camera, pose))
+        frames.append(SourceFrame(name, entry.image, mask=entry.mask, camera=camera, pose=pose))
     return frames
 
 
@@ -71,6 +109,8 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
         else:
+            from cleargs.media.image import read_rgb
+
             height, width = read_rgb(image).shape[:2]
         fx = _focal(values, "x", width)
         fy = _focal(values, "y", height)
@@ -123,3 +163,53 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"the pose of {name} is not a 4x4 matrix", hint=hint)
     return rigid_pose(matrix, name, hint)
+
+
+def _read_listing(path: Path) -> _Listing:
+    """Read transforms.json. Raises InputError where it is damaged or an entry names no image."""
+    try:
+        data = read_json(path)
+        if not isinstance(data, dict) or "frames" not in data:
+            raise ValueError("it has no 'frames'")
+        frames = data["frames"]
+        if not isinstance(frames, list) or not all(isinstance(entry, dict) for entry in frames):
+            raise ValueError("'frames' is not a list of objects")
+        for number, entry in enumerate(frames):
+            if not isinstance(entry.get("file_path"), str):
+                raise ValueError(f"frames[{number}] has no file_path")
+            if not isinstance(entry.get("mask_path", ""), str):
+                raise ValueError(f"frames[{number}] has a mask_path that is no text")
+        entries = tuple(
+            _Entry(
+                entry,
+                _find_image(path.parent, entry["file_path"]),
+                _find(path.parent, entry["mask_path"]) if "mask_path" in entry else None,
+            )
+            for entry in frames
+        )
+    except FAULTS as error:
+        raise InputError(
+            f"cannot read {path}: {cause(error)}",
+            hint="it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it",
+        ) from error
+    return _Listing({name: value for name, value in data.items() if name != "frames"}, entries)
+
+
+def _find(root: Path, listed: str) -> Path | None:
+    path = root / listed.replace("\\", "/")
+    return path if path.is_file() else None
+
+
+def _find_image(root: Path, listed: str) -> Path | None:
+    """The listed file; where it is listed without an extension, the image of that stem."""
+    if (file := _find(root, listed)) is not None:
+        return file
+    path = root / listed.replace("\\", "/")
+    if not path.name or path.suffix.lower() in IMAGE_SUFFIXES:
+        return None
+    for suffix in sorted(IMAGE_SUFFIXES):
+        for spelling in (suffix, suffix.upper()):
+            candidate = path.with_name(path.name + spelling)
+            if candidate.is_file():
+                return candidate
+    return None

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cleargs.capture.tables import load_frames, load_points
 from cleargs.errors import StoreError
-
-if TYPE_CHECKING:
-    from cleargs.pipeline.stage import StageContext
+from cleargs.pipeline.stage import StageContext
 
 _UNKNOWN = (60, 0.5)
 """Frames and megapixels assumed where nothing is known of the capture."""
