@@ -39,7 +39,6 @@ from cleargs.media.video import read_timeline
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.config import read_toml
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.lease import living_holder
 from cleargs.pipeline.manifest import read_manifest
 from cleargs.progress import SilentReporter
 from cleargs.render.pose_files import read_poses
@@ -171,9 +170,6 @@ def sheets(folder: Path) -> None:
 def manifests(folder: Path) -> None:
     folder.mkdir()
     (folder / "manifest.json").write_text(json.dumps({"stage": "g0", "files": {}, "seal": "0" * 64}))
-    (folder / "lease.json").write_text(
-        json.dumps({"host": "h", "pid": 1, "pid_space": "", "born": "", "job": ""})
-    )
     (folder / "run.toml").write_text('input = "x"\nseed = 0\n[g0]\nsteps = 3\n')
 
 
@@ -248,7 +244,6 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path], object]]] = {
     "images": (pictures, all_of(read_rgb, "a.*")),
     "sheets": (sheets, all_of(lambda file: read_scenes(file, installed()), "s.*")),
     "manifest": (manifests, read_manifest_or_none),
-    "lease": (manifests, lambda folder: living_holder(folder / "lease.json")),
     "poses": (poses, all_of(lambda file: read_poses(file, LENS, SAME), "*.json")),
     "tables, checkpoints": (tables, all_of(read_stored, "t.*")),
     "video": (video, lambda folder: read_timeline(folder / "v.mp4")),

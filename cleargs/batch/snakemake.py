@@ -18,7 +18,6 @@ from pathlib import Path
 
 from cleargs.batch.folder import BatchFolder
 from cleargs.errors import InputError, StageError, StoreError
-from cleargs.pipeline.lease import lease, living_holder
 
 ENGINE_VARIABLE = "CLEARGS_SNAKEMAKE"
 PROFILES = ("local", "slurm")
@@ -90,7 +89,7 @@ def only_batch(folder: BatchFolder) -> Iterator[int]:
     """Be the only batch at work in ``folder``; yields the lock's handle, which the engine is to inherit.
 
     The lock lives as long as the engine, also where the command that started it was killed; one that was
-    interrupted is waited for. Where the file system has no locks, the lease tells. Raises StageError when
+    interrupted is waited for. Raises StageError when
     another batch is at work, StoreError when the folder cannot be made.
     """
     try:
@@ -99,16 +98,13 @@ def only_batch(folder: BatchFolder) -> Iterator[int]:
         raise StoreError(f"cannot make {folder.root}: {error.strerror}", hint="choose another -o") from error
     handle = os.open(folder.root / "batch.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        if living_holder(folder.root / "batch.lease") is not None or not (
-            _take(handle, patience=GLANCE) or _take_after_interrupted(handle, folder)
-        ):
+        if not (_take(handle, patience=GLANCE) or _take_after_interrupted(handle, folder)):
             engine = _read_lock(handle)
             raise StageError(
                 f"a batch of this sheet is at work already{f' ({engine})' if engine else ''}",
                 hint="watch it with cleargs batch-status; it may be interrupted, what is done is kept",
             )
-        with lease(folder.root / "batch.lease"):
-            yield handle
+        yield handle
     finally:
         os.close(handle)
 

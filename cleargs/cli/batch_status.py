@@ -11,7 +11,6 @@ from cleargs.batch.status import scene_states
 from cleargs.cli.batch import batch_folder, folder_option, print_states, sheet_argument
 from cleargs.cli.common import json_option
 from cleargs.errors import InputError
-from cleargs.pipeline.lease import living_holder
 
 
 @click.command()
@@ -25,7 +24,6 @@ def batch_status(sheet: Path, folder: Path | None, as_json: bool) -> int:
     if plan is None:
         raise InputError(f"there was no batch in {root.root}", hint=f"start one: cleargs batch {sheet}")
     print_states(scene_states(root, plan), plan, as_json)
-    holder = living_holder(root.root / "batch.lease")
-    engine = f"process {holder.pid} on {holder.host}" if holder else engine_at_work(root)
+    engine = engine_at_work(root)
     click.echo(f"at work: {engine}" if engine else "no batch is at work", err=True)
     return 0

@@ -1,28 +1,28 @@
-"""Locks that die with their holder. They save work; correctness rests on the rename that publishes."""
+"""File locks that end with their process. They save work; correctness rests on the rename that publishes."""
 
 from __future__ import annotations
 
 import fcntl
 import os
+import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
 @contextmanager
-def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterator[bool]:
-    """Hold the lock file ``path`` (created when absent) for the block; yields whether it is held.
+def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterator[bool | None]:
+    """Hold the lock file ``path`` (created when absent) for the block.
 
-    The kernel drops the lock when its process ends, however it ends, so a stale lock file blocks nobody.
-    Another holder is waited for; with ``wait=False`` the block runs with False instead. On a file system
-    without locks the block runs as if the lock were held.
+    Yields True, or None on a file system without locks. The kernel drops the lock when its process ends,
+    however it ends. Another holder is waited for; with ``wait=False`` the block runs with False instead.
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
-            held = _acquire(handle, kind, wait=wait)
+            held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
             if held and not _still_there(path, handle):
                 continue  # its last holder removed the file while we waited: lock the new one
             yield held
@@ -31,16 +31,44 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
             os.close(handle)
 
 
-def _acquire(handle: int, kind: int, *, wait: bool) -> bool:
+def is_locked(path: Path) -> bool:
+    """Return True if a process holds ``path`` alone, or if nobody can tell."""
     try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        return True
-    except BlockingIOError:
-        if not wait:
-            return False
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
-        return True
-    fcntl.flock(handle, kind)
+        return False
+    try:
+        return _acquire(handle, fcntl.LOCK_SH | fcntl.LOCK_NB) is not True
+    finally:
+        os.close(handle)
+
+
+def process_name(pid: int) -> str:
+    """The name of a process of this host in a lock file."""
+    job = os.environ.get("SLURM_JOB_ID", "")
+    return f"process {pid} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
+
+
+def sign(path: Path) -> None:
+    """Note this process in the lock file ``path``, which it holds. The note only serves messages."""
+    with suppress(OSError):
+        path.write_text(process_name(os.getpid()), encoding="utf-8")
+
+
+def signature(path: Path) -> str:
+    """The process that signed the lock file ``path`` last."""
+    with suppress(OSError, UnicodeDecodeError):
+        return path.read_text(encoding="utf-8") or "another process"
+    return "another process"
+
+
+def _acquire(handle: int, kind: int) -> bool | None:
+    try:
+        fcntl.flock(handle, kind)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
     return True
 
 

@@ -83,10 +83,10 @@ def at_work(run: Run, dag: Dag, check: Callable[[], None]) -> Iterator[None]:
         try:
             while not _joined(run, held, lambda: is_noted(run)):
                 with file_lock(run.folder / LOCK, wait=False) as alone:
-                    if alone:
+                    if alone is not False:
                         check()
                         write_run_file(run)
-                if alone:
+                if alone is not False:
                     continue
                 if _joined(run, held, lambda: _results_alike(run, dag)):
                     break

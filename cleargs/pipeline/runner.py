@@ -171,12 +171,12 @@ class Runner:
             recipe = self._read_again(name, done)
             entry = self.store.find(name, recipe.key)
             reasons = ("forced",) if forced else self._why(recipe, entry)
-            with self.store.lock(recipe.key, self.reporter, name):
+            with self.store.lock(recipe.key, self.reporter, name) as alone:
                 entry = self._find(name, recipe)
                 manifest = entry.whole if entry is not None and not forced else None
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
-                    manifest, how = self._make(recipe, entry, forced=forced), "made"
+                    manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
         return self._show(how, recipe, manifest)
 
     def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
@@ -208,11 +208,13 @@ class Runner:
             return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
         return self.planner.reasons(recipe, entry)
 
-    def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool) -> Manifest:
+    def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""
         name = recipe.parts.stage
         stage = self.dag.load(name)
-        work = self.store.open_work(recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS)
+        work = self.store.open_work(
+            recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
+        )
         for place in work.thrown_away:
             self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)

@@ -1,24 +1,23 @@
-"""The store: finished stage folders by content key, unfinished work beside them.
+"""The store: finished stage folders by content key, unfinished work next to them.
 
 ::
 
-    STORE/<stage>/<key>/                      finished: every output and manifest.json; never written again
-    STORE/work/<key>@<writer>/{out,checkpoints}/  unfinished: survives kill -9, the next try resumes from it
-    STORE/leases/<writer>.json                who that writer is, with a heartbeat
-    STORE/kept/<stage>/                       findings about single items, by digest; safe to delete
-    STORE/locks/  STORE/roots/  STORE/digests.sqlite
+    STORE/<stage>/<key>/                   finished: every output and manifest.json; never written again
+    STORE/work/<key>/{out,checkpoints}/    unfinished: survives kill -9, the next try resumes from it
+    STORE/locks/<key>.lock                 held by the one process that works on the key, with its name
+    STORE/kept/<stage>/                    findings about single items, by digest; safe to delete
+    STORE/locks/store.lock  STORE/roots/  STORE/digests.sqlite
 
-A work folder carries its writer's name, and another takes it over by renaming it: of two only one can, and a
-writer that was taken for dead finds its folder gone instead of writing into another's.
+On a file system without locks each process works in its own folder, ``<key>@<process>``. Several may make the
+same results, and the rename decides.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import shutil
-import time
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -29,8 +28,7 @@ from typing import Literal
 from cleargs.errors import StoreError
 from cleargs.files import disk_error, is_partial, sync, sync_tree, write_bytes
 from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.lease import DEAD_AFTER, Holder, lease, living_holder, this_process
-from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.lock import file_lock, is_locked, process_name, sign, signature
 from cleargs.pipeline.manifest import (
     MANIFEST,
     Manifest,
@@ -50,9 +48,6 @@ ROOTS = "roots"
 
 SECONDS = "seconds"
 """File in a work folder: how long the tries before took."""
-
-WAIT = 0.5
-"""Seconds between two looks whether another writer is done."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +108,6 @@ class Store:
     def __init__(self, root: Path, memo: DigestMemo) -> None:
         self.root = root
         self.memo = memo
-        here = this_process()
-        self._writer = f"{_process_name(here.host, here.pid)}{secrets.token_hex(4)}"
 
     # -- reading ---------------------------------------------------------------------------------------
 
@@ -146,87 +139,67 @@ class Store:
         if self._only_readable():
             yield
             return
-        with file_lock(self.root / "locks" / "store.lock", shared=True), lease(self._lease(self._writer)):
+        with file_lock(self.root / "locks" / "store.lock", shared=True):
             yield
 
     @contextmanager
-    def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[None]:
-        """Hold the work on ``key``; waits, and says so, while another process has it.
+    def lock(self, key: str, reporter: Reporter, stage: str) -> Iterator[bool]:
+        """Hold the work on ``key``; wait while another process has it, and say which one.
 
-        The lock keeps processes apart where the file system has locks. Where it has none, another writer's
-        heartbeat is waited out; where a dead node's lock stays, it is passed over once no writer was seen
-        alive for `DEAD_AFTER` seconds.
+        Yields whether this process is alone: a file system without locks keeps nobody apart.
         """
         if self._only_readable():
             raise StoreError(
                 f"{stage} is to be made, but the store {self.root} may only be read",
                 hint="choose a --store of your own",
             )
-        path, held, said = self.root / "locks" / f"{key}.lock", False, False
-        seen = time.monotonic()
-        with ExitStack() as kept:
-            while True:
-                if not held:
-                    with ExitStack() as attempt:
-                        held = attempt.enter_context(file_lock(path, wait=False))
-                        if held:
-                            kept.enter_context(attempt.pop_all())
-                holder = self._other_writer(key)
-                if holder is not None:
-                    seen = time.monotonic()
-                elif held or time.monotonic() - seen > DEAD_AFTER:
-                    break
-                if not said:
-                    where = f" ({holder.host}, job {holder.job})" if holder is not None and holder.job else ""
-                    reporter.info(f"{stage}: another run is at work on it{where}; waiting")
-                    said = True
-                time.sleep(WAIT)
+        path = self.root / "locks" / f"{key}.lock"
+        with ExitStack() as stack:
+            held = stack.enter_context(file_lock(path, wait=False))
+            if held is False:
+                reporter.info(f"{stage}: {signature(path)} works on it; waiting")
+                held = stack.enter_context(file_lock(path))
+            sign(path)
             try:
-                yield
+                yield held is not None
             finally:
-                self._let_go(key)
+                self._hand_back(key)
 
     def _only_readable(self) -> bool:
         return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
-    def _lease(self, writer: str) -> Path:
-        return self.root / "leases" / f"{writer}.json"
+    def _own(self) -> str:
+        """The ending of this process's own work folders, where no lock keeps another one out."""
+        return f"@{socket.gethostname()}-{os.getpid()}"
 
-    def _other_writer(self, key: str) -> Holder | None:
-        """A living writer, other than this one, that has a work folder of ``key``."""
-        for folder in (self.root / "work").glob(f"{key}*@*"):
-            writer = folder.name.partition("@")[2]
-            if writer != self._writer and (holder := living_holder(self._lease(writer))) is not None:
-                return holder
-        return None
+    def _hand_back(self, key: str) -> None:
+        """Leave this process's own work folders of ``key`` to the next try."""
+        for folder in (self.root / "work").glob(f"{key}*{self._own()}"):
+            with suppress(OSError):  # another process left something there already
+                folder.rename(folder.with_name(folder.name.removesuffix(self._own())))
 
-    def _claim(self, name: str) -> Path:
-        """The work folder ``name`` as this writer's own; what a dead writer left of it is taken over."""
-        mine = self.root / "work" / f"{name}@{self._writer}"
-        for folder in sorted((self.root / "work").glob(f"{name}@*")):
-            writer = folder.name.partition("@")[2]
-            if mine.exists() or living_holder(self._lease(writer)) is not None:
-                continue
-            self._lease(writer).unlink(missing_ok=True)  # first: without it, that writer publishes nothing
-            with suppress(FileNotFoundError):  # else another writer was quicker
-                folder.rename(mine)
-        return mine
-
-    def _let_go(self, key: str) -> None:
-        """Leave what this writer keeps of ``key`` to whoever comes next; else it would be waited for."""
-        for folder in (self.root / "work").glob(f"{key}*@{self._writer}"):
-            with suppress(OSError):  # something left is there already: ours stays until this process ends
-                folder.rename(folder.with_name(f"{folder.name.partition('@')[0]}@left"))
-
-    def open_work(self, key: str, *, fresh: bool, entry: Entry | None, leftovers: Sequence[str] = ()) -> Work:
+    def open_work(
+        self,
+        key: str,
+        *,
+        fresh: bool,
+        entry: Entry | None,
+        leftovers: Sequence[str] = (),
+        alone: bool = True,
+    ) -> Work:
         """The work folder of ``key``, ready to resume: of the outputs that dead writers left, only those stay
-        that match one of the patterns ``leftovers``.
+        that match one of the patterns ``leftovers``. Where this process is not ``alone``, the folder is its
+        own.
 
         A forced rebuild (``fresh``) has a folder of its own, which resumes only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
         """
-        work = Work(self._claim(f"{key}.forced" if fresh else key))
+        work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
         try:
+            if not alone:
+                left, work = work, Work(work.folder.with_name(work.folder.name + self._own()))
+                with suppress(OSError):  # nothing is there, or another process took it
+                    left.folder.rename(work.folder)
             work = replace(work, thrown_away=tuple(_only_files(work.folder)))
             _keep_only(work.out, leftovers)
             if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
@@ -245,14 +218,8 @@ class Store:
         """Move the outputs of ``work`` to their final place: all or nothing, and durable.
 
         Where a whole result with the same content is already there, ours is dropped and that one's manifest
-        returned. A partial, damaged or differing one makes room. Raises StoreError when this writer was taken
-        for dead meanwhile: what it holds may lack what it wrote before.
+        returned. A partial, damaged or differing one makes room.
         """
-        if not self._lease(self._writer).exists():
-            raise StoreError(
-                f"another process took over the work on {manifest.stage}: this one gave no sign of life",
-                hint="nothing is lost; the same command waits for the other or finds what it made",
-            )
         final = self.folder(manifest.stage, manifest.key)
         try:
             write_manifest(work.out, manifest)
@@ -338,12 +305,16 @@ class Store:
         """Remove the finished folders that no run links to; with ``checkpoints`` unfinished work and what is
         kept about single items too.
 
-        Raises StoreError when a run is at work in the store.
+        Raises StoreError when a run is at work in the store, or where the file system cannot tell.
         """
-        leases = sorted((self.root / "leases").glob("*.json"))
         with file_lock(self.root / "locks" / "store.lock", wait=False) as alone:
-            if not alone or any(living_holder(path) is not None for path in leases):
+            if alone is False:
                 raise StoreError("a run is at work in this store", hint="try again when it is done")
+            if alone is None and not dry_run:
+                raise StoreError(
+                    f"the file system of {self.root} has no locks, which would keep data in use",
+                    hint="when no run works there, delete the folders that --dry-run lists",
+                )
             linked = self._linked(stages)
             found = [
                 Garbage(folder, "finished", _size(folder))
@@ -364,8 +335,6 @@ class Store:
             if not dry_run:
                 for garbage in found:
                     self.discard(garbage.folder)
-                for path in leases:
-                    path.unlink(missing_ok=True)
                 for lock in (self.root / "locks").glob("*.lock"):
                     if lock.name != "store.lock":
                         lock.unlink(missing_ok=True)
@@ -389,28 +358,23 @@ class Garbage:
 
 
 def last_saved(root: Path, pid: int) -> int:
-    """When process ``pid`` of this host last finished a file in its work folders in the store ``root``.
+    """Time of the youngest whole file in the work folders of process ``pid`` of this host, ns; 0 for none.
 
-    The youngest time stamp, ns; 0 without any file. A growing number says that a checkpoint was written.
+    A growing number says that a checkpoint was written in the store ``root``.
     """
+    keys = [lock.stem for lock in (root / "locks").glob("*.lock") if signature(lock) == process_name(pid)]
     youngest = 0
-    for folder in (root / "work").glob(f"*@{_process_name(this_process().host, pid)}*"):
-        for file in folder.rglob("*"):
-            with suppress(FileNotFoundError):
-                if file.is_file() and not is_partial(file):
-                    youngest = max(youngest, file.stat().st_mtime_ns)
+    for file in (file for key in keys for file in (root / "work").glob(f"{key}*/**/*")):
+        with suppress(FileNotFoundError):
+            if file.is_file() and not is_partial(file):
+                youngest = max(youngest, file.stat().st_mtime_ns)
     return youngest
 
 
 def writer_lives(work: Path) -> bool:
-    """Whether somebody is at work in the work folder ``work``."""
-    lease_of = work.parent.parent / "leases" / f"{work.name.partition('@')[2]}.json"
-    return work.is_dir() and living_holder(lease_of) is not None
-
-
-def _process_name(host: str, pid: int) -> str:
-    """How the name of a writer begins."""
-    return f"{host}-{pid}-"
+    """Return True if a process works in the work folder ``work``."""
+    key = work.name.partition("@")[0].removesuffix(".forced")
+    return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
 
 
 def _size(folder: Path) -> int:

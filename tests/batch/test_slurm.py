@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -259,9 +258,9 @@ def test_three_scenes_and_a_job_killed_amid_g0(tmp_path: Path, slurm: Slurm) -> 
     while not (checkpoints := checkpoints_of(folder, "kitchen", "g0")):
         assert time.monotonic() < deadline and batch.poll() is None, folder.engine_log.read_text()[-3000:]
         time.sleep(0.05)
-    (writer,) = {checkpoint.parents[1].name.partition("@")[2] for checkpoint in checkpoints}
-    lease = json.loads((folder.store / "leases" / f"{writer}.json").read_text())
-    os.kill(lease["pid"], signal.SIGKILL)
+    (key,) = {checkpoint.parents[1].name for checkpoint in checkpoints}
+    writer = (folder.store / "locks" / f"{key}.lock").read_text()
+    os.kill(int(writer.split()[1]), signal.SIGKILL)
     code, scenes = finish(batch)
     assert code == 0, folder.engine_log.read_text()[-3000:]
     assert {name: state["state"] for name, state in scenes.items()} == dict.fromkeys(
@@ -293,17 +292,10 @@ def checkpoints_of(folder: BatchFolder, scene: str, stage: str) -> list[Path]:
     status = folder.read_status(scene, stage)
     if status is None or status.state != "running":
         return []
-    writers = [path for path in (folder.store / "leases").glob("*.json") if job_number(path) == status.job]
+    locks = (folder.store / "locks").glob("*.lock")
+    keys = [lock.stem for lock in locks if f"Slurm job {status.job})" in lock.read_text()]
     return [
         file
-        for writer in writers
-        for file in (folder.store / "work").glob(f"*@{writer.stem}/checkpoints/{stage}.safetensors")
+        for key in keys
+        for file in (folder.store / "work").glob(f"{key}/checkpoints/{stage}.safetensors")
     ]
-
-
-def job_number(path: Path) -> str:
-    """The Slurm job in a lease."""
-    try:
-        return str(json.loads(path.read_text())["job"])
-    except (OSError, ValueError):
-        return ""

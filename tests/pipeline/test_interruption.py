@@ -67,7 +67,7 @@ def test_two_runs_at_once_do_each_stage_once(bench: Bench) -> None:
     wait_for(bench, "held")
     second = start(bench)
     assert second.stderr is not None
-    met = any("square: another run is at work on it; waiting" in line for line in second.stderr)
+    met = any("works on it; waiting" in line for line in second.stderr)
     (bench.root / "hold").unlink()
     assert met
     for process in (first, second):

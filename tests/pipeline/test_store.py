@@ -132,7 +132,7 @@ def test_leftovers_of_dead_writers_are_not_published(bench: Bench) -> None:
     bench.run(until="count")
     key = read_manifest(bench.folder / "count").key
     shutil.rmtree(bench.store / "count")
-    out = bench.store / "work" / f"{key}@dead-1-0" / "out"
+    out = bench.store / "work" / f"{key}" / "out"
     (out / "numbers").mkdir(parents=True)
     (out / "numbers" / ".99.partial.1.txt").write_text("half")
     (out / MANIFEST).write_text("{}")
@@ -278,7 +278,7 @@ def test_work_folders_that_are_none_are_thrown_away(bench: Bench, place: str, wh
     healthy = bench.digests()
     key = read_manifest(bench.folder / "square").key
     shutil.rmtree(bench.store / "square")
-    found = bench.store / "work" / f"{key}@left" / place
+    found = bench.store / "work" / f"{key}" / place
     found.parent.mkdir(parents=True)
     if what == "file":
         found.write_bytes(b"no folder")
@@ -295,7 +295,7 @@ def test_links_among_leftovers_are_not_published(bench: Bench) -> None:
     healthy = bench.digests()
     key = read_manifest(bench.folder / "count").key
     shutil.rmtree(bench.store / "count")
-    out = bench.store / "work" / f"{key}@left" / "out"
+    out = bench.store / "work" / f"{key}" / "out"
     (out / "numbers").mkdir(parents=True)
     (out / "numbers" / "1.txt").symlink_to(bench.capture / "1.txt")
     (out / "secret").symlink_to("/etc/passwd")
@@ -325,7 +325,7 @@ def test_foreign_files_among_leftovers_are_not_published(bench: Bench) -> None:
     }.items():
         shutil.rmtree(bench.store / name)
         for place in places:
-            file = bench.store / "work" / f"{manifests[name].key}@left" / "out" / place
+            file = bench.store / "work" / f"{manifests[name].key}" / "out" / place
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text("99")
     assert bench.digests() == healthy

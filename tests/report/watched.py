@@ -11,8 +11,8 @@ from pathlib import Path
 from report_run import FinishedRun
 
 from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.lease import lease
 from cleargs.pipeline.live import noted
+from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.report.page import write_report
@@ -46,11 +46,11 @@ def serving(made: FinishedRun) -> Iterator[int]:
 @contextmanager
 def working(made: FinishedRun, stage: str) -> Iterator[tuple[Reporter, Path]]:
     """A writer of ``stage`` at work: its reporter and its checkpoints."""
-    store, work = made.run.store, made.run.store / "work" / "key@me"
+    store, work = made.run.store, made.run.store / "work" / "key"
     (work / "checkpoints" / "round_01").mkdir(parents=True)
     try:
         with (
-            lease(store / "leases" / "me.json"),
+            file_lock(store / "locks" / "key.lock"),
             noted(SilentReporter(), made.folder, stage, work) as reporter,
         ):
             yield reporter, work / "checkpoints"

@@ -1,0 +1,90 @@
+"""Locks: one process per work folder, and file systems without locks, where the rename decides."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+from pathlib import Path
+
+import pytest
+from toy import Bench
+
+from cleargs.errors import StoreError
+from cleargs.pipeline.digest import DigestMemo
+from cleargs.pipeline.lock import file_lock, is_locked, sign, signature
+from cleargs.pipeline.manifest import read_manifest
+from cleargs.pipeline.store import Store
+
+
+@pytest.fixture
+def no_locks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(handle: int, kind: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+
+
+def test_lock_excludes_and_ends_with_its_block(tmp_path: Path) -> None:
+    path = tmp_path / "locks" / "key.lock"
+    assert not is_locked(path)
+    with file_lock(path) as held, file_lock(path, wait=False) as second:
+        assert (held, second) == (True, False)
+        sign(path)
+        assert is_locked(path) and signature(path).startswith("process ")
+    assert not is_locked(path)
+    with file_lock(path, shared=True), file_lock(path, shared=True, wait=False) as second:
+        assert second and not is_locked(path)
+
+
+def test_unsigned_lock_is_of_another_process(tmp_path: Path) -> None:
+    path = tmp_path / "key.lock"
+    assert signature(path) == "another process"
+    path.write_bytes(b"\xff")
+    assert signature(path) == "another process"
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_run_without_locks(bench: Bench) -> None:
+    assert [outcome.how for outcome in bench.run()] == ["made"] * 3
+    assert list((bench.store / "work").iterdir()) == []
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_without_locks_the_rename_decides(bench: Bench) -> None:
+    bench.run()
+    manifest = read_manifest(bench.folder / "total")
+    with DigestMemo(bench.root / "memo.sqlite") as memo:
+        first, second = Store(bench.root / "shared", memo), Store(bench.root / "shared", memo)
+        second._own = lambda: "@another-node-1"  # type: ignore[method-assign]
+        key, result = manifest.key, (bench.folder / "total" / "total.txt").read_bytes()
+        with first.lock(key, bench.remarks, "total") as alone, second.lock(key, bench.remarks, "total"):
+            assert not alone
+            works = [store.open_work(key, fresh=False, entry=None, alone=False) for store in (first, second)]
+            for work in works:
+                (work.out / "total.txt").write_bytes(result)
+            assert first.publish(works[0], manifest) == second.publish(works[1], manifest) == manifest
+        assert list((bench.root / "shared" / "work").iterdir()) == []
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_without_locks_a_failed_try_is_resumed(bench: Bench) -> None:
+    (bench.capture / "3.txt").write_text("no number")
+    with pytest.raises(ValueError, match="no number"):
+        bench.run()
+    (left,) = (bench.store / "work").iterdir()
+    assert "@" not in left.name and (left / "checkpoints" / "state.txt").exists()
+    bench.work_done()
+    with pytest.raises(ValueError, match="no number"):
+        bench.run()
+    assert "square 2.txt" not in bench.work_done()
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_without_locks_nothing_is_cleared_away(bench: Bench) -> None:
+    bench.run("square.power=3")
+    bench.run()
+    with DigestMemo(bench.store / "digests.sqlite") as memo:
+        store = Store(bench.store, memo)
+        assert store.collect(bench.dag.names, checkpoints=False, dry_run=True)
+        with pytest.raises(StoreError, match="has no locks"):
+            store.collect(bench.dag.names, checkpoints=False, dry_run=False)
