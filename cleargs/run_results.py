@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import Manifest, read_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import SCENE, scene_stage
@@ -46,25 +45,18 @@ class Run:
             return StageResults(self.folder / stage, read_manifest(self.folder / stage))
         except (OSError, ValueError) as error:
             raise InputError(
-                f"{stage} is not finished in {self.folder}", hint=f"see cleargs explain {self.folder}"
+                f"{stage} is not finished in {self.folder}", hint=f"see cleargs status {self.folder}"
             ) from error
 
-    def scene(self, stage: str | None = None, *, stale: bool = False) -> Scene:
-        """The scene of ``stage``, or of the last stage that has one.
-
-        Raises InputError where there is none, or where it was made with other settings or inputs than the
-        run's, unless ``stale``.
-        """
+    def scene(self, stage: str | None = None) -> Scene:
+        """The scene of ``stage``, or of the last that has one. Raises InputError where there is none."""
         from cleargs.splat.ply import read_ply
 
-        return read_ply(self.scene_file(stage, stale=stale))
+        return read_ply(self.scene_file(stage))
 
-    def scene_file(self, stage: str | None = None, *, stale: bool = False) -> Path:
-        """Where the scene of `scene` lies."""
-        dag = installed()
-        chosen = scene_stage(dag, self.folder, stage)
-        require_fresh(dag, self.folder, (chosen,), stale=stale)
-        return self.folder / chosen / SCENE
+    def scene_file(self, stage: str | None = None) -> Path:
+        """The file of `scene`."""
+        return self.folder / scene_stage(installed(), self.folder, stage) / SCENE
 
 
 @dataclass(frozen=True)

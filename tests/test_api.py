@@ -58,7 +58,7 @@ def test_what_is_missing_is_an_error_with_a_hint(tmp_path: Path) -> None:
         cg.Run(tmp_path)["rvaa"]
     with pytest.raises(InputError, match="rva is not finished") as caught:
         cg.Run(tmp_path)["rva"]
-    assert "cleargs explain" in caught.value.hint
+    assert "cleargs status" in caught.value.hint
     with pytest.raises(InputError, match="there is no stage 'rvaa'"):
         cg.run(tmp_path, tmp_path / "run", until="rvaa")
     with pytest.raises(InputError, match=r"there is no setting rva\.tau"):

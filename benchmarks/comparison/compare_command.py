@@ -17,7 +17,6 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
-    stale_option,
     threads_or_all,
     work_options,
 )
@@ -26,7 +25,6 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
@@ -110,7 +108,6 @@ Examples:
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
 @quality_option
 @report_option("Write OUT/report/index.html, the tables and pictures as a page.")
-@stale_option
 @work_options
 @json_option
 @quiet_option
@@ -128,7 +125,6 @@ def compare(
     overrides: tuple[str, ...],
     quality: tuple[str, ...],
     wants_report: bool,
-    stale: bool,
     device: DeviceChoice,
     threads: int | None,
     as_json: bool,
@@ -160,7 +156,6 @@ def compare(
             f"{', '.join(idle)}: finished runs are compared as they are",
             hint="leave it out, or give captures, whose variants are trained",
         )
-    warnings = list(filter(None, (require_fresh(dag, run, dag.names, stale=stale) for run in runs)))
     chosen = find_variants([name.strip() for name in variants.split(",") if name.strip()])
     out = out.absolute()
     reporter = make_reporter(quiet)
@@ -181,7 +176,7 @@ def compare(
             made = make_scenes(out, samples, chosen, recipe, store, reporter)
         compared = compare_scenes(out, made, recipe, store, reporter)
     found, labels = compared.results.cells, compared.labels
-    warnings = [*training_lines(found, labels), *warnings]
+    warnings = training_lines(found, labels)
     baselines = BASELINES if not runs else found.variants()[:1]
     made_with = _made_with(() if runs else chosen, seeds, recipe)
     head = "\n\n".join(["# Comparison", *warnings, "\n".join(f"* {line}" for line in made_with)])

@@ -29,9 +29,6 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings 
 partial_option = click.option(
     "--allow-partial", is_flag=True, help="Continue after a stage that is done only in part."
 )
-stale_option = click.option(
-    "--stale", is_flag=True, help="Take results that were made with other settings or inputs than the run's."
-)
 run_argument = click.argument("run", type=FOLDER)
 
 

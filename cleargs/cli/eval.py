@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, stale_option, threads_or_all
+from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
@@ -112,7 +111,6 @@ stages and options stay there as long as their scenes do.
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads; results do not depend on it.")
-@stale_option
 @click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
 @quiet_option
@@ -132,7 +130,6 @@ def eval(
     save_renders: Path | None,
     output: Path | None,
     threads: int | None,
-    stale: bool,
     per_image: bool,
     as_json: bool,
     quiet: bool,
@@ -151,7 +148,6 @@ def eval(
         raise InputError(
             "--poses given needs --reference", hint="held-out frames are rendered at their own poses anyway"
         )
-    warning = "" if run is None else require_fresh(dag, run, (dag.names[0], *scenes), stale=stale)
     nets: tuple[LpipsNet, ...] = LPIPS_NETS if lpips == "both" else () if lpips == "none" else (lpips,)
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
     from cleargs.evaluate.eval_report import Report, write_report
@@ -199,11 +195,9 @@ def eval(
     elif output is not None:
         write_report(output, report)
     if as_json:
-        if warning:
-            reporter.warn(warning)
         print_json(report.document())
     else:
-        for line in filter(None, (_seen_before(report), warning)):
+        if line := _seen_before(report):
             click.echo(line)
         _print(report, per_image, output)
         if run is not None and not align_colour and _exposure_counts(run):
@@ -265,7 +259,7 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
         )
     done = [name for name in dag.names if (target / name / SCENE).is_file()]
     if not done:
-        raise InputError(f"there is no scene in {target}", hint=f"see cleargs explain {target}")
+        raise InputError(f"there is no scene in {target}", hint=f"see cleargs status {target}")
     chosen = done if "all" in stages else [dag.check(name) for name in dict.fromkeys(stages)] or done[-1:]
     for name in chosen:
         if name not in done:

@@ -7,11 +7,10 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import run_argument, stale_option
+from cleargs.cli.common import run_argument
 from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.session import SCENE, scene_stage
 
@@ -78,7 +77,6 @@ Examples:
     help="The new file; its ending says what to write: .ply .compressed.ply .sog .spz .glb .usdc",
 )
 @click.option("--force", is_flag=True, help="Replace the files where they exist.")
-@stale_option
 @click.pass_obj
 def export(
     dag: Dag,
@@ -92,7 +90,6 @@ def export(
     chosen: str | None,
     output: Path,
     force: bool,
-    stale: bool,
 ) -> None:
     """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
     beside it."""
@@ -110,7 +107,6 @@ def export(
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
-    warning = require_fresh(dag, run, (stage,), stale=stale)
     from cleargs.capture.model import moved, read_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
@@ -131,7 +127,7 @@ def export(
         similarity = upright(named[0][1], up)
 
     scene = read_ply(run / stage / SCENE)
-    remarks = [] if warning is None else [warning]
+    remarks = []
     if thresholds:
         scene, remark = pruned(scene, thresholds, run, stage)
         remarks.append(remark)

@@ -21,7 +21,7 @@ INTERRUPTED = 130
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("cleargs.cli.run", "Turn a capture into a clean scene: all stages, or those that are missing."),
     "stage": ("cleargs.cli.stage", "Run one stage of a prepared run."),
-    "explain": ("cleargs.cli.explain", "Say for each stage whether it is done, and what changed if not."),
+    "status": ("cleargs.cli.status", "Say for each stage whether it is done, and what changed if not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
     "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
     "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
@@ -42,12 +42,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 """Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""
 
+ALIASES = {"explain": "status"}
+"""Old name of a command -> its name."""
+
 EPILOG = """\b
 Examples:
   cleargs run video.mp4 -o room              a video, an image folder, a COLMAP project ...
   cleargs run video.mp4 -o room --set rva.tau_R=0.7
   cleargs show room                          what each stage found
-  cleargs explain room                       what the same command would do again, and why
+  cleargs status room                        what is done, what is missing, and which setting changed
   cleargs settings g0                        what a stage can be told
   cleargs report room                        a page to look at: room/report/index.html
   cleargs render room -o room.mp4            a film along the capture's path
@@ -66,6 +69,7 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        cmd_name = ALIASES.get(cmd_name, cmd_name)
         if cmd_name not in COMMANDS:
             return None
         command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_"))

@@ -13,14 +13,12 @@ from cleargs.cli.common import (
     print_json,
     quiet_option,
     run_argument,
-    stale_option,
     threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.session import DeviceChoice, resolve_device, scene_stage
 
 if TYPE_CHECKING:
@@ -103,7 +101,6 @@ for each pose.
     help="The new file; its ending says what to write: .mp4 .png .exr",
 )
 @click.option("--force", is_flag=True, help="Replace the file where it exists.")
-@stale_option
 @work_options
 @json_option
 @quiet_option
@@ -123,7 +120,6 @@ def render(
     codec: Literal["h264", "av1"],
     output: Path,
     force: bool,
-    stale: bool,
     device: DeviceChoice,
     threads: int | None,
     as_json: bool,
@@ -140,14 +136,11 @@ def render(
     kind = kind_of(output)
     require_free(output, force=force)
     stage = scene_stage(dag, run, chosen)
-    warning = require_fresh(dag, run, (stage,), stale=stale)
     from cleargs.render.shots import CaptureShots
     from cleargs.splat.kernels.runtime import set_threads
     from cleargs.splat.ply import read_ply
 
     reporter = make_reporter(quiet)
-    if warning:
-        reporter.warn(warning)
     on = resolve_device(device, reporter.info)
     set_threads(threads_or_all(threads))
     capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)

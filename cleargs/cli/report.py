@@ -14,14 +14,12 @@ from cleargs.cli.common import (
     print_json,
     quiet_option,
     run_argument,
-    stale_option,
     store_option,
     threads_or_all,
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import require_fresh
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Outcome
@@ -35,7 +33,6 @@ Examples:
 """
 )
 @run_argument
-@stale_option
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all cores]")
 @store_option
 @json_option
@@ -44,24 +41,18 @@ Examples:
 def report(
     dag: Dag,
     run: Path,
-    stale: bool,
     threads: int | None,
     store: Path | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it.
-
-    Results that were made with other settings or inputs than the run's are refused without --stale.
-    """
+    """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
     from cleargs.report.page import write_report
 
     settings = read_run_file(run, dag, store=store)
     reporter = make_reporter(quiet)
-    if line := require_fresh(dag, run, dag.names, stale=stale):
-        reporter.warn(line)
     with opened_store(settings.store) as opened:
-        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), reporter), stale=stale)
+        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), reporter))
     if as_json:
         print_json({"report": str(page)})
     else:

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, run_argument, stale_option
+from cleargs.cli.common import json_option, print_json, run_argument
 from cleargs.cli.frame_reasons import COLUMNS, frame_rows, short_name
 from cleargs.cli.manifest_words import headlines, in_words, text_of
 from cleargs.cli.summary import describe_table, sampled_rows
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.freshness import Reasons, require_fresh, stale_stages
 from cleargs.pipeline.live import at_work, preview_of
 from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import Run, read_run_file
@@ -38,9 +37,6 @@ Examples:
   cleargs show room g0 --rows 5     rows of each table, evenly spread
   cleargs show room rva --plot      a picture of the trajectory: room/rva-plot.png
   cleargs show room --frame 3       all about one frame, and its layers: room/frame-000003.png
-
-\b
-A stage is stale when it was made with other settings or inputs than the run has now.
 """
 )
 @run_argument
@@ -66,7 +62,6 @@ A stage is stale when it was made with other settings or inputs than the run has
     type=click.Path(dir_okay=False, path_type=Path),
     help=f"Picture of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
 )
-@stale_option
 @json_option
 @click.pass_obj
 def show(
@@ -78,7 +73,6 @@ def show(
     plot: bool,
     frame: int | None,
     output: Path | None,
-    stale: bool,
     as_json: bool,
 ) -> None:
     """Show what the stages of RUN found, or the tables of one STAGE."""
@@ -96,24 +90,22 @@ def show(
             "--output names the PNG of --plot or --frame", hint=f"cleargs show {run} rva --plot -o FILE.png"
         )
     if frame is not None:
-        _show_frame(dag, run, frame, output or run / f"frame-{frame:06d}.png", stale, as_json)
+        _show_frame(dag, run, frame, output or run / f"frame-{frame:06d}.png", as_json)
         return
     settings = read_run_file(run, dag)
-    old = stale_stages(dag, settings)
     if stage is None:
         manifests = {name: linked_manifest(run, name) for name in dag.names}
         if as_json:
-            print_json({name: _facts(manifest, old.get(name)) for name, manifest in manifests.items()})
+            print_json({name: _facts(manifest) for name, manifest in manifests.items()})
         else:
-            _print_run(manifests, old)
+            _print_run(manifests)
             _print_work(settings)
         return
     dag.check(stage)
     manifest = linked_manifest(run, stage)
     if manifest is None:
-        raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs explain {run}")
+        raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     if plot:
-        _say(require_fresh(dag, run, ("ingest", "rva"), stale=stale))
         picture = _plot(run, output or run / PLOT)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
@@ -128,17 +120,17 @@ def show(
     frames = None
     if stage == "rva":
         rivr = run / "rivr" / "selection.parquet"
-        repairs = _read(rivr).to_pylist() if rivr.is_file() and "rivr" not in old else None
+        repairs = _read(rivr).to_pylist() if rivr.is_file() else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
     if as_json:
         shown = {
             name: {"rows": table.num_rows, "columns": describe_table(table)} for name, table in tables.items()
         }
-        facts = {"stage": stage, **(_facts(manifest, old.get(stage)) or {}), "tables": shown}
+        facts = {"stage": stage, **(_facts(manifest) or {}), "tables": shown}
         print_json(facts if frames is None else {**facts, "frames": frames})
         return
     console = _console()
-    _print_facts(console, manifest, old.get(stage))
+    _print_facts(console, manifest)
     if frames is not None and not columns and rows is None:
         _print_frames(console, frames)
         return
@@ -154,14 +146,13 @@ def show(
         console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 
 
-def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, stale: bool, as_json: bool) -> None:
+def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, as_json: bool) -> None:
     """Print all about one frame, and write the picture of its layers. Raises InputError, StoreError."""
     from cleargs.cli.show_frame import frame_facts, frame_row, in_lines, write_layers
 
     made = {name: found for name in dag.names if (found := linked_manifest(run, name)) is not None}
     if "ingest" not in made:
-        raise InputError(f"{run} has no frames yet", hint=f"see cleargs explain {run}")
-    _say(require_fresh(dag, run, list(made), stale=stale))
+        raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
     row = frame_row(run, made, frame)
     facts = frame_facts(run, made, row, made["rva"].parts.config if "rva" in made else {})
     layers = write_layers(picture, run, made, row)
@@ -177,12 +168,6 @@ def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, stale: bool, as_
         table.add_row(label, Text(text))
     _console().print(table)
     click.echo(f"written: {picture}")
-
-
-def _say(warning: str) -> None:
-    """What is taken although it is stale."""
-    if warning:
-        click.echo(f"warning: {warning}", err=True)
 
 
 def _plot(run: Path, picture: Path) -> Path:
@@ -207,12 +192,11 @@ def _read(path: Path) -> Any:
         ) from error
 
 
-def _facts(manifest: Manifest | None, stale: Reasons | None) -> dict[str, Any] | None:
+def _facts(manifest: Manifest | None) -> dict[str, Any] | None:
     if manifest is None:
         return None
     return {
         "status": manifest.status,
-        "stale": list(stale or ()),
         "missing": [*manifest.inherited, *manifest.missing],
         "key": manifest.key,
         "digest": manifest.digest,
@@ -235,7 +219,7 @@ def _console() -> Console:
     return Console(highlight=False, markup=False)  # names may hold brackets
 
 
-def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons]) -> None:
+def _print_run(manifests: dict[str, Manifest | None]) -> None:
     from rich.table import Table
 
     table = Table("stage", "state", "seconds", "MB", "files", "figures", box=None, header_style="bold")
@@ -243,13 +227,9 @@ def _print_run(manifests: dict[str, Manifest | None], stale: dict[str, Reasons])
         if manifest is None:
             table.add_row(name, "not done", "", "", "", "")
             continue
-        state = "stale" if name in stale else manifest.status
         cells = (f"{manifest.seconds:.1f}", f"{manifest.bytes / 1e6:.1f}", str(len(manifest.files)))
-        table.add_row(name, state, *cells, headlines(manifest.summary))
-    console = _console()
-    console.print(table)
-    for name, reasons in stale.items():
-        console.print(f"{name} is stale: {'; '.join(reasons)}")
+        table.add_row(name, manifest.status, *cells, headlines(manifest.summary))
+    _console().print(table)
 
 
 def _print_work(run: Run) -> None:
@@ -265,13 +245,12 @@ def _print_work(run: Run) -> None:
         console.print(f"preview: {preview.path}", soft_wrap=True)
 
 
-def _print_facts(console: Console, manifest: Manifest, stale: Reasons | None) -> None:
+def _print_facts(console: Console, manifest: Manifest) -> None:
     from rich.table import Table
 
-    state = "stale" if stale else manifest.status
-    table = Table(box=None, show_header=False, title=f"{manifest.stage}: {state}", title_justify="left")
-    for reason in stale or ():
-        table.add_row("stale", reason)
+    table = Table(
+        box=None, show_header=False, title=f"{manifest.stage}: {manifest.status}", title_justify="left"
+    )
     for missing in (*manifest.inherited, *manifest.missing):
         table.add_row("missing", missing)
     for label, text in in_words(manifest.summary):

@@ -83,7 +83,7 @@ def _changed_inputs(dag: Dag, run: Run, store: Store, manifest: Manifest) -> Ite
     for role, place in dag.load(stage).externals(run.config.sections[stage], run.source).items():
         before = manifest.origins.get(role)
         if before is None:
-            continue  # the stage was made with other settings, which `cleargs explain` tells
+            continue  # the stage was made with other settings, which `cleargs status` tells
         files = named_files(place)
         for name in sorted(before.keys() | files.keys()):
             label = f"{role} {name}".rstrip()

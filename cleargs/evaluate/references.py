@@ -91,7 +91,7 @@ def reference_of(
     if manifest is None:
         raise InputError(
             f"{run_folder} has no finished ingest: nothing is known of its world",
-            hint=f"see cleargs explain {run_folder}",
+            hint=f"see cleargs status {run_folder}",
         )
     found = _in_world(run_folder, manifest, directory, poses, align, reporter)
     try:

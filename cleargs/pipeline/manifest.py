@@ -114,6 +114,16 @@ def linked_manifest(run: Path, stage: str) -> Manifest | None:
         return None
 
 
+def hidden_link(run: Path, stage: str) -> Path:
+    """The link to the results that ``RUN/<stage>`` showed before the settings or inputs changed."""
+    return run / f".{stage}.before"
+
+
+def last_shown(run: Path, stage: str) -> Manifest | None:
+    """The manifest that ``RUN/<stage>`` shows, or showed before the settings or inputs changed."""
+    return linked_manifest(run, stage) or linked_manifest(run, hidden_link(run, stage).name)
+
+
 def published_files(folder: Path) -> dict[str, Path]:
     """Relative POSIX path -> file, for every file that belongs to the outputs in ``folder``."""
     return {

@@ -13,7 +13,7 @@ from cleargs.errors import InputError, StoreError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.digest import require_utf8, tree_digest
 from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions, plugin_versions
-from cleargs.pipeline.manifest import Manifest, linked_manifest
+from cleargs.pipeline.manifest import Manifest, last_shown, linked_manifest
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, External, StageContext
 from cleargs.pipeline.store import Entry, Store
@@ -30,9 +30,8 @@ NOT_MADE = "not made yet"
 
 Origins = dict[str, dict[str, str]]
 
-State = Literal["hit", "partial", "miss", "waits"]
-"""`partial`: there, but its own work is not whole. `waits`: a stage before it must run first; as keys are
-made of content, it may turn out to be a hit."""
+State = Literal["done", "partial", "missing"]
+"""`partial`: there, but its own work is not whole."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +63,9 @@ class StagePlan:
     estimate: Estimate | None = None
     """Cost of the work to do; None where there is none."""
     recipe: Recipe | None = None
-    """None while a stage before it must run first."""
+    """None while a stage before it must run first. As keys are made of content, it may be done after all."""
     manifest: Manifest | None = None
-    """That of a hit."""
+    """That of a stage that is done."""
 
     @property
     def key(self) -> str | None:
@@ -156,7 +155,7 @@ class Planner:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
         if entry is not None and entry.damage is not None:
             return (f"damaged: {entry.damage}",)
-        before = linked_manifest(self.run.folder, recipe.parts.stage)
+        before = last_shown(self.run.folder, recipe.parts.stage)
         if before is None:
             return (NOT_MADE,)
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
@@ -231,6 +230,34 @@ class Planner:
             reporter=self.reporter,
         )
 
+    def outdated(self) -> list[str]:
+        """Stages whose results the run shows although its settings or inputs are others now, in order.
+
+        Results of an older version of the program or of a library are not outdated.
+        """
+        shown: dict[str, Manifest] = {}
+        for name in self.dag.names:
+            manifest = linked_manifest(self.run.folder, name)
+            if manifest is None or manifest.stage != name:
+                continue
+            whole = all(upstream in shown for upstream in self.dag.load(name).INPUTS)
+            if whole and self._with_present_settings(manifest, shown) == manifest.parts:
+                shown[name] = manifest
+        return [name for name in self.dag.names if name not in shown]
+
+    def _with_present_settings(self, manifest: Manifest, shown: Mapping[str, Manifest]) -> KeyParts:
+        """The parts of ``manifest`` with the settings and inputs that its stage has now."""
+        name, parts = manifest.stage, manifest.parts
+        digests = self.external_digests(name)
+        return parts.model_copy(
+            update={
+                "config": _known(key_config(self.run.config.sections[name]), parts.config),
+                "seed": self.run.config.seed,
+                "inputs": _known(self.inputs(name, shown)[0], parts.inputs),
+                "externals": _known({role: tree_digest(digests[role]) for role in digests}, parts.externals),
+            }
+        )
+
     def plan(self, until: str | None = None, force: tuple[str, ...] = ()) -> list[StagePlan]:
         """The state of each stage up to ``until``.
 
@@ -243,22 +270,33 @@ class Planner:
             if waits_for:
                 self.external_digests(name)
                 reason = f"waits for {', '.join(waits_for)}"
-                plans.append(StagePlan(name, "waits", (reason,), self.estimate(name, done)))
+                plans.append(StagePlan(name, "missing", (reason,), self.estimate(name, done)))
                 continue
             recipe = self.recipe(name, done)
             entry = self.store.find(name, recipe.key)
             usable = entry.usable if entry is not None else None
             if name in force:
-                plans.append(StagePlan(name, "miss", ("forced",), self.estimate(name, done), recipe))
+                plans.append(StagePlan(name, "missing", ("forced",), self.estimate(name, done), recipe))
             elif usable is None:
                 reasons = self.reasons(recipe, entry)
-                plans.append(StagePlan(name, "miss", reasons, self.estimate(name, done), recipe))
+                plans.append(StagePlan(name, "missing", reasons, self.estimate(name, done), recipe))
             elif usable.missing:
                 plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), recipe))
             else:
                 done[name] = usable
-                plans.append(StagePlan(name, "hit", (), None, recipe, usable))
+                plans.append(StagePlan(name, "done", (), None, recipe, usable))
         return plans
+
+
+def _known(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """``before`` with the values of ``now``. A name that only one of them has came or went with a version of
+    the program."""
+    return {
+        name: _known(now[name], value)
+        if isinstance(value, Mapping) and isinstance(now.get(name), Mapping)
+        else now.get(name, value)
+        for name, value in before.items()
+    }
 
 
 def redo_lines(plans: list[StagePlan]) -> list[str]:
@@ -266,9 +304,9 @@ def redo_lines(plans: list[StagePlan]) -> list[str]:
     lines = [
         f"{plan.stage} is made again: {'; '.join(plan.reasons)}"
         for plan in plans
-        if plan.state in ("miss", "partial") and plan.reasons != (NOT_MADE,)
+        if plan.recipe is not None and plan.state != "done" and plan.reasons != (NOT_MADE,)
     ]
-    after = [plan.stage for plan in plans if plan.state == "waits"]
+    after = [plan.stage for plan in plans if plan.recipe is None]
     return [*lines, f"then {', '.join(after)}"] if lines and after else lines
 
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +18,7 @@ from cleargs.pipeline.manifest import (
     FileRecord,
     Manifest,
     damages,
-    linked_manifest,
+    last_shown,
     plain_json,
     published_files,
     versions,
@@ -74,7 +73,7 @@ class Runner:
         forced = tuple(self.dag.check(name) for name in force)
         plans = self.planner.plan(until, forced)
         for plan in plans:
-            if plan.state != "hit":
+            if plan.state != "done":
                 self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
         plans = self.planner.at_measured_pace(plans)
@@ -83,9 +82,9 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
-        same_input = partial(check_same_input, self.run, self.dag, self.store)
-        with at_work(self.run, self.dag, same_input), self.store.in_use():
+        with at_work(self.run, self.dag, self._prepare), self.store.in_use():
             self.store.add_root(self.run.folder)
+            self._unlink_outdated()
             as_planned = True
             for plan in plans:
                 name = plan.stage
@@ -96,11 +95,23 @@ class Runner:
                     outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
+                if outcome.how == "made":
+                    self._unlink_outdated()
                 if name == self.dag.names[0] and outcome.how == "made":
                     self._revise(plans[1:], done)
                 if outcome.manifest.status == "partial" and not allow_partial:
                     break
         return outcomes
+
+    def _prepare(self) -> None:
+        """Look at the run folder before its ``run.toml`` changes. Raises InputError for another capture."""
+        check_same_input(self.run, self.dag, self.store)
+        self._unlink_outdated()
+
+    def _unlink_outdated(self) -> None:
+        """Let the run folder show no results of other settings or inputs."""
+        for name in self.planner.outdated():
+            self.store.unlink(self.run.folder, name)
 
     def _revise(self, plans: Sequence[StagePlan], done: Mapping[str, Manifest]) -> None:
         """Say what the stages to come cost, now that the capture is known."""
@@ -121,10 +132,13 @@ class Runner:
         done: dict[str, Manifest] = {}
         with file_lock(self.run.folder / LOCK, shared=True), self.store.in_use():
             self.store.add_root(self.run.folder)
+            self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
                 if upstream in self._all_upstream(name):
                     done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
-            return self._bring(name, done, forced=force)
+            outcome = self._bring(name, done, forced=force)
+            self._unlink_outdated()
+        return outcome
 
     def _all_upstream(self, name: str) -> set[str]:
         direct = set(self.dag.load(name).INPUTS)
@@ -310,7 +324,7 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
     if before is None or before == run.source:
         return
     first = dag.names[0]
-    made = linked_manifest(run.folder, first)
+    made = last_shown(run.folder, first)
     if made is not None:
         externals = dag.load(first).externals(run.config.sections[first], run.source)
         now = {role: tree_digest(store.memo.digests_of(place)) for role, place in externals.items()}

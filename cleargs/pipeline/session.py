@@ -76,9 +76,9 @@ def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
     done = [name for name in dag.names if (run / name / SCENE).is_file()]
     stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
     if stage is None:
-        raise InputError(f"there is no scene in {run}", hint=f"see cleargs explain {run}")
+        raise InputError(f"there is no scene in {run}", hint=f"see cleargs status {run}")
     if stage not in done:
-        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs explain {run}"
+        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs status {run}"
         raise InputError(f"{stage} has no scene in {run}", hint=there)
     return stage
 

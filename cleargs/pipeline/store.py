@@ -33,6 +33,7 @@ from cleargs.pipeline.manifest import (
     MANIFEST,
     Manifest,
     damage,
+    hidden_link,
     published_files,
     read_manifest,
     write_manifest,
@@ -285,8 +286,16 @@ class Store:
             temporary.unlink(missing_ok=True)
             temporary.symlink_to(target)
             temporary.replace(link)
+            hidden_link(run, stage).unlink(missing_ok=True)
         except OSError as error:
             raise disk_error(error, link) from error
+
+    def unlink(self, run: Path, stage: str) -> None:
+        """Let ``RUN/<stage>`` show nothing. What it showed stays in the store, and known to `last_shown`."""
+        link = run / stage
+        if link.is_symlink():
+            with suppress(FileNotFoundError):  # another process did it
+                link.replace(hidden_link(run, stage))
 
     def add_root(self, run: Path) -> None:
         """Note that ``run`` links into this store, so that `collect` keeps what it shows."""

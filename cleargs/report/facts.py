@@ -18,7 +18,7 @@ from cleargs.pipeline.plan import StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.report.words import duration, size
 
-STATES = {"hit": "up to date", "partial": "done in part", "miss": "to be made", "waits": "waits"}
+STATES = {"done": "up to date", "partial": "done in part", "missing": "to be made"}
 
 
 @dataclass(frozen=True)

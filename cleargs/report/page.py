@@ -10,7 +10,6 @@ from typing import Any
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
-from cleargs.pipeline.freshness import stale_stages
 from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
@@ -63,12 +62,10 @@ class SceneView:
     background: tuple[float, float, float]
 
 
-def write_report(planner: Planner, last: LastRun | None = None, *, stale: bool = False) -> Path:
+def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     """Write the report of ``planner.run``, in place of an older one; returns its page.
 
-    Without ``last``, what an older report noted of the last run is kept. With ``stale`` the report also shows
-    results that were made with other settings or inputs than the run's, and says so; else they are left out.
-    The folder appears whole.
+    Without ``last``, what an older report noted of the last run is kept. The folder appears whole.
 
     Raises:
         InputError: when nothing of the run is done yet.
@@ -76,16 +73,12 @@ def write_report(planner: Planner, last: LastRun | None = None, *, stale: bool =
     """
     run = planner.run.folder
     manifests = linked_manifests(run, planner.dag.names)
-    old = {name: why for name, why in stale_stages(planner.dag, planner.run).items() if name in manifests}
-    if not stale:
-        manifests = {name: manifest for name, manifest in manifests.items() if name not in old}
-        old = {}
     if "ingest" not in manifests:
-        raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs explain {run}")
+        raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
     last = last or noted(run)
     with new_report(run) as folder:
-        _fill(folder, planner, manifests, last, {name: "; ".join(why) for name, why in old.items()})
-        write_record(folder, manifests, last, stale=list(old))
+        _fill(folder, planner, manifests, last)
+        write_record(folder, manifests, last)
     return page_of(run)
 
 
@@ -94,7 +87,6 @@ def _fill(
     planner: Planner,
     manifests: Mapping[str, Manifest],
     last: LastRun | None,
-    stale: Mapping[str, str],
 ) -> None:
     """Write the page and all that it needs into ``folder``."""
     run = planner.run.folder
@@ -121,7 +113,7 @@ def _fill(
         source=planner.run.source.name,
         rows=rows,
         pictures=pictures,
-        verdict=judge(manifests, rows, planner.run.config, stale),
+        verdict=judge(manifests, rows, planner.run.config),
         scenes=scenes,
         viewer=write_viewer(folder) if scenes else "",
         plan=charts.plan_of(rows),

@@ -36,7 +36,7 @@ def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
 
 
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
-    """Whether the report of ``run`` is of these results, none of them stale, and of this version."""
+    """Whether the report of ``run`` is of these results, and of this version."""
     return (run / FOLDER / PAGE).is_file() and _record(run).get("made_from") == _made_from(manifests)
 
 
@@ -60,9 +60,7 @@ def noted(run: Path) -> LastRun | None:
         return None
 
 
-def write_record(
-    folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None, *, stale: Sequence[str] = ()
-) -> None:
-    """Note in the report's ``folder`` what it is made from, and which of that it calls stale."""
-    made_from = _made_from(manifests) | ({"stale": ", ".join(stale)} if stale else {})
-    write_json(folder / RECORD, {"made_from": made_from, "last_run": asdict(last) if last else None})
+def write_record(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+    """Note in the report's ``folder`` what it is made from."""
+    record = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
+    write_json(folder / RECORD, record)

@@ -59,11 +59,9 @@ class Verdict:
     warnings: tuple[Caution, ...]
 
 
-def judge(
-    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
-) -> Verdict:
-    """The verdict on a run that shows these ``manifests``; ``stale``: stage -> what changed since."""
-    warnings = tuple(_warnings(manifests, rows, config, stale))
+def judge(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> Verdict:
+    """The verdict on a run that shows these ``manifests``."""
+    warnings = tuple(_warnings(manifests, rows, config))
     tone, headline = _headline(manifests)
     return Verdict(tone, headline, _text(manifests, rows), tuple(_figures(manifests, rows)), warnings)
 
@@ -164,10 +162,8 @@ def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Ite
 
 
 def _warnings(
-    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config, stale: Mapping[str, str]
+    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
 ) -> Iterator[Caution]:
-    for stage, reason in stale.items():
-        yield Caution(f"{stage} is stale", reason, ())
     for manifest in manifests.values():
         for missing in manifest.missing:
             yield Caution(f"{manifest.stage} is done only in part", missing, ())

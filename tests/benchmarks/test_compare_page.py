@@ -16,7 +16,7 @@ from benchmarks.comparison.findings import Compared
 from benchmarks.comparison.page import write_comparison
 
 CAPTURE = "gone & <away>"
-WARNING = "g0 is stale: </script><script>window.hacked = 2</script>"
+WARNING = "note: </script><script>window.hacked = 2</script>"
 
 
 @pytest.fixture(scope="module")

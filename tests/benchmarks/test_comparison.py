@@ -253,7 +253,7 @@ def test_runs_of_two_captures_of_one_name_are_refused(
     assert place is not None
     noted.write_text(text.replace(place[1], str(twin)))
     runs = [str(out / "room-0" / "all-view"), str(other / "rva2")]
-    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", "--stale"]) == 2
+    assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet"]) == 2
     assert "two captures of these runs are called room" in capsys.readouterr().err
 
 

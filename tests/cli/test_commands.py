@@ -89,7 +89,7 @@ def test_an_existing_run_keeps_its_settings_and_says_so(shell: Shell) -> None:
     assert "square.power=3" in err and "seed=5" in err and "--reset" in err
     again(shell, "--set", "count.limit=4")
     assert (shell.bench.folder / "total" / "total.txt").read_text() == "plain 36.0 5", "0 + 1 + 8 + 27"
-    assert shell("explain", str(shell.bench.folder))[1].count("hit") == 3
+    assert shell("status", str(shell.bench.folder))[1].count("done") == 3
 
 
 def test_reset_and_workflow_start_from_the_recipe(shell: Shell) -> None:
@@ -174,19 +174,21 @@ def test_quiet_says_nothing_on_stderr(shell: Shell) -> None:
 
 def test_dry_run_writes_nothing(shell: Shell) -> None:
     code, out, _ = shell.run("--dry-run")
-    assert code == 0 and "count        miss     not made yet" in out and "waits for count" in out
+    assert code == 0 and "count        missing  not made yet" in out and "waits for count" in out
     assert "expected about" in out
     assert not shell.bench.folder.exists()
 
 
-def test_explain_and_stage(shell: Shell) -> None:
+def test_status_and_stage(shell: Shell) -> None:
     shell.run()
     folder = str(shell.bench.folder)
-    assert shell("explain", folder)[1].count("hit") == 3
+    assert shell("status", folder)[1].count("done") == 3
     (shell.bench.capture / "1.txt").write_text("50")
-    code, out, _ = shell("explain", folder)
+    code, out, _ = shell("status", folder)
     assert code == 0 and "external capture: 1.txt changed" in out
-    assert json.loads(shell("explain", folder, "--json")[1])[0]["state"] == "miss"
+    assert json.loads(shell("status", folder, "--json")[1])[0]["state"] == "missing"
+    assert shell("explain", folder) == shell("status", folder), "the old name"
+    assert "explain" not in shell("--help")[1]
     code, _, err = shell("stage", "total", folder)
     assert code == 1 and "error: total needs count, which is not done" in err
     assert shell("stage", "count", folder)[0] == 0
@@ -214,18 +216,15 @@ def test_show(shell: Shell) -> None:
     )
 
 
-def test_show_calls_stale_what_is_stale(shell: Shell) -> None:
+def test_show_and_status_after_a_change(shell: Shell) -> None:
     shell.run()
     again(shell, "--set", "square.power=3", "--until", "count")
     folder = str(shell.bench.folder)
-    code, out, _ = shell("show", folder)
-    assert code == 0 and "square is stale: setting square.power: 2 -> 3" in out
-    rows = [line.split()[:2] for line in out.splitlines()[1:4]]
-    assert rows == [["count", "complete"], ["square", "stale"], ["total", "stale"]]
-    assert json.loads(shell("show", folder, "--json")[1])["square"]["stale"] == [
-        "setting square.power: 2 -> 3"
-    ]
-    assert "square: stale" in shell("show", folder, "square")[1]
+    rows = [line.split()[:2] for line in shell("show", folder)[1].splitlines()[1:4]]
+    assert rows == [["count", "complete"], ["square", "not"], ["total", "not"]]
+    assert "square       missing  setting square.power: 2 -> 3" in shell("status", folder)[1]
+    code, _, err = shell("show", folder, "square")
+    assert code == 2 and f"see cleargs status {folder}" in err
 
 
 def test_gc(shell: Shell) -> None:
@@ -244,7 +243,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
     assert shell.run()[0] == 0
     assert (tmp_path / "shared" / "count").is_dir() and not shell.bench.store.exists()
     monkeypatch.delenv("CLEARGS_STORE")
-    assert shell("explain", str(shell.bench.folder))[1].count("hit") == 3, "run.toml knows its store"
+    assert shell("status", str(shell.bench.folder))[1].count("done") == 3, "run.toml knows its store"
 
 
 @pytest.mark.parametrize(
@@ -255,7 +254,7 @@ def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatc
         (["run", "nowhere", "-o", "r"], 2, "there is no nowhere", "give a video"),
         (["run", ".", "-o", "r", "--workflow", "fast"], 2, "there is no workflow 'fast'", "choose default"),
         (["run", ".", "-o", "r", "--threads", "0"], 2, "Invalid value for '--threads'", "cleargs run --help"),
-        (["explain", "nowhere"], 2, "is no run", "cleargs run INPUT"),
+        (["status", "nowhere"], 2, "is no run", "cleargs run INPUT"),
         (["show", "nowhere"], 2, "is no run", "cleargs run INPUT"),
         (["show", "nowhere", "--rows", "3"], 2, "tables of a stage", "show nowhere rva --columns"),
         (["gc"], 2, "neither a run nor a store", "--store"),
@@ -273,10 +272,10 @@ def test_wrong_usage(shell: Shell, arguments: list[str], code: int, cause: str, 
 def test_damaged_run_file_is_written_anew(shell: Shell) -> None:
     shell.run()
     (shell.bench.folder / "run.toml").write_text("[half")
-    assert shell("explain", str(shell.bench.folder))[0] == 2
+    assert shell("status", str(shell.bench.folder))[0] == 2
     code, out, _ = shell.run()
     assert code == 0 and "already there: count, square, total" in out
-    assert shell("explain", str(shell.bench.folder))[0] == 0
+    assert shell("status", str(shell.bench.folder))[0] == 0
 
 
 def test_bad_setting_creates_nothing(shell: Shell) -> None:

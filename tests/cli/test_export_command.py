@@ -12,12 +12,11 @@ import torch
 sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
 
 from colmap_model import write_sparse
-from eval_world import add_scene, cameras, make_scene, write_run
+from eval_world import cameras, make_scene, write_run
 
 from cleargs.cli.export_pruning import cropped
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
-from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.splat.ply import read_ply
 
 
@@ -59,20 +58,6 @@ def test_a_stage_without_a_scene_is_named(
     assert export(run, tmp_path / "x.ply", "--stage", "rva") == 2
     cause, remedy = capsys.readouterr().err.splitlines()
     assert "rva has no scene" in cause and "g0" in remedy
-
-
-def test_a_stale_scene_is_written_only_on_demand(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    add_scene(run, "rivr", make_scene(count=30))
-    text = (run / RUN_FILE).read_text()
-    (run / RUN_FILE).write_text(text.replace("tau_R = 0.7\n", "tau_R = 0.95\n"))
-    assert export(run, tmp_path / "x.ply") == 2 and not (tmp_path / "x.ply").exists()
-    cause, remedy = capsys.readouterr().err.splitlines()
-    assert "rivr is stale" in cause and "--stale" in remedy
-    assert export(run, tmp_path / "x.ply", "--stale") == 0
-    assert capsys.readouterr().out.startswith("rivr is stale: ")
-    assert read_ply(tmp_path / "x.ply").gaussians.num == 30
 
 
 def test_nothing_left_to_crop_is_said() -> None:

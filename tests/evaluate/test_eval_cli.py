@@ -114,25 +114,20 @@ def test_metrics_that_are_not_installed(
     assert document["means"]["lpips_alex"] is None and document["means"]["clarity-net"] is not None
 
 
-def test_a_stale_scene_is_scored_only_on_demand_and_then_says_what_it_was_trained_on(
-    shell: Shell, run: Path, truth: Path
-) -> None:
+def test_a_scene_says_how_many_of_its_views_it_was_trained_on(shell: Shell, run: Path, truth: Path) -> None:
     # Other frames are held out than those that the scene of g0 was not trained on.
     frames = pq.read_table(run / "ingest" / "frames.parquet").to_pylist()
     for row in frames:
         row["split"] = "test" if row["frame_id"] in (2, 4) else "train"
     write_table(run / "ingest" / "frames.parquet", pa.Table.from_pylist(frames, FRAMES), FRAMES)
     note_finished(run, "ingest", {"poses": "input", "similarity": WORLD.to_json()})
-    fails(shell(run, "--stage", "g0", *FAST), "g0 is stale: input ingest/frames.parquet changed")
-    code, out, _ = shell(run, "--stage", "g0", "--stale", *FAST)
-    first, second = out.splitlines()[:2]
-    assert code == 0 and first == "note: 1 of 2 views are of frames that the scene was trained on"
-    assert second.startswith("g0 is stale: ")
+    code, out, _ = shell(run, "--stage", "g0", *FAST)
+    assert code == 0 and out.startswith("note: 1 of 2 views are of frames that the scene was trained on\n")
     found = json.loads((run / "eval" / "holdout" / "eval.json").read_text())["evaluations"][0]
     assert found["trained_on"] == 1
 
 
-def test_a_comparison_of_a_stale_scene_says_first_what_it_was_trained_on(
+def test_a_comparison_says_first_what_it_was_trained_on(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = pq.read_table(run / "ingest" / "frames.parquet").to_pylist()
@@ -144,7 +139,7 @@ def test_a_comparison_of_a_stale_scene_says_first_what_it_was_trained_on(
     settings = run / "run.toml"
     settings.write_text(settings.read_text().replace('holdout = "none"', 'holdout = "every:4"'))
     out = tmp_path / "out"
-    options = ("--stale", "--lpips", "none", "--threads", "1", "-q", "--no-report", "-o", str(out))
+    options = ("--lpips", "none", "--threads", "1", "-q", "--no-report", "-o", str(out))
     assert invoke(["compare", str(run), *options]) == 0
     text = capsys.readouterr().out
     assert text.splitlines()[2] == "note: 1 of 2 views of run are of frames that it was trained on"

@@ -77,7 +77,7 @@ def test_damage_is_a_miss_with_a_warning(bench: Bench, what: str) -> None:
     healthy = {outcome.stage: outcome.manifest.digest for outcome in bench.run()}
     bench.work_done()
     DAMAGES[what](bench.folder / "count")
-    assert bench.plan()["count"].state == "miss"
+    assert bench.plan()["count"].state == "missing"
     outcomes = bench.run()
     assert len(bench.remarks.warnings) == 1 and "damaged" in bench.remarks.warnings[0]
     assert outcomes[0].how == "made"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO
 import pytest
-from eval_world import HEIGHT, WIDTH, WORLD, add_scene, cameras, make_scene, picture, to_input
+from eval_world import HEIGHT, WIDTH, WORLD, cameras, make_scene, picture, to_input
 from numpy.typing import NDArray
 
 from cleargs.cli.main import invoke
@@ -267,16 +266,3 @@ def test_nothing_half_made_is_left(
         taken.clear()
         assert render(run, output, "--fps", "5", "--seconds", "2") == 130
         assert not list(tmp_path.iterdir())
-
-
-def test_a_stale_scene_only_on_demand(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
-    add_scene(copy, "rivr", make_scene(1))
-    text = (copy / "run.toml").read_text()
-    (copy / "run.toml").write_text(text.replace("\nrounds = ", "\nrounds = 1 #"))
-    assert render(copy, tmp_path / "a.png") == 2
-    assert "rivr is stale" in refusal(capsys)[0]
-    assert render(copy, tmp_path / "a.png", "--stale") == 0 and "rivr is stale" in capsys.readouterr().err
-    assert render(copy, tmp_path / "g0.png", "--stage", "g0") == 0
-    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "g0.png").read_bytes()

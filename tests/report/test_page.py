@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import shutil
 from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,6 @@ import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
-from cleargs.cli.main import invoke
 from cleargs.cli.report import older_report, report_on
 from cleargs.errors import InputError
 from cleargs.pipeline.config import load_config
@@ -156,29 +156,16 @@ def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> 
     assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
 
 
-def test_stale_results_are_shown_only_where_that_is_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    g0 = linked_manifest(run.folder, "g0")
-    assert g0 is not None
-    old = g0.model_copy(update={"parts": g0.parts.model_copy(update={"config": {"steps": 7}})})
-    write_manifest(run.folder / "g0", old)
-    steps = run.run.config.sections["g0"].steps
-    reason = f"g0 is stale: setting g0.steps: 7 -> {steps}"
-    assert invoke(["report", str(run.folder)]) == 2
-    assert reason in capsys.readouterr().err and not (run.folder / "report").exists()
-    assert invoke(["report", str(run.folder), "--stale"]) == 0
-    assert reason in capsys.readouterr().err
+    for stage in ("g0", "rivr", "consolidate"):
+        shutil.rmtree(run.folder / stage)
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
-        planner = run.planner(Store(tmp_path, memo))
-        text = write_report(planner, stale=True).read_text()
-        assert "g0 is stale" in text and "rivr is stale" in text and 'id="stage"' in text
-        manifests = linked_manifests(run.folder, run.dag.names)
-        assert not is_current(run.folder, manifests), "it stays no longer than it must"
-        text = write_report(planner).read_text()  # as at the end of `cleargs run --until rva`
-        assert "is stale" not in text and "no scene is trained yet" in text
-        assert "none tried" in text and "the restored frame" not in text
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    assert "no scene is trained yet" in text and is_current(
+        run.folder, linked_manifests(run.folder, run.dag.names)
+    )
+    assert "none tried" in text and "the restored frame" not in text
 
 
 def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -11,8 +10,6 @@ import pytest
 from vlm_server import two_stages
 
 from cleargs.cli.main import invoke
-from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.manifest import FileRecord, read_manifest, write_manifest
 
 
 class Shell:
@@ -76,19 +73,3 @@ def test_wrong_usage(shell: Shell, stage: str, options: list[str], words: str) -
     code, out, err = shell.plot(*options, stage=stage)
     assert (code, out) == (2, "")
     assert err.splitlines()[0] == f"error: {words}" and err.splitlines()[1].startswith("hint: cleargs show ")
-
-
-@pytest.mark.parametrize("name", ["frames.parquet", "images/000002.png"])
-def test_scores_of_another_ingest_are_not_drawn_over_this_one(shell: Shell, name: str) -> None:
-    """After ``cleargs stage ingest`` with other settings RUN/rva still holds the scores of the old frames."""
-    link, other = shell.folder / "ingest", shell.root / "other"
-    manifest = read_manifest(link)
-    shutil.copytree(link, other)
-    (other / name).write_bytes((other / name).read_bytes() + b"\0")
-    changed = FileRecord(size=manifest.files[name].size + 1, digest=file_digest(other / name))
-    write_manifest(other, manifest.model_copy(update={"files": {**manifest.files, name: changed}}))
-    link.unlink()
-    link.symlink_to(other)
-    code, _, err = shell.plot("--plot")
-    assert code == 2 and "rva is stale: input ingest/" in err and "bring it up to date (cleargs run" in err
-    assert not (shell.folder / "rva-plot.png").exists()

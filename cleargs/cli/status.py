@@ -1,4 +1,4 @@
-"""``cleargs explain``: the state of each stage of a run, and why."""
+"""``cleargs status``: the state of each stage of a run, and the reasons."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from cleargs.pipeline.session import opened_store
 @click.command(
     epilog="""\b
 States:
-  hit      the results are there and whole
+  done     the results are there and whole
   partial  the results are there, something is missing; the next run tries again
-  miss     must be made: the line says which setting, input file or version changed
-  waits    a stage before it must run first (equal content makes it a hit after all)
+  missing  to be made: the line says which setting, input file or version changed
 """
 )
 @run_argument
 @store_option
 @json_option
 @click.pass_obj
-def explain(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
-    """Say for each stage of RUN whether it is done, and what changed if it is not."""
+def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
+    """Say for each stage of RUN whether it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     with opened_store(settings.store) as opened:
         planner = Planner(dag, settings, opened, threads_or_all(None), make_reporter())
