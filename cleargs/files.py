@@ -7,12 +7,15 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from cleargs.errors import StoreError
+
+External: TypeAlias = Path | Mapping[str, Path]
+"""Files outside the store: one, all of a folder that are not hidden, or single ones by name."""
 
 PARTIAL_SUFFIX = ".partial"
 """Ending of a file that is being written; whoever finds one may delete it."""

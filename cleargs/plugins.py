@@ -11,12 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from typing import Any, Literal
 
 from cleargs.errors import InputError, did_you_mean
 
 Socket = Literal["evaluators", "experts", "scorers", "formats", "layouts", "backends"]
+
+
+def installed_version(distribution: str) -> str:
+    """The installed version of a package; "absent" without one."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "absent"
 
 
 @dataclass(frozen=True)

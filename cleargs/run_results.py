@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
+from cleargs.manifest import Manifest, read_manifest
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.manifest import Manifest, read_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import SCENE, scene_stage
 

@@ -6,9 +6,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from cleargs.errors import InputError
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
+from cleargs.stages import gpu_libraries
 
 VERSION = 24
 CONFIG = ConsolidateConfig
@@ -37,15 +38,20 @@ OUTPUTS = (
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = (
     "torch",
-    "triton",
     "numba",
     "numpy",
-    "onnxruntime",
     "OpenImageIO",
     "opencv-contrib-python-headless",
     "pyarrow",
     "safetensors",
 )
+
+
+def other_libraries(device: Device) -> Mapping[str, str]:
+    """What else computes on ``device``."""
+    from cleargs.models.onnx import runtime_version
+
+    return gpu_libraries(device) | {"onnxruntime": runtime_version(device)}
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:

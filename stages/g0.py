@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.splat.config import G0Config
+from cleargs.stages import gpu_libraries
 
 if TYPE_CHECKING:
     from cleargs.formation.exposure import Exposure
@@ -23,7 +24,12 @@ INPUTS: Mapping[str, tuple[str, ...]] = {
 }
 OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet", "state.safetensors")
 LEFTOVERS: tuple[str, ...] = ()
-LIBRARIES = ("torch", "triton", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
+LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
+
+
+def other_libraries(device: Device) -> Mapping[str, str]:
+    """What else computes on ``device``."""
+    return gpu_libraries(device)
 
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:

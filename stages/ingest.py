@@ -12,7 +12,8 @@ from pydantic import Field, field_validator
 
 from cleargs.capture.config import CaptureConfig, SfmConfig
 from cleargs.capture.sources import externals as capture_externals
-from cleargs.pipeline.stage import Estimate, External, StageContext, StageResult
+from cleargs.files import External
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 
 
 class IngestConfig(SfmConfig, CaptureConfig):

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cleargs.errors import StoreError
-from cleargs.pipeline.stage import Estimate, StageContext, StageResult
+from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import RivrConfig
+from cleargs.stages import gpu_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot
@@ -40,15 +41,20 @@ OUTPUTS = (
 LEFTOVERS = ("round_*/*.exr",)
 LIBRARIES = (
     "torch",
-    "triton",
     "numba",
     "numpy",
-    "onnxruntime",
     "OpenImageIO",
     "opencv-contrib-python-headless",
     "pyarrow",
     "safetensors",
 )
+
+
+def other_libraries(device: Device) -> Mapping[str, str]:
+    """What else computes on ``device``."""
+    from cleargs.models.onnx import runtime_version
+
+    return gpu_libraries(device) | {"onnxruntime": runtime_version(device)}
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:

@@ -32,6 +32,7 @@ from cleargs.capture.sources import externals
 from cleargs.errors import CleargsError
 from cleargs.files import write_json
 from cleargs.formation.exposure import EXPOSURE
+from cleargs.manifest import read_manifest
 from cleargs.media.encode import write_video
 from cleargs.media.exr import LayeredImage, read_exr, write_exr
 from cleargs.media.image import read_rgb
@@ -39,7 +40,6 @@ from cleargs.media.video import read_timeline
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.config import read_toml
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.manifest import read_manifest
 from cleargs.progress import SilentReporter
 from cleargs.render.pose_files import read_poses
 from cleargs.splat.camera import Camera

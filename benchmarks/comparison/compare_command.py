@@ -208,7 +208,7 @@ def compare(
 
 def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> list[str]:
     """What the tables were made with, in lines."""
-    from cleargs.pipeline.manifest import versions
+    from cleargs.manifest import versions
 
     lines = [f"LPIPS v0.1 with {', '.join(recipe.options.lpips) or 'no network'}; device {recipe.device}"]
     if variants:

@@ -16,10 +16,10 @@ from benchmarks.comparison.choices import Choice, Choices, judge_choices
 from benchmarks.comparison.roles import Roles, count_roles
 from benchmarks.comparison.scenes import EVALUATION_VERSION, Made, Recipe, judge
 from benchmarks.comparison.tables import Results
+from cleargs.digest import canonical_json
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import write_bytes
-from cleargs.pipeline.keys import canonical_json
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
 from cleargs.untrusted import read_bytes

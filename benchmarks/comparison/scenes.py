@@ -19,15 +19,15 @@ from pydantic import ValidationError
 from benchmarks.comparison.cells import Cell, ViewSet
 from benchmarks.comparison.equal_work import Work, decide_work, variant_config
 from benchmarks.comparison.variants import Variant
+from cleargs.digest import canonical_json
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import write_bytes
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.parquet import damage_told
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import canonical_json
-from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE, Device, Run, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store

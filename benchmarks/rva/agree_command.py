@@ -19,12 +19,12 @@ from cleargs.cli.common import (
 )
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress_bars import make_reporter
+from cleargs.digest import tree_digest
 from cleargs.errors import InputError
+from cleargs.manifest import linked_manifest
 from cleargs.pipeline.config import Config, check_document, merge, parse_override
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import tree_digest
 from cleargs.pipeline.keys import key_config
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.progress import Reporter

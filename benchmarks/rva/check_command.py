@@ -10,8 +10,8 @@ import click
 
 from cleargs.cli.common import json_option, print_json
 from cleargs.errors import InputError
+from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import read_run_file
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from cleargs.batch.resources import Resources
 from cleargs.errors import StoreError
 from cleargs.files import write_bytes
-from cleargs.pipeline.manifest import Manifest
+from cleargs.manifest import Manifest
 from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 

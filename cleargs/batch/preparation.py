@@ -13,10 +13,10 @@ from cleargs.batch.resources import Resources, resources
 from cleargs.batch.scenes import Scene
 from cleargs.batch.sheet import Problem
 from cleargs.children import module_command
+from cleargs.digest import DigestMemo
 from cleargs.errors import CleargsError, InputError
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Device, Run, write_run_file
 from cleargs.pipeline.runner import check_same_input

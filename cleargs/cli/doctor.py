@@ -15,7 +15,7 @@ import click
 
 import cleargs
 from cleargs.cli.common import json_option, print_json
-from cleargs.pipeline.keys import installed_onnxruntimes
+from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 from cleargs.splat.pace import remembered_pace
 
@@ -72,8 +72,8 @@ def doctor(folder: Path, as_json: bool) -> int:
 
 
 def _library(name: str) -> Finding:
-    if name == "onnxruntime" and (found := installed_onnxruntimes()):  # under any of its names
-        return Finding(name, "ok", ", ".join(found))
+    if name == "onnxruntime" and (found := installed_runtimes()) != "absent":  # under any of its names
+        return Finding(name, "ok", found)
     try:
         return Finding(name, "ok", version(name))
     except PackageNotFoundError:

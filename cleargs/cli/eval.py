@@ -10,11 +10,11 @@ import click
 
 from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress_bars import make_reporter
+from cleargs.digest import file_digest
 from cleargs.errors import InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
+from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.run_file import RUN_FILE
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import click
 from cleargs.cli.common import run_argument
 from cleargs.errors import InputError
 from cleargs.files import disk_error
+from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.session import SCENE, scene_stage
 
 MODEL = "colmap/sparse/0"

@@ -13,9 +13,9 @@ from cleargs.cli.frame_reasons import COLUMNS, frame_rows, short_name
 from cleargs.cli.manifest_words import headlines, in_words, text_of
 from cleargs.cli.summary import describe_table, sampled_rows
 from cleargs.errors import InputError
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import at_work, preview_of
-from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.run_file import Run, read_run_file
 
 if TYPE_CHECKING:

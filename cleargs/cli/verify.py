@@ -9,10 +9,10 @@ from typing import Literal
 import click
 
 from cleargs.cli.common import json_option, print_json, run_argument, store_option
+from cleargs.digest import named_files
 from cleargs.errors import InputError
+from cleargs.manifest import Manifest, damages, read_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import named_files
-from cleargs.pipeline.manifest import Manifest, damages, read_manifest
 from cleargs.pipeline.run_file import Run, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import Store

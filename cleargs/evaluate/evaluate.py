@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.colour_alignment import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
@@ -23,11 +24,10 @@ from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.evaluate.regions import clipped_pixels, depth_of_points, far_pixels, pooled, region
 from cleargs.files import disk_error
+from cleargs.manifest import versions
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
-from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.keys import installed_onnxruntimes
-from cleargs.pipeline.manifest import versions
+from cleargs.models.onnx import installed_runtimes
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.engine import Engine
@@ -223,7 +223,7 @@ def _evaluate(
         versions={
             **versions(),
             **{name: version(name) for name in _LIBRARIES},
-            "onnxruntime": ", ".join(installed_onnxruntimes()) or "absent",
+            "onnxruntime": installed_runtimes(),
         },
         images=tuple(images),
     )

@@ -21,15 +21,15 @@ from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
+from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.media.image import IMAGE_SUFFIXES, read_alpha, read_mask, read_rgb
-from cleargs.pipeline.digest import tree_digest
-from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import view_of

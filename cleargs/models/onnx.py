@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from io import StringIO
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
+from cleargs.plugins import installed_version
 from cleargs.untrusted import cause, read_bytes
 
 Device = Literal["cpu", "cuda"]
@@ -42,6 +44,22 @@ _CUDA_OPTIONS = {
     "cudnn_conv_algo_search": "HEURISTIC",  # a search by time may end with another algorithm each time
     "arena_extend_strategy": "kSameAsRequested",  # the splatting shares the GPU's memory
 }
+
+
+RUNTIMES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")
+"""Distributions that bring the module onnxruntime, each with its own providers."""
+
+
+def installed_runtimes() -> str:
+    """The installed ones with their versions; "absent" without one."""
+    versions = {name: installed_version(name) for name in RUNTIMES}
+    return ", ".join(f"{name} {found}" for name, found in versions.items() if found != "absent") or "absent"
+
+
+@cache
+def runtime_version(device: Device) -> str:
+    """The installed runtimes with the device that runs the networks. On a GPU, only a trial tells it."""
+    return f"{installed_runtimes()}, on {network_device(device, lambda warning: None)}"
 
 
 def network_device(device: Device, warn: Callable[[str], None]) -> Device:

@@ -5,51 +5,15 @@ Not in a key: paths, host, time, number of threads, log level.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from pydantic import BaseModel
 
-from cleargs.plugins import Socket, plugin
-from cleargs.record import Record
-
-SCHEMA = 1
-"""Raised when the way keys are made changes: every old result becomes a miss."""
-
-PRECISION = "float32"
-"""Precision of the parameters that the stages train and publish."""
-
-
-def canonical_json(value: Any) -> str:
-    """JSON with sorted keys and no spaces: equal values give equal text. NaN and infinities are refused."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-
-
-class KeyParts(Record):
-    """What goes into the key of one stage."""
-
-    stage: str
-    version: int
-    config: dict[str, Any]
-    """The stage's own section, without the fields marked by `key_config` as outside the key."""
-    inputs: dict[str, dict[str, str | None]]
-    """Upstream stage -> declared path -> digest of its content; None where an optional path is absent."""
-    externals: dict[str, str]
-    """Role -> digest of the content of a file or folder outside the store."""
-    seed: int
-    device: Literal["cpu", "cuda"]
-    libraries: dict[str, str]
-    precision: str = PRECISION
-    schema_version: int = SCHEMA
-
-    @property
-    def key(self) -> str:
-        """sha256 of the canonical JSON, hexadecimal."""
-        return hashlib.sha256(canonical_json(self.model_dump(mode="json")).encode()).hexdigest()
+from cleargs.manifest import KeyParts
+from cleargs.pipeline.stage import Device, Stage
+from cleargs.plugins import Socket, installed_version, plugin
 
 
 def key_config(config: BaseModel) -> dict[str, Any]:
@@ -69,19 +33,11 @@ def key_config(config: BaseModel) -> dict[str, Any]:
     return kept
 
 
-def library_versions(distributions: tuple[str, ...], device: Literal["cpu", "cuda"]) -> dict[str, str]:
-    """What of each distribution computes on ``device``: its installed version; "absent" without one.
-
-    ``triton`` compiles kernels for a GPU and counts there only. ``onnxruntime`` is what was installed under
-    any of its names, with the provider that runs the networks.
-    """
-    versions = {}
-    for name in distributions:
-        if name == "onnxruntime":
-            versions[name] = _onnxruntime(device)
-        elif name != "triton" or device == "cuda":
-            versions[name] = _version(name)
-    return versions
+def library_versions(stage: Stage, device: Device) -> dict[str, str]:
+    """What computes in ``stage`` on ``device``: name -> installed version."""
+    versions = {name: installed_version(name) for name in stage.LIBRARIES}
+    other = getattr(stage, "other_libraries", None)
+    return versions if other is None else versions | other(device)
 
 
 def plugin_versions(config: BaseModel, prefix: str = "") -> dict[str, str]:
@@ -100,33 +56,6 @@ def plugin_versions(config: BaseModel, prefix: str = "") -> dict[str, str]:
                 distribution, version = found.distribution
                 versions[f"{distribution} for {prefix}{name}={value}"] = version
     return versions
-
-
-ONNXRUNTIMES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")
-"""Distributions that bring the module onnxruntime, each with providers of its own."""
-
-
-def installed_onnxruntimes() -> list[str]:
-    """Those that are installed, with their versions."""
-    return [f"{name} {found}" for name in ONNXRUNTIMES if (found := _version(name)) != "absent"]
-
-
-@cache
-def _onnxruntime(device: Literal["cpu", "cuda"]) -> str:
-    installed = installed_onnxruntimes()
-    if device == "cuda":
-        # Imported, as only a trial says whether the provider loads.
-        from cleargs.models.onnx import network_device
-
-        device = network_device(device, lambda warning: None)
-    return ", ".join([*(installed or ["absent"]), f"on {device}"])
-
-
-def _version(distribution: str) -> str:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return "absent"
 
 
 def differences(

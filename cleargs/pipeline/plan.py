@@ -9,13 +9,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from cleargs.digest import require_utf8, tree_digest
 from cleargs.errors import InputError, StoreError
+from cleargs.files import External
+from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import require_utf8, tree_digest
-from cleargs.pipeline.keys import KeyParts, differences, key_config, library_versions, plugin_versions
-from cleargs.pipeline.manifest import Manifest, last_shown, linked_manifest
+from cleargs.pipeline.keys import differences, key_config, library_versions, plugin_versions
 from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.stage import Estimate, External, StageContext
+from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
 
@@ -103,7 +104,7 @@ class Planner:
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
             device=self.run.device,
-            libraries=library_versions(stage.LIBRARIES, self.run.device) | plugin_versions(config),
+            libraries=library_versions(stage, self.run.device) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited = tuple(

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, Literal, TypeGuard, cast
+from typing import Any, TypeGuard, cast
 
 import tomli_w
 
@@ -18,6 +18,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import key_config, settings
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.settings import Setting, settings_of
+from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
 from cleargs.untrusted import MAX_TEXT_BYTES, read_bytes
 
@@ -33,8 +34,6 @@ HEADER = """\
 
 WIDTH = 110
 """Of the comments, characters."""
-
-Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
+from cleargs.digest import file_digest, tree_digest
 from cleargs.errors import InputError, StageError, StoreError
-from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import file_digest, tree_digest
-from cleargs.pipeline.live import noted
-from cleargs.pipeline.lock import file_lock
-from cleargs.pipeline.manifest import (
+from cleargs.manifest import (
     FileRecord,
     Manifest,
     damages,
@@ -24,6 +21,9 @@ from cleargs.pipeline.manifest import (
     versions,
     write_manifest,
 )
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.live import noted
+from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.plan import (
     Planner,
     Recipe,

@@ -10,10 +10,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
 from cleargs.pipeline.config import Config, Document, check_document, load_config
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.keys import settings as settings_in
 from cleargs.pipeline.run_file import RUN_FILE, Device, Run, kept_settings, noted_place
 from cleargs.pipeline.store import STORE_FOLDER, Store

@@ -9,10 +9,10 @@ from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
+from cleargs.files import External
 from cleargs.progress import Reporter
 
-External: TypeAlias = Path | Mapping[str, Path]
-"""Files outside the store: one, all of a folder that are not hidden, or single ones by name."""
+Device: TypeAlias = Literal["cpu", "cuda"]
 
 C = TypeVar("C", bound=BaseModel, covariant=True)
 
@@ -37,7 +37,7 @@ class StageContext(Generic[C]):
     """What was found out about single items (frames, say), for any later work of this stage in the store:
     files that appear whole, named by the digest of all that decides them. Any may be missing at any time."""
     seed: int
-    device: Literal["cpu", "cuda"]
+    device: Device
     threads: int
     reporter: Reporter
     expected: Mapping[str, Estimate] = field(default_factory=dict)
@@ -86,7 +86,8 @@ class Stage(Protocol):
     """Patterns of the files in ``out`` from which it resumes after a killed try (``*`` within one name).
     Whatever else such a try left there is thrown away."""
     LIBRARIES: tuple[str, ...]
-    """Distributions whose version changes results; their versions enter the key."""
+    """Distributions whose version changes results; their versions enter the key. A stage may also have a
+    function ``other_libraries(device)``: name -> version of what computes on that device only."""
 
     def externals(self, config: Any, source: Path) -> Mapping[str, External]:
         """Role -> files outside the store whose content enters the key (capture, model weights)."""

@@ -25,11 +25,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
 from cleargs.files import disk_error, is_partial, sync, sync_tree, write_bytes
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.lock import file_lock, is_locked, process_name, sign, signature
-from cleargs.pipeline.manifest import (
+from cleargs.manifest import (
     MANIFEST,
     Manifest,
     damage,
@@ -38,6 +37,7 @@ from cleargs.pipeline.manifest import (
     read_manifest,
     write_manifest,
 )
+from cleargs.pipeline.lock import file_lock, is_locked, process_name, sign, signature
 from cleargs.progress import Reporter
 from cleargs.untrusted import FAULTS, read_text
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
+from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.render.output import Shot
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.render.pose_files import World, read_poses

@@ -15,8 +15,8 @@ from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.status import SceneState
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
+from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
-from cleargs.pipeline.manifest import Manifest
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
 from cleargs.report.frame_strip import last_scene
 from cleargs.report.html import new_report, write_page

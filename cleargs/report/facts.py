@@ -11,9 +11,9 @@ from typing import Any
 import tomli_w
 from pydantic import BaseModel
 
+from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.report.words import duration, size

@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 import cleargs
 from cleargs.files import PARTIAL_SUFFIX, disk_error
-from cleargs.pipeline.manifest import plain_json
+from cleargs.manifest import plain_json
 from cleargs.report.charts import weight_colour
 from cleargs.report.report_json import FOLDER, PAGE
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import cleargs
 from cleargs.files import write_json
-from cleargs.pipeline.manifest import Manifest, linked_manifest
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.untrusted import read_json
 
 FOLDER, PAGE, RECORD = "report", "index.html", "report.json"

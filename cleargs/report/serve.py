@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 from urllib.parse import unquote, urlsplit
 
 from cleargs.errors import InputError
-from cleargs.pipeline.manifest import plain_json
+from cleargs.manifest import plain_json
 from cleargs.report.report_json import FOLDER, PAGE
 from cleargs.report.watched_run import Watched
 from cleargs.untrusted import open_regular

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
-from cleargs.pipeline.manifest import Manifest
 from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow
 from cleargs.report.words import count, decibel
 

@@ -18,8 +18,8 @@ from toy_batch import ToyBatch, finish
 
 from cleargs.batch.folder import BatchFolder
 from cleargs.batch.snakemake import ENGINE_VARIABLE, find_snakemake, profile_folder
+from cleargs.manifest import read_manifest
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.manifest import read_manifest
 
 pytestmark = [
     pytest.mark.slow,

@@ -24,10 +24,10 @@ from toy import toy_dag
 from cleargs.batch.folder import BatchFolder
 from cleargs.batch.preparation import Preparation
 from cleargs.batch.status import SceneState, scene_states
+from cleargs.digest import DigestMemo
+from cleargs.manifest import read_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.lock import file_lock
-from cleargs.pipeline.manifest import read_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store

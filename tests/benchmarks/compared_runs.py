@@ -8,8 +8,8 @@ from report_run import FinishedRun
 
 from benchmarks.comparison.findings import Compared, compare_scenes
 from benchmarks.comparison.scenes import Recipe, existing
+from cleargs.digest import DigestMemo
 from cleargs.evaluate.config import EvalOptions
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 

@@ -17,8 +17,8 @@ from cleargs.capture.layouts.llff import read_llff, read_poses_bounds
 from cleargs.capture.model import write_model
 from cleargs.capture.sources import Capture, externals, open_capture
 from cleargs.capture.tables import load_frames
+from cleargs.digest import named_files
 from cleargs.errors import InputError
-from cleargs.pipeline.digest import named_files
 from cleargs.stages.ingest import IngestConfig
 
 from .conftest import FOCAL, HEIGHT, WIDTH, Ingest, camera_to_world

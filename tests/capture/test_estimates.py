@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
 from cleargs.media.image import image_size
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate

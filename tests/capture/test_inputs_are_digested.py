@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from cleargs.capture.sources import externals, open_capture
+from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.stages.ingest import IngestConfig
 
 from .conftest import Ingest

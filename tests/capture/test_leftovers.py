@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from cleargs.capture.sfm import GIVEN_POSES, PLACED
+from cleargs.digest import file_digest
 from cleargs.files import remove
-from cleargs.pipeline.digest import file_digest
-from cleargs.pipeline.manifest import published_files
+from cleargs.manifest import published_files
 
 from .conftest import Ingest
 

@@ -20,9 +20,8 @@ from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.outcome import print_outcomes
 from cleargs.cli.progress_bars import LineTask
 from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
-from cleargs.pipeline.keys import KeyParts
-from cleargs.pipeline.manifest import FileRecord, Manifest
 from cleargs.pipeline.runner import Outcome
 
 

@@ -10,7 +10,7 @@ import pytest
 from toy import Bench, make_bench
 
 from cleargs.cli.main import invoke
-from cleargs.pipeline.digest import DigestMemo, file_digest
+from cleargs.digest import DigestMemo, file_digest
 
 
 @pytest.fixture

@@ -17,15 +17,15 @@ from scipy.spatial.transform import Rotation
 from cleargs.capture.cameras import Pose
 from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import FRAMES, load_frames
+from cleargs.digest import DigestMemo, file_digest
 from cleargs.evaluate.config import EvalOptions
 from cleargs.formation.exposure import Exposure, write_exposure
+from cleargs.manifest import FileRecord, KeyParts, Manifest, linked_manifest, published_files, write_manifest
 from cleargs.media.image import to_uint8, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.digest import DigestMemo, file_digest
-from cleargs.pipeline.keys import KeyParts, key_config
-from cleargs.pipeline.manifest import FileRecord, Manifest, linked_manifest, published_files, write_manifest
+from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
 from cleargs.pipeline.store import Store

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from toy import Bench
 
-from cleargs.pipeline.manifest import read_manifest
+from cleargs.manifest import read_manifest
 
 PROGRAM = Path(__file__).with_name("toy.py")
 

@@ -6,8 +6,9 @@ from importlib.metadata import PackageNotFoundError
 
 import pytest
 
+from cleargs import plugins
 from cleargs.models import onnx
-from cleargs.pipeline import keys
+from cleargs.models.onnx import runtime_version
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import library_versions
 
@@ -22,30 +23,29 @@ def known(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
             raise PackageNotFoundError(name)
         return versions[name]
 
-    monkeypatch.setattr(keys, "version", version)
-    keys._onnxruntime.cache_clear()
+    monkeypatch.setattr(plugins, "version", version)
+    runtime_version.cache_clear()
     return versions
 
 
 def test_onnxruntime_is_named_as_it_was_installed_and_runs(
     known: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert library_versions(("onnxruntime",), "cpu") == {"onnxruntime": "onnxruntime-gpu 1.31.0, on cpu"}
+    assert runtime_version("cpu") == "onnxruntime-gpu 1.31.0, on cpu"
     monkeypatch.setattr(onnx, "network_device", lambda device, warn: "cuda")
-    assert library_versions(("onnxruntime",), "cuda") == {"onnxruntime": "onnxruntime-gpu 1.31.0, on cuda"}
-    keys._onnxruntime.cache_clear()
+    assert runtime_version("cuda") == "onnxruntime-gpu 1.31.0, on cuda"
+    runtime_version.cache_clear()
     monkeypatch.setattr(onnx, "network_device", lambda device, warn: "cpu")  # the provider does not load
-    assert library_versions(("onnxruntime",), "cuda") == {"onnxruntime": "onnxruntime-gpu 1.31.0, on cpu"}
-    keys._onnxruntime.cache_clear()
+    assert runtime_version("cuda") == "onnxruntime-gpu 1.31.0, on cpu"
+    runtime_version.cache_clear()
     known.clear()
-    assert library_versions(("onnxruntime",), "cpu") == {"onnxruntime": "absent, on cpu"}
+    assert runtime_version("cpu") == "absent, on cpu"
 
 
-def test_triton_counts_on_a_gpu_only(known: dict[str, str]) -> None:
-    assert library_versions(("triton", "torch"), "cpu") == {"torch": "absent"}
-    assert library_versions(("triton", "torch"), "cuda") == {"triton": "3.4.0", "torch": "absent"}
-
-
-def test_every_stage_that_trains_names_triton() -> None:
-    for name in ("g0", "rivr", "consolidate"):
-        assert "triton" in installed().load(name).LIBRARIES
+@pytest.mark.parametrize("name", ["g0", "rivr", "consolidate"])
+def test_triton_counts_on_a_gpu_only(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(onnx, "network_device", lambda device, warn: "cpu")
+    stage = installed().load(name)
+    on_cpu, on_gpu = library_versions(stage, "cpu"), library_versions(stage, "cuda")
+    assert set(on_gpu) - set(on_cpu) == {"triton"} and on_gpu["triton"] == "3.4.0"
+    assert on_cpu["torch"] == "absent" and ("onnxruntime" in on_cpu) == (name != "g0")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from toy import Bench
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
-from cleargs.pipeline.digest import DigestMemo
+from cleargs.manifest import read_manifest
 from cleargs.pipeline.lock import file_lock, is_locked, sign, signature
-from cleargs.pipeline.manifest import read_manifest
 from cleargs.pipeline.store import Store
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from toy import Bench
 
-from cleargs.pipeline.manifest import read_manifest
+from cleargs.manifest import read_manifest
 
 
 def test_partial_stops_is_retried_and_redoes_only_what_is_missing(bench: Bench) -> None:

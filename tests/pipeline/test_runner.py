@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from toy import Bench
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import InputError, StageError, StoreError
+from cleargs.manifest import read_manifest, write_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.manifest import read_manifest, write_manifest
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import check_same_input

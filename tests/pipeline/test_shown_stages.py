@@ -9,9 +9,9 @@ import pytest
 from test_interruption import start, wait_for
 from toy import Bench
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import StageError
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.manifest import read_manifest
+from cleargs.manifest import read_manifest
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store

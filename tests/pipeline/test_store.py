@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from toy import Bench
 
+from cleargs.digest import RACY_NS, DigestMemo, file_digest
 from cleargs.errors import StageError, StoreError
-from cleargs.pipeline.digest import RACY_NS, DigestMemo, file_digest
+from cleargs.manifest import MANIFEST, damage, read_manifest
 from cleargs.pipeline.lock import file_lock
-from cleargs.pipeline.manifest import MANIFEST, damage, read_manifest
 from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.pipeline.store import Store
 

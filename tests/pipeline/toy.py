@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cleargs.digest import DigestMemo
 from cleargs.errors import StageError
 from cleargs.files import write_bytes
 from cleargs.pipeline.config import check_document, merge, parse_override
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.digest import DigestMemo
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.runner import Outcome, Runner

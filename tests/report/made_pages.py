@@ -10,7 +10,7 @@ from report_run import FinishedRun
 from cleargs.batch.folder import BatchFolder, Plan
 from cleargs.batch.resources import Wanted, resources
 from cleargs.batch.status import SceneState
-from cleargs.pipeline.digest import DigestMemo
+from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.report.batch_page import write_batch
 from cleargs.report.page import write_report

@@ -11,21 +11,22 @@ import pyarrow as pa
 import torch
 
 from cleargs.capture.tables import FRAMES
+from cleargs.digest import file_digest, tree_digest
 from cleargs.formation.exposure import Exposure, write_exposure
-from cleargs.media.exr import LayeredImage, to_layer, write_exr
-from cleargs.media.image import write_rgb
-from cleargs.parquet import write_table
-from cleargs.pipeline.config import load_config
-from cleargs.pipeline.dag import installed
-from cleargs.pipeline.digest import file_digest, tree_digest
-from cleargs.pipeline.keys import KeyParts, key_config
-from cleargs.pipeline.manifest import (
+from cleargs.manifest import (
     FileRecord,
+    KeyParts,
     Manifest,
     linked_manifest,
     published_files,
     write_manifest,
 )
+from cleargs.media.exr import LayeredImage, to_layer, write_exr
+from cleargs.media.image import write_rgb
+from cleargs.parquet import write_table
+from cleargs.pipeline.config import load_config
+from cleargs.pipeline.dag import installed
+from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store

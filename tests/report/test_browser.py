@@ -12,7 +12,7 @@ from browser import CHROMIUM, NO_CHROMIUM, Opened
 from report_run import HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames
-from cleargs.pipeline.digest import DigestMemo
+from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 from cleargs.report.web_scene import Renderer, camera_of, level_camera

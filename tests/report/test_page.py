@@ -17,11 +17,11 @@ from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
 from cleargs.cli.report import older_report, report_on
+from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
+from cleargs.manifest import linked_manifest, write_manifest
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.manifest import linked_manifest, write_manifest
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report import facts, verdict

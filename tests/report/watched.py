@@ -10,7 +10,7 @@ from pathlib import Path
 
 from report_run import FinishedRun
 
-from cleargs.pipeline.digest import DigestMemo
+from cleargs.digest import DigestMemo
 from cleargs.pipeline.live import noted
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.store import Store

@@ -10,8 +10,9 @@ import torch
 
 from cleargs.cli.main import main
 from cleargs.errors import InputError
+from cleargs.manifest import KeyParts
 from cleargs.pipeline import session
-from cleargs.pipeline.keys import KeyParts, key_config, library_versions
+from cleargs.pipeline.keys import key_config, library_versions
 from cleargs.splat.engine import Engine
 from cleargs.splat.kernels.cuda import support
 
@@ -60,7 +61,7 @@ def test_the_device_is_part_of_the_key(stage: str) -> None:
         externals={},
         seed=0,
         device="cpu",
-        libraries=library_versions(module.LIBRARIES, "cpu"),
+        libraries=library_versions(module, "cpu"),
     )
     assert parts.key != parts.model_copy(update={"device": "cuda"}).key
 

@@ -10,13 +10,42 @@ from pathlib import Path
 from typing import Any, Literal
 
 import cleargs
+from cleargs.digest import DigestMemo, canonical_json
 from cleargs.files import is_partial, write_json
-from cleargs.pipeline.digest import DigestMemo
-from cleargs.pipeline.keys import KeyParts, canonical_json
 from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 
 MANIFEST = "manifest.json"
+
+
+SCHEMA = 1
+"""Raised when the way keys are made changes: every old result becomes a miss."""
+
+PRECISION = "float32"
+"""Precision of the parameters that the stages train and publish."""
+
+
+class KeyParts(Record):
+    """What goes into the key of one stage."""
+
+    stage: str
+    version: int
+    config: dict[str, Any]
+    """The stage's own section, without the fields marked by `key_config` as outside the key."""
+    inputs: dict[str, dict[str, str | None]]
+    """Upstream stage -> declared path -> digest of its content; None where an optional path is absent."""
+    externals: dict[str, str]
+    """Role -> digest of the content of a file or folder outside the store."""
+    seed: int
+    device: Literal["cpu", "cuda"]
+    libraries: dict[str, str]
+    precision: str = PRECISION
+    schema_version: int = SCHEMA
+
+    @property
+    def key(self) -> str:
+        """sha256 of the canonical JSON, hexadecimal."""
+        return hashlib.sha256(canonical_json(self.model_dump(mode="json")).encode()).hexdigest()
 
 
 class FileRecord(Record):
