@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.images import read_rgb_float
 from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
-from cleargs.media.image import read_rgb_float
 from cleargs.parquet import read_table
 from cleargs.record import Record
 from cleargs.rivr.tables import read_selection

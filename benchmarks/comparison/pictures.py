@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
 from benchmarks.comparison.tables import TITLES, metric_title
+from benchmarks.images import read_rgb_float
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.references import images_by_stem
 from cleargs.files import atomic_path
-from cleargs.media.image import read_rgb_float, write_rgb
+from cleargs.media.image import write_rgb
 from cleargs.report.contact import Tile, contact_sheet
 
 if TYPE_CHECKING:

@@ -194,7 +194,8 @@ def _cues_of(
 
 def _write_sheet(path: Path, agreement: Agreement, frames: Sequence[Frame], ingest: Path) -> Path:
     """The frames of the widest gaps, each with what both say of it."""
-    from cleargs.media.image import read_rgb_float, write_rgb
+    from benchmarks.images import read_rgb_float
+    from cleargs.media.image import write_rgb
     from cleargs.report.contact import Tile, contact_sheet
 
     tiles = [

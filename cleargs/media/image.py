@@ -57,11 +57,6 @@ def image_size(path: Path) -> tuple[int, int]:
     return spec.width, spec.height
 
 
-def read_rgb_float(path: Path) -> NDArray[np.float32]:  # [H, W, 3]
-    """The image in ``path`` as float32 sRGB in [0, 1]. Raises InputError like `read_rgb`."""
-    return read_rgb(path).astype(np.float32) / np.float32(255)
-
-
 def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
 
