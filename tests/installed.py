@@ -21,6 +21,6 @@ for package, name in FOLDERS.items():
         if path.is_dir() or path.suffix == ".pyc" or inside.as_posix() in NOT_INSTALLED:
             continue
         assert (folder / inside).is_file(), f"{package} lacks {inside}"
-assert find_spec("tools") is None
+assert find_spec("tools") is None and find_spec("benchmarks") is None
 assert version("cleargs") == cleargs.__version__, version("cleargs")
 print(f"cleargs {cleargs.__version__} is whole in {files('cleargs')}")
