@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +24,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import noted
-from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.lock import only_one
 from cleargs.pipeline.plan import (
     Planner,
     Recipe,
@@ -33,7 +34,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_place
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_place, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
@@ -82,9 +83,11 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
-        with at_work(self.run, self.dag, self._prepare), self.store.in_use():
+        with self._alone(), self.store.in_use():
+            check_same_input(self.run, self.dag, self.store)
+            self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
+            write_run_file(self.run)
             self.store.add_root(self.run.folder)
-            self._unlink_outdated()
             as_planned = True
             for plan in plans:
                 name = plan.stage
@@ -103,10 +106,9 @@ class Runner:
                     break
         return outcomes
 
-    def _prepare(self) -> None:
-        """Look at the run folder before its ``run.toml`` changes. Raises InputError for another capture."""
-        check_same_input(self.run, self.dag, self.store)
-        self._unlink_outdated()
+    def _alone(self) -> AbstractContextManager[bool]:
+        """Keep the run folder for this process; wait while another one works there."""
+        return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
         """Let the run folder show no results of other settings or inputs."""
@@ -130,7 +132,7 @@ class Runner:
         """
         check_address_space()
         done: dict[str, Manifest] = {}
-        with file_lock(self.run.folder / LOCK, shared=True), self.store.in_use():
+        with self._alone(), self.store.in_use():
             self.store.add_root(self.run.folder)
             self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
@@ -229,8 +231,6 @@ class Runner:
         work = self.store.open_work(
             recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
         )
-        for place in work.thrown_away:
-            self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
