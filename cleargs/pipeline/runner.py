@@ -88,14 +88,8 @@ class Runner:
             self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
             write_run_file(self.run)
             self.store.add_root(self.run.folder)
-            as_planned = True
-            for plan in plans:
-                name = plan.stage
-                as_planned = as_planned and self._still_there(plan)
-                if as_planned and plan.recipe is not None and plan.manifest is not None:
-                    outcome = self._show("found", plan.recipe, plan.manifest)
-                else:
-                    outcome = self._bring(name, done, forced=name in forced)
+            for name in (plan.stage for plan in plans):
+                outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
                 if outcome.how == "made":
@@ -162,11 +156,6 @@ class Runner:
             )
         return entry.manifest
 
-    def _still_there(self, plan: StagePlan) -> bool:
-        """Whether what the plan found is in the store: until we held that, `collect` was free to act."""
-        entry = None if plan.manifest is None else self.store.find(plan.stage, plan.manifest.key)
-        return entry is not None and entry.whole is not None
-
     def _find(self, name: str, recipe: Recipe) -> Entry | None:
         """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
         entry = self.store.find(name, recipe.key)
@@ -186,14 +175,16 @@ class Runner:
         if manifest is None:
             recipe = self._read_again(name, done)
             entry = self.store.find(name, recipe.key)
-            reasons = ("forced",) if forced else self._why(recipe, entry)
+            reasons = ("forced",) if forced else self.planner.reasons(recipe, entry)
             with self.store.lock(recipe.key, self.reporter, name) as alone:
                 entry = self._find(name, recipe)
                 manifest = entry.whole if entry is not None and not forced else None
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
                     manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
-        return self._show(how, recipe, manifest)
+        manifest = self._with_inherited(manifest, recipe.inherited)
+        self.store.link(self.run.folder, name, recipe.key)
+        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
 
     def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
@@ -211,18 +202,6 @@ class Runner:
                     hint="the same command makes them again",
                 )
         return self.planner.recipe(name, done, afresh=True)
-
-    def _show(self, how: Literal["found", "made"], recipe: Recipe, manifest: Manifest) -> Outcome:
-        """Let the run folder show the finished results of ``recipe``."""
-        name = recipe.parts.stage
-        manifest = self._with_inherited(manifest, recipe.inherited)
-        self.store.link(self.run.folder, name, recipe.key)
-        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
-
-    def _why(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
-        if entry is not None and entry.usable is not None:
-            return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
-        return self.planner.reasons(recipe, entry)
 
     def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""

@@ -32,7 +32,6 @@ from cleargs.manifest import (
     Manifest,
     damage,
     hidden_link,
-    published_files,
     read_manifest,
     write_manifest,
 )
@@ -394,17 +393,17 @@ def _keep_only(out: Path, patterns: Sequence[str]) -> None:
 def _link_files(source: Path, target: Path) -> None:
     """Bring the files of ``source`` into ``target`` without copying their content where hard links work.
 
-    Stages replace files by rename and never write into one, so that the source stays as it was. The copy
-    is made beside its place, so that a killed one is not taken for whole.
+    Stages replace files by rename and never write into one, so that the source stays as it was. The copy is
+    made next to its place, so that a killed one is not mistaken for a whole one.
     """
     beside = target.with_name(f"{target.name}.carried")
     shutil.rmtree(beside, ignore_errors=True)
-    for name, file in published_files(source).items():
-        place = beside / name
-        place.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(file, place)
-        except OSError:
-            shutil.copy2(file, place)
-    beside.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(source, beside, copy_function=_link_or_copy)
     beside.rename(target)
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
