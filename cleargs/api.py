@@ -22,7 +22,7 @@ from cleargs.pipeline.session import (
     opened_store,
     usable_cores,
 )
-from cleargs.progress import Reporter, SilentReporter, SilentTask, Task
+from cleargs.progress import LogReporter, Reporter, SilentReporter, SilentTask, Task
 from cleargs.run_results import Prepared, Run, open_prepared
 from cleargs.splat.effort import Quality, decided, quality_settings
 
@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     Image = NDArray[np.uint8] | NDArray[np.float32]
 
 Progress = Reporter | Callable[[str], object] | None
-"""Who is told how work progresses: nobody, a function that takes lines, or a `cleargs.progress.Reporter`."""
+"""Where progress and remarks go: to the logger ``cleargs`` (None), to a function that takes lines, or to a
+`cleargs.progress.Reporter`."""
 
 
 def run(
@@ -310,7 +311,7 @@ class _Lines(SilentReporter):
 
 def _reporter(progress: Progress) -> Reporter:
     if progress is None:
-        return SilentReporter()
+        return LogReporter()
     return _Lines(progress) if callable(progress) else progress
 
 

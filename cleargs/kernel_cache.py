@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import tempfile
 from pathlib import Path
 
@@ -12,8 +11,7 @@ def cache_folder(name: str) -> Path:
     """A writable folder ``name`` for compiled kernels, made if needed.
 
     Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
-    or ``~/.cache``), else, when none can be written to, a fresh temporary folder. One that others own or may
-    write to is passed over: what lies there is run.
+    or ``~/.cache``), else, when none can be written to, a fresh temporary folder.
     """
     candidates = []
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
@@ -26,31 +24,11 @@ def cache_folder(name: str) -> Path:
             folder = candidate.expanduser() / name
             folder.parent.mkdir(parents=True, exist_ok=True)
             folder.mkdir(mode=0o700, exist_ok=True)
-            if not _private(folder):
-                continue
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except (OSError, RuntimeError):  # RuntimeError: expanduser without a home
             continue
     return Path(tempfile.mkdtemp(prefix=f"cleargs-{name}-"))
-
-
-def _private(folder: Path) -> bool:
-    """Whether nobody but the user (and root) can put something into ``folder``, or another in its place."""
-    status = folder.lstat()
-    return (
-        stat.S_ISDIR(status.st_mode)
-        and status.st_uid == os.geteuid()
-        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-        and all(_keeps_names(parent.stat()) for parent in folder.resolve().parents)
-    )
-
-
-def _keeps_names(status: os.stat_result) -> bool:
-    """Whether nobody else can rename what lies in a folder: as in /tmp, where only owners may."""
-    return status.st_uid in (0, os.geteuid()) and (
-        not status.st_mode & stat.S_IWOTH or bool(status.st_mode & stat.S_ISVTX)
-    )
 
 
 def configure_numba(name: str) -> None:

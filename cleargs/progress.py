@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -87,7 +88,7 @@ class SilentTask:
 
 
 class SilentReporter:
-    """A reporter nobody listens to (libraries and tests)."""
+    """A reporter nobody listens to."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
@@ -96,3 +97,22 @@ class SilentReporter:
     def info(self, text: str) -> None: ...
 
     def warn(self, text: str) -> None: ...
+
+
+class LogReporter(SilentReporter):
+    """The reporter of the library: remarks go to the logger ``cleargs``, where a program routes them."""
+
+    def __init__(self, name: str = "cleargs") -> None:
+        self._logger = logging.getLogger(name)
+
+    @contextmanager
+    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        begin = time.monotonic()
+        yield SilentTask()
+        self._logger.debug("%s: done in %.1f s", label, time.monotonic() - begin)
+
+    def info(self, text: str) -> None:
+        self._logger.info("%s", text)
+
+    def warn(self, text: str) -> None:
+        self._logger.warning("%s", text)

@@ -11,7 +11,6 @@ import json
 import os
 import stat
 import struct
-from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,6 @@ MAX_BYTES = 4 * 2**30
 
 MAX_TEXT_BYTES = 256 * 2**20
 """Most bytes of a document (JSON, TOML, CSV); transforms.json of 100,000 frames has 80 MB."""
-
-MAX_NESTING = 32
-"""Most tables and lists inside each other in a document; ours have six."""
 
 FAULTS: tuple[type[Exception], ...] = (
     OSError,
@@ -36,6 +32,9 @@ FAULTS: tuple[type[Exception], ...] = (
     struct.error,
 )
 """What decoding a file of the wrong form may raise. Readers catch these where they say what they read."""
+
+
+TOO_DEEP = "it is nested too deeply"
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -72,25 +71,11 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The JSON document at ``path``.
-
-    Raises OSError like `read_bytes`, ValueError where it is no JSON or nested deeper than `MAX_NESTING`.
-    """
-    data = read_bytes(path, MAX_TEXT_BYTES)
+    """The JSON document at ``path``. Raises OSError like `read_bytes`, ValueError where it is no JSON."""
     try:
-        return shallow(json.loads(data))
+        return json.loads(read_bytes(path, MAX_TEXT_BYTES))
     except RecursionError:
-        raise _too_deep() from None
-
-
-def shallow(document: Any) -> Any:
-    """``document``, when it is nested no deeper than `MAX_NESTING`. Raises ValueError otherwise."""
-    level = [document]
-    for _ in range(MAX_NESTING):
-        level = [item for container in level for item in _items(container)]
-        if not level:
-            return document
-    raise _too_deep()
+        raise ValueError(TOO_DEEP) from None
 
 
 def cause(error: Exception) -> str:
@@ -106,18 +91,7 @@ def cause(error: Exception) -> str:
     if isinstance(error, ZeroDivisionError):
         return "a number is zero that must not be"
     if isinstance(error, RecursionError):
-        return str(_too_deep())
+        return TOO_DEEP
     if isinstance(error, KeyError):
         return f"{error.args[0]!r} is missing" if error.args else "something is missing"
     return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _items(container: Any) -> Iterator[Any]:
-    if isinstance(container, dict):
-        yield from container.values()
-    elif isinstance(container, list):
-        yield from container
-
-
-def _too_deep() -> ValueError:
-    return ValueError(f"it is nested deeper than {MAX_NESTING} levels")

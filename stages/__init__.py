@@ -5,15 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cleargs.pipeline.stage import Device
-from cleargs.plugins import installed_version
-
 STAGES = ("ingest", "rva", "g0", "rivr", "consolidate")
-
-
-def gpu_libraries(device: Device) -> dict[str, str]:
-    """Version of the library that compiles kernels where ``device`` is a GPU."""
-    return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 def pace(say: Callable[[str], None] | None = None) -> float:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from cleargs.errors import InputError
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.plugins import installed_version
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
-from cleargs.stages import gpu_libraries
 
 VERSION = 24
 CONFIG = ConsolidateConfig
@@ -51,7 +51,8 @@ def other_libraries(device: Device) -> Mapping[str, str]:
     """What else computes on ``device``."""
     from cleargs.models.onnx import runtime_version
 
-    return gpu_libraries(device) | {"onnxruntime": runtime_version(device)}
+    kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
+    return {"onnxruntime": runtime_version(device), **kernels}
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:

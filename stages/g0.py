@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.plugins import installed_version
 from cleargs.splat.config import G0Config
-from cleargs.stages import gpu_libraries
 
 if TYPE_CHECKING:
     from cleargs.formation.exposure import Exposure
@@ -29,7 +29,7 @@ LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless
 
 def other_libraries(device: Device) -> Mapping[str, str]:
     """What else computes on ``device``."""
-    return gpu_libraries(device)
+    return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
+from cleargs.plugins import installed_version
 from cleargs.random_streams import Stream
 from cleargs.rivr.config import RivrConfig
-from cleargs.stages import gpu_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot
@@ -54,7 +54,8 @@ def other_libraries(device: Device) -> Mapping[str, str]:
     """What else computes on ``device``."""
     from cleargs.models.onnx import runtime_version
 
-    return gpu_libraries(device) | {"onnxruntime": runtime_version(device)}
+    kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
+    return {"onnxruntime": runtime_version(device), **kernels}
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 
-from cleargs import progress
-from cleargs.progress import Pace, Rate
+from cleargs import api, progress
+from cleargs.errors import InputError
+from cleargs.progress import LogReporter, Pace, Rate
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,3 +48,44 @@ def test_no_less_than_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     pace.seconds_left(1, 0.1)
     now = 3600.0
     assert pace.seconds_left(10, 1.0 + 1e-15) == 0.0
+
+
+def test_remarks_of_the_library_are_logged(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reporter = LogReporter()
+    caplog.set_level(logging.DEBUG, "cleargs")
+    reporter.info("rva: starts")
+    reporter.warn("100 % of %s")
+    with reporter.task("rva", 3) as task:
+        task.advance(3)
+    found = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]
+    assert found[:2] == [("cleargs", "INFO", "rva: starts"), ("cleargs", "WARNING", "100 % of %s")]
+    assert found[2][1:] == ("DEBUG", "rva: done in 0.0 s")
+    caplog.clear()
+    logging.getLogger("cleargs").disabled = True
+    try:
+        reporter.warn("nobody hears this")
+    finally:
+        logging.getLogger("cleargs").disabled = False
+    assert not caplog.records and capsys.readouterr() == ("", "")
+
+
+def test_a_run_of_the_library_logs(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "photos").mkdir()
+    caplog.set_level(logging.INFO, "cleargs")
+
+    def asked(*arguments: object, say: Callable[[str], None], **options: object) -> None:
+        say("as in run.toml")
+        raise InputError("stop", hint="here")
+
+    monkeypatch.setattr(api, "asked_run", asked)
+    with pytest.raises(InputError):
+        api.run(tmp_path / "photos", tmp_path / "run")
+    assert caplog.messages == ["as in run.toml"]
+    lines: list[str] = []
+    with pytest.raises(InputError):
+        api.run(tmp_path / "photos", tmp_path / "run", progress=lines.append)
+    assert lines == ["as in run.toml"] and caplog.messages == lines, "a function takes them in its place"

@@ -31,7 +31,7 @@ from cleargs.progress import Reporter
 from cleargs.record import Record
 from cleargs.splat.effort import training_cost
 from cleargs.synth.synthetic_capture import make_capture
-from cleargs.untrusted import FAULTS, cause, read_text, shallow
+from cleargs.untrusted import FAULTS, cause, read_text
 
 WORLD_SETTINGS = (
     "rva.enabled=false",
@@ -147,7 +147,7 @@ def read_evidence(path: Path | None = None) -> Evidence:
     hint = "compare it with benchmarks/comparison/evidence.toml"
     try:
         text = read_text(path or Path(__file__).with_name("evidence.toml"))
-        return Evidence.model_validate(shallow(tomllib.loads(text)))
+        return Evidence.model_validate(tomllib.loads(text))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))

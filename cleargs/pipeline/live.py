@@ -1,7 +1,6 @@
-"""What a run is at work on, for whoever watches it: a note in the run folder, renewed while a stage works.
+"""The progress of a run at work, for `cleargs watch` and `show`: a note in the run folder.
 
-The note is a courtesy. Nothing rests on it: no key, no output, no decision, and a note that cannot be written
-stops no work.
+Nothing rests on the note: no key, no output, no decision. A note that cannot be written stops no work.
 """
 
 from __future__ import annotations
@@ -9,14 +8,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
+
+from pydantic import Field
 
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.pipeline.store import writer_lives
 from cleargs.progress import PREVIEW, Pace, Reporter, Task
+from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 
 NOTE = ".at_work.json"
@@ -24,37 +25,30 @@ NOTE = ".at_work.json"
 EVERY = 2.0
 """Seconds between two notes."""
 
-_NUMBERS = (int, type(None))
 
-
-@dataclass(frozen=True)
-class AtWork:
-    """How far a stage is."""
+class AtWork(Record):
+    """The progress of a stage."""
 
     stage: str
-    work: str
+    work: str = Field(pattern=r"^[^/\x00]+$")
     """Name of its work folder in the store."""
     label: str
-    """What it does at present."""
-    done: int
-    total: int | None
-    note: str
+    """The present task."""
+    done: int = 0
+    total: int | None = None
+    note: str = ""
     """A few figures: PSNR, Gaussians."""
-    seconds_left: float | None
-    """Of what it does at present."""
+    seconds_left: float | None = None
+    """Of the present task."""
 
 
 def at_work(run: Path, store: Path) -> AtWork | None:
-    """What the run in the folder ``run`` does now; None when it is not at work, or died."""
+    """The progress of the run in the folder ``run``; None when it is not at work, or died."""
     try:
-        found = AtWork(**read_json(run / NOTE))
-    except FAULTS:
+        found = AtWork.model_validate(read_json(run / NOTE))
+    except FAULTS:  # ValidationError is a ValueError
         return None
-    texts = (found.stage, found.work, found.label, found.note)
-    sound = all(isinstance(text, str) for text in texts) and Path(found.work).name == found.work
-    sound = sound and isinstance(found.done, int) and isinstance(found.total, _NUMBERS)
-    sound = sound and isinstance(found.seconds_left, (*_NUMBERS, float))
-    return found if sound and writer_lives(store / "work" / found.work) else None
+    return found if writer_lives(store / "work" / found.work) else None
 
 
 class Preview(NamedTuple):
@@ -77,63 +71,60 @@ def preview_of(found: AtWork, store: Path) -> Preview | None:
 
 @contextmanager
 def noted(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[Reporter]:
-    """A reporter that passes everything on to ``reporter`` and notes in ``run`` how far ``stage`` is.
+    """A reporter that passes everything on to ``reporter`` and notes in ``run`` the progress of ``stage``.
 
     The note goes when the block ends.
     """
     try:
-        yield _NotingReporter(reporter, run / NOTE, stage, work.name)
+        yield _NotingReporter(reporter, run / NOTE, AtWork(stage=stage, work=work.name, label=stage))
     finally:
         with suppress(OSError):
             (run / NOTE).unlink(missing_ok=True)
 
 
 class _NotingReporter:
-    """Passes on, and notes the task that was told of last."""
+    """Passes on, and notes the task that advanced last."""
 
-    def __init__(self, reporter: Reporter, path: Path, stage: str, work: str) -> None:
-        self._reporter, self._path, self._stage, self._work = reporter, path, stage, work
-        self._write(AtWork(stage, work, stage, 0, None, "", None))
+    def __init__(self, reporter: Reporter, path: Path, first: AtWork) -> None:
+        self._reporter, self._path = reporter, path
+        self.info, self.warn = reporter.info, reporter.warn
+        self.write(first)
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         with self._reporter.task(label, total) as task:
-            yield _NotingTask(task, label, total, self)
+            state = self._state.model_copy(update={"label": label, "total": total, "done": 0, "note": ""})
+            yield _NotingTask(task, state, self)
 
-    def info(self, text: str) -> None:
-        self._reporter.info(text)
-
-    def warn(self, text: str) -> None:
-        self._reporter.warn(text)
-
-    def tell(self, label: str, done: int, total: int | None, note: str, seconds_left: float | None) -> None:
-        """Note the task, unless the last note is too young."""
+    def tell(self, state: AtWork) -> None:
+        """Note ``state``, unless the last note is too young."""
         if time.monotonic() - self._noted >= EVERY:
-            self._write(AtWork(self._stage, self._work, label, done, total, note, seconds_left))
+            self.write(state)
 
-    def _write(self, state: AtWork) -> None:
-        self._noted = time.monotonic()
+    def write(self, state: AtWork) -> None:
+        """Note ``state``."""
+        self._state, self._noted = state, time.monotonic()
         with suppress(StoreError):
-            write_json(self._path, asdict(state))
+            write_json(self._path, state.model_dump())
 
 
 class _NotingTask:
     """One task, passed on and noted."""
 
-    def __init__(self, task: Task, label: str, total: int | None, reporter: _NotingReporter) -> None:
-        self._task, self._label, self._total, self._reporter = task, label, total, reporter
-        self._done, self._note = 0, ""
-        self._pace = Pace(total)
+    def __init__(self, task: Task, state: AtWork, reporter: _NotingReporter) -> None:
+        self._task, self._state, self._reporter, self._pace = task, state, reporter, Pace(state.total)
 
     def advance(self, steps: int = 1) -> None:
         self._task.advance(steps)
-        self._tell(self._done + steps, self._note, None)
+        self._tell(None, done=self._state.done + steps)
 
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         self._task.update(done=done, note=note, share=share)
-        self._tell(self._done if done is None else done, self._note if note is None else note, share)
+        changes = {"done": done, "note": note}
+        self._tell(share, **{name: value for name, value in changes.items() if value is not None})
 
-    def _tell(self, done: int, note: str, share: float | None) -> None:
-        self._done, self._note = done, note
-        left = self._pace.seconds_left(done, share)
-        self._reporter.tell(self._label, done, self._total, note, left)
+    def _tell(self, share: float | None, **changes: object) -> None:
+        state = self._state.model_copy(update=changes)
+        left = self._pace.seconds_left(state.done, share)
+        self._state = state.model_copy(update={"seconds_left": left})
+        self._reporter.tell(self._state)

@@ -6,8 +6,11 @@ import fcntl
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+
+from cleargs.files import disk_error
+from cleargs.progress import Reporter
 
 
 @contextmanager
@@ -18,9 +21,12 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
     however it ends. Another holder is waited for; with ``wait=False`` the block runs with False instead.
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise disk_error(error, path) from error
         try:
             held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
             if held and not _still_there(path, handle):
@@ -29,6 +35,22 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
             return
         finally:
             os.close(handle)
+
+
+@contextmanager
+def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
+    """Hold the lock file ``path`` of ``what``; wait while another process has it, and say which one.
+
+    Yields whether this process is alone: a file system without locks keeps nobody apart.
+    """
+    with ExitStack() as stack:
+        held = stack.enter_context(file_lock(path, wait=False))
+        if held is False:
+            reporter.info(f"{what}: {_holder(path)} works on it; waiting")
+            held = stack.enter_context(file_lock(path))
+        with suppress(OSError):  # the note only serves messages
+            path.write_text(process_name(os.getpid()), encoding="utf-8")
+        yield held is not None
 
 
 def is_locked(path: Path) -> bool:
@@ -49,14 +71,12 @@ def process_name(pid: int) -> str:
     return f"process {pid} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
 
 
-def sign(path: Path) -> None:
-    """Note this process in the lock file ``path``, which it holds. The note only serves messages."""
-    with suppress(OSError):
-        path.write_text(process_name(os.getpid()), encoding="utf-8")
+def is_held_by(path: Path, pid: int) -> bool:
+    """Return True if process ``pid`` of this host took the lock file ``path`` last."""
+    return _holder(path) == process_name(pid)
 
 
-def signature(path: Path) -> str:
-    """The process that signed the lock file ``path`` last."""
+def _holder(path: Path) -> str:
     with suppress(OSError, UnicodeDecodeError):
         return path.read_text(encoding="utf-8") or "another process"
     return "another process"

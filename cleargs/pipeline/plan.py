@@ -156,6 +156,8 @@ class Planner:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
         if entry is not None and entry.damage is not None:
             return (f"damaged: {entry.damage}",)
+        if entry is not None and entry.usable is not None:
+            return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
         before = last_shown(self.run.folder, recipe.parts.stage)
         if before is None:
             return (NOT_MADE,)

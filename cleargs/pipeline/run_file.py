@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -11,21 +9,19 @@ from typing import Any, TypeGuard, cast
 
 import tomli_w
 
-from cleargs.errors import ConfigError, InputError, StageError
+from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_error, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import key_config, settings
-from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.keys import settings
 from cleargs.pipeline.settings import Setting, settings_of
 from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
-from cleargs.untrusted import MAX_TEXT_BYTES, read_bytes
 
 RUN_FILE = "run.toml"
 
 LOCK = ".lock"
-"""Held by whoever works in the run folder."""
+"""Held by the process that works in the run folder."""
 
 HEADER = """\
 # The full configuration of this run, as `cleargs run` resolved it: all commands on the run read it, and the
@@ -52,77 +48,13 @@ class Run:
 
 def write_run_file(run: Run) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
-    path = run.folder / RUN_FILE
+    path, text = run.folder / RUN_FILE, _text(run).encode()
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        if not is_noted(run):
-            write_bytes(path, _text(run).encode())
+        if not path.is_file() or path.read_bytes() != text:
+            write_bytes(path, text)
     except OSError as error:
         raise disk_error(error, path) from error
-
-
-def is_noted(run: Run) -> bool:
-    """Whether ``run.toml`` says just this."""
-    try:
-        return read_bytes(run.folder / RUN_FILE, MAX_TEXT_BYTES) == _text(run).encode()
-    except OSError:
-        return False
-
-
-@contextmanager
-def at_work(run: Run, dag: Dag, check: Callable[[], None]) -> Iterator[None]:
-    """Work in the run folder for the block.
-
-    Runs of the same results may share the folder. Others would overwrite each other's ``run.toml`` and links,
-    and none be told: ``run.toml`` changes only while nobody works, after ``check`` (which may raise) has
-    looked at what is there. Raises StageError where another run is at work, StoreError where the folder
-    cannot be written.
-    """
-    with ExitStack() as held:
-        try:
-            while not _joined(run, held, lambda: is_noted(run)):
-                with file_lock(run.folder / LOCK, wait=False) as alone:
-                    if alone is not False:
-                        check()
-                        write_run_file(run)
-                if alone is not False:
-                    continue
-                if _joined(run, held, lambda: _results_alike(run, dag)):
-                    break
-                raise StageError(
-                    f"another run, of other settings or another input, is at work in {run.folder}",
-                    hint="wait until it is done, or choose another folder with -o",
-                )
-        except OSError as error:
-            raise disk_error(error, run.folder / LOCK) from error
-        yield
-
-
-def _joined(run: Run, held: ExitStack, ours: Callable[[], bool]) -> bool:
-    """Share the run folder until ``held`` ends, if its ``run.toml`` is ``ours``."""
-    with ExitStack() as attempt:
-        attempt.enter_context(file_lock(run.folder / LOCK, shared=True))
-        if ours():
-            held.enter_context(attempt.pop_all())
-            return True
-    return False
-
-
-def _results_alike(run: Run, dag: Dag) -> bool:
-    """Whether ``run.toml`` leads to the same results in the same place: settings outside keys may differ."""
-    try:
-        noted = read_run_file(run.folder, dag)
-    except InputError:
-        return False
-    stages = {name: dag.load(name) for name in dag.names}
-    return all(
-        (noted.source, noted.store, noted.device, noted.config.seed)
-        == (run.source, run.store, run.device, run.config.seed)
-        and key_config(noted.config.sections[name]) == key_config(run.config.sections[name])
-        and stage.externals(noted.config.sections[name], run.source)
-        == stage.externals(run.config.sections[name], run.source)
-        for name, stage in stages.items()
-    )
 
 
 def _text(run: Run) -> str:

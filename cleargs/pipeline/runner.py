@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +24,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import noted
-from cleargs.pipeline.lock import file_lock
+from cleargs.pipeline.lock import only_one
 from cleargs.pipeline.plan import (
     Planner,
     Recipe,
@@ -33,7 +34,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, at_work, noted_place
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_place, write_run_file
 from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
@@ -82,17 +83,13 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[Outcome] = []
         done: dict[str, Manifest] = {}
-        with at_work(self.run, self.dag, self._prepare), self.store.in_use():
+        with self._alone(), self.store.in_use():
+            check_same_input(self.run, self.dag, self.store)
+            self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
+            write_run_file(self.run)
             self.store.add_root(self.run.folder)
-            self._unlink_outdated()
-            as_planned = True
-            for plan in plans:
-                name = plan.stage
-                as_planned = as_planned and self._still_there(plan)
-                if as_planned and plan.recipe is not None and plan.manifest is not None:
-                    outcome = self._show("found", plan.recipe, plan.manifest)
-                else:
-                    outcome = self._bring(name, done, forced=name in forced)
+            for name in (plan.stage for plan in plans):
+                outcome = self._bring(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
                 if outcome.how == "made":
@@ -103,10 +100,9 @@ class Runner:
                     break
         return outcomes
 
-    def _prepare(self) -> None:
-        """Look at the run folder before its ``run.toml`` changes. Raises InputError for another capture."""
-        check_same_input(self.run, self.dag, self.store)
-        self._unlink_outdated()
+    def _alone(self) -> AbstractContextManager[bool]:
+        """Keep the run folder for this process; wait while another one works there."""
+        return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
         """Let the run folder show no results of other settings or inputs."""
@@ -130,7 +126,7 @@ class Runner:
         """
         check_address_space()
         done: dict[str, Manifest] = {}
-        with file_lock(self.run.folder / LOCK, shared=True), self.store.in_use():
+        with self._alone(), self.store.in_use():
             self.store.add_root(self.run.folder)
             self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
@@ -160,11 +156,6 @@ class Runner:
             )
         return entry.manifest
 
-    def _still_there(self, plan: StagePlan) -> bool:
-        """Whether what the plan found is in the store: until we held that, `collect` was free to act."""
-        entry = None if plan.manifest is None else self.store.find(plan.stage, plan.manifest.key)
-        return entry is not None and entry.whole is not None
-
     def _find(self, name: str, recipe: Recipe) -> Entry | None:
         """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
         entry = self.store.find(name, recipe.key)
@@ -184,14 +175,16 @@ class Runner:
         if manifest is None:
             recipe = self._read_again(name, done)
             entry = self.store.find(name, recipe.key)
-            reasons = ("forced",) if forced else self._why(recipe, entry)
+            reasons = ("forced",) if forced else self.planner.reasons(recipe, entry)
             with self.store.lock(recipe.key, self.reporter, name) as alone:
                 entry = self._find(name, recipe)
                 manifest = entry.whole if entry is not None and not forced else None
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
                     manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
-        return self._show(how, recipe, manifest)
+        manifest = self._with_inherited(manifest, recipe.inherited)
+        self.store.link(self.run.folder, name, recipe.key)
+        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
 
     def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
@@ -210,18 +203,6 @@ class Runner:
                 )
         return self.planner.recipe(name, done, afresh=True)
 
-    def _show(self, how: Literal["found", "made"], recipe: Recipe, manifest: Manifest) -> Outcome:
-        """Let the run folder show the finished results of ``recipe``."""
-        name = recipe.parts.stage
-        manifest = self._with_inherited(manifest, recipe.inherited)
-        self.store.link(self.run.folder, name, recipe.key)
-        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
-
-    def _why(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
-        if entry is not None and entry.usable is not None:
-            return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
-        return self.planner.reasons(recipe, entry)
-
     def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""
         name = recipe.parts.stage
@@ -229,8 +210,6 @@ class Runner:
         work = self.store.open_work(
             recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
         )
-        for place in work.thrown_away:
-            self.reporter.warn(f"{name}: {place} of an interrupted try is no file of ours and was removed")
         context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds

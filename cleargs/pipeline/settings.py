@@ -19,57 +19,36 @@ KIND_WORDS: Mapping[Any, str] = {
 }
 """How the types of settings are called."""
 
-SYNONYMS: Mapping[str, str] = {
-    "iterations": "steps",
-    "iters": "steps",
-    "epochs": "steps",
-    "max_steps": "steps",
-    "resolution": "max_size",
-    "size": "max_size",
-    "width": "max_size",
-    "long_side": "max_size",
-    "frames": "max_frames",
-    "images": "max_frames",
-    "num_frames": "max_frames",
-    "frame_rate": "fps",
-    "split": "holdout",
-    "test": "holdout",
-    "validation": "holdout",
-    "llffhold": "holdout",
-    "camera": "camera_model",
-    "features": "max_features",
-    "gaussians": "budget",
-    "splats": "budget",
-    "max_gaussians": "budget",
-    "cap_max": "budget",
-    "degree": "sh_degree",
-    "sh": "sh_degree",
-    "dssim": "ssim_lambda",
-    "lambda_dssim": "ssim_lambda",
-    "learning_rate": "lr_means",
-    "lr": "lr_means",
-    "position_lr_init": "lr_means",
-    "opacity_lr": "lr_opacities",
-    "scaling_lr": "lr_scales",
-    "rotation_lr": "lr_rotations",
-    "feature_lr": "lr_sh",
-    "densification_interval": "refine_every",
-    "densify_from_iter": "refine_start",
-    "densify_until_iter": "refine_stop",
-    "bg": "background",
-    "white_background": "background",
-    "mip": "antialias",
-    "threshold": "tau_R",
-    "judge": "evaluator",
-    "restorer": "expert",
-    "model": "expert",
-    "metric": "primary_scorer",
-    "scorer": "primary_scorer",
-    "fused": "use_fused",
-    "deblur": "undo_motion",
-    "random_seed": "seed",
+SYNONYMS: Mapping[str, tuple[str, ...]] = {
+    "steps": ("iterations", "iters", "epochs", "max_steps"),
+    "max_size": ("resolution", "size", "width", "long_side"),
+    "max_frames": ("frames", "images", "num_frames"),
+    "fps": ("frame_rate",),
+    "holdout": ("split", "test", "validation", "llffhold"),
+    "camera_model": ("camera",),
+    "max_features": ("features",),
+    "budget": ("gaussians", "splats", "max_gaussians", "cap_max"),
+    "sh_degree": ("degree", "sh"),
+    "ssim_lambda": ("dssim", "lambda_dssim"),
+    "lr_means": ("learning_rate", "lr", "position_lr_init"),
+    "lr_opacities": ("opacity_lr",),
+    "lr_scales": ("scaling_lr",),
+    "lr_rotations": ("rotation_lr",),
+    "lr_sh": ("feature_lr",),
+    "refine_every": ("densification_interval",),
+    "refine_start": ("densify_from_iter",),
+    "refine_stop": ("densify_until_iter",),
+    "background": ("bg", "white_background"),
+    "antialias": ("mip",),
+    "tau_R": ("threshold",),
+    "evaluator": ("judge",),
+    "expert": ("restorer", "model"),
+    "primary_scorer": ("metric", "scorer"),
+    "use_fused": ("fused",),
+    "undo_motion": ("deblur",),
+    "seed": ("random_seed",),
 }
-"""What people and other programs call a setting -> the last part of its name here."""
+"""The last part of a name here -> what people and other programs call it."""
 
 OPTIONS = ("threads", "device", "store", "until")
 """What is no setting, but an option of the command line."""
@@ -197,7 +176,7 @@ def suggestion(name: str, prefix: str, siblings: list[str], models: Mapping[str,
         return f"that is an option: --{name}"
     everything = [f"{section}.{full}" for section, model in models.items() for full in names_of(model)]
     by_last = {full.rpartition(".")[2]: full for full in reversed(everything)} | {"seed": "seed"}
-    meant = SYNONYMS.get(name.lower(), name)
+    meant = next((here for here, words in SYNONYMS.items() if name.lower() in words), name)
     if meant in siblings:
         return f"did you mean {prefix}{meant}?"
     if meant in by_last:

@@ -19,9 +19,8 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -33,11 +32,10 @@ from cleargs.manifest import (
     Manifest,
     damage,
     hidden_link,
-    published_files,
     read_manifest,
     write_manifest,
 )
-from cleargs.pipeline.lock import file_lock, is_locked, process_name, sign, signature
+from cleargs.pipeline.lock import file_lock, is_held_by, is_locked, only_one
 from cleargs.progress import Reporter
 from cleargs.untrusted import FAULTS, read_text
 
@@ -76,8 +74,6 @@ class Work:
     """Where one key is being worked on."""
 
     folder: Path
-    thrown_away: tuple[str, ...] = ()
-    """What could not be used of an earlier try, and was removed."""
 
     @property
     def out(self) -> Path:
@@ -154,15 +150,9 @@ class Store:
                 f"{stage} is to be made, but the store {self.root} may only be read",
                 hint="choose a --store of your own",
             )
-        path = self.root / "locks" / f"{key}.lock"
-        with ExitStack() as stack:
-            held = stack.enter_context(file_lock(path, wait=False))
-            if held is False:
-                reporter.info(f"{stage}: {signature(path)} works on it; waiting")
-                held = stack.enter_context(file_lock(path))
-            sign(path)
+        with only_one(self.root / "locks" / f"{key}.lock", reporter, stage) as alone:
             try:
-                yield held is not None
+                yield alone
             finally:
                 self._hand_back(key)
 
@@ -201,14 +191,13 @@ class Store:
                 left, work = work, Work(work.folder.with_name(work.folder.name + self._own()))
                 with suppress(OSError):  # nothing is there, or another process took it
                     left.folder.rename(work.folder)
-            work = replace(work, thrown_away=tuple(_only_files(work.folder)))
             _keep_only(work.out, leftovers)
             if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
                 _link_files(entry.folder, work.out)
             work.out.mkdir(parents=True, exist_ok=True)
             work.checkpoints.mkdir(parents=True, exist_ok=True)
             (work.out / MANIFEST).unlink(missing_ok=True)
-            for file in [*work.out.rglob("*"), *work.checkpoints.rglob("*")]:
+            for file in work.checkpoints.rglob("*"):
                 if is_partial(file) and not file.is_dir():
                     file.unlink()
         except OSError as error:
@@ -371,7 +360,7 @@ def last_saved(root: Path, pid: int) -> int:
 
     A growing number says that a checkpoint was written in the store ``root``.
     """
-    keys = [lock.stem for lock in (root / "locks").glob("*.lock") if signature(lock) == process_name(pid)]
+    keys = [lock.stem for lock in (root / "locks").glob("*.lock") if is_held_by(lock, pid)]
     youngest = 0
     for file in (file for key in keys for file in (root / "work").glob(f"{key}*/**/*")):
         with suppress(FileNotFoundError):
@@ -390,46 +379,31 @@ def _size(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
-def _only_files(folder: Path) -> Iterator[str]:
-    """Leave nothing but files of our own in folders below ``folder``; yields what was removed.
-
-    A link or a device among outputs would be published, and change with what it stands for.
-    """
-    if folder.is_symlink() or not folder.is_dir():
-        folder.unlink(missing_ok=True)
-    for place in sorted(folder.rglob("*")):
-        ours = place.parent != folder or place.name == SECONDS
-        if place.is_symlink() or not (place.is_dir() or (place.is_file() and ours)):
-            place.unlink(missing_ok=True)
-            yield place.relative_to(folder).as_posix()
-
-
 def _keep_only(out: Path, patterns: Sequence[str]) -> None:
-    """Leave nothing in ``out`` but files that match a pattern, part by part, and their folders."""
+    """Leave nothing in ``out`` but files that match a pattern, and their folders."""
+    known = {file for pattern in patterns for file in out.glob(pattern)}
     for place in sorted(out.rglob("*"), reverse=True):  # what is in a folder before the folder
-        parts = place.relative_to(out).parts
-        known = (pattern.split("/") for pattern in patterns)
         if place.is_dir() and not place.is_symlink():
             if not any(place.iterdir()):
                 place.rmdir()
-        elif not any(len(parts) == len(names) and all(map(fnmatchcase, parts, names)) for names in known):
+        elif place not in known or not place.is_file() or is_partial(place):
             place.unlink()
 
 
 def _link_files(source: Path, target: Path) -> None:
     """Bring the files of ``source`` into ``target`` without copying their content where hard links work.
 
-    Stages replace files by rename and never write into one, so that the source stays as it was. The copy
-    is made beside its place, so that a killed one is not taken for whole.
+    Stages replace files by rename and never write into one, so that the source stays as it was. The copy is
+    made next to its place, so that a killed one is not mistaken for a whole one.
     """
     beside = target.with_name(f"{target.name}.carried")
     shutil.rmtree(beside, ignore_errors=True)
-    for name, file in published_files(source).items():
-        place = beside / name
-        place.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(file, place)
-        except OSError:
-            shutil.copy2(file, place)
-    beside.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(source, beside, copy_function=_link_or_copy)
     beside.rename(target)
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)

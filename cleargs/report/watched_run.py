@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ class Watched:
             stages.append({"name": name, "state": state, "seconds": seconds})
         return {
             "name": self.folder.name,
-            "now": None if found is None else asdict(found),
+            "now": None if found is None else found.model_dump(),
             "stages": stages,
             "preview": None if picture is None else str(picture.version),
             "report": page_of(self.folder).is_file(),

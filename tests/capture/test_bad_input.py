@@ -211,7 +211,7 @@ def test_numbers_and_names_that_are_none(posed: Path, change: Any, words: str) -
 
 def test_json_that_is_nested_too_deeply(posed: Path) -> None:
     (posed / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
-    with pytest.raises(InputError, match="nested deeper") as caught:
+    with pytest.raises(InputError, match="nested too deeply") as caught:
         open_capture(posed, IngestConfig())
     assert refused(caught)
 

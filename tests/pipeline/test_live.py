@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +70,7 @@ def test_a_damaged_note_says_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
 ) -> None:
     monkeypatch.setattr(live, "writer_lives", lambda work: True)
-    whole = asdict(AtWork("g0", "key@host-1-a", "G0", 1, 2, "", None))
+    whole = AtWork(stage="g0", work="key@host-1", label="G0", done=1, total=2).model_dump()
     (tmp_path / NOTE).write_text(json.dumps(whole))
     assert at_work(tmp_path, tmp_path) is not None
     (tmp_path / NOTE).write_text(json.dumps(whole | change))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,7 @@ from toy import Bench
 from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
 from cleargs.manifest import read_manifest
-from cleargs.pipeline.lock import file_lock, is_locked, sign, signature
+from cleargs.pipeline.lock import file_lock, is_held_by, is_locked, only_one
 from cleargs.pipeline.store import Store
 
 
@@ -24,23 +27,28 @@ def no_locks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", refused)
 
 
-def test_lock_excludes_and_ends_with_its_block(tmp_path: Path) -> None:
+def test_lock_excludes_and_ends_with_its_block(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "locks" / "key.lock"
     assert not is_locked(path)
-    with file_lock(path) as held, file_lock(path, wait=False) as second:
-        assert (held, second) == (True, False)
-        sign(path)
-        assert is_locked(path) and signature(path).startswith("process ")
-    assert not is_locked(path)
+    with only_one(path, bench.remarks, "key") as alone, file_lock(path, wait=False) as second:
+        assert (alone, second) == (True, False)
+        assert is_locked(path) and is_held_by(path, os.getpid())
+    assert not is_locked(path) and bench.remarks.lines == []
     with file_lock(path, shared=True), file_lock(path, shared=True, wait=False) as second:
         assert second and not is_locked(path)
 
 
-def test_unsigned_lock_is_of_another_process(tmp_path: Path) -> None:
+def test_a_lock_without_a_name_is_waited_for(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "key.lock"
-    assert signature(path) == "another process"
-    path.write_bytes(b"\xff")
-    assert signature(path) == "another process"
+    with ExitStack() as first:
+        first.enter_context(file_lock(path))
+        path.write_bytes(b"\xff")
+        release = threading.Timer(0.2, first.pop_all().close)
+        release.start()
+        with only_one(path, bench.remarks, "square") as alone:
+            assert alone
+        release.join()
+    assert bench.remarks.lines == ["square: another process works on it; waiting"]
 
 
 @pytest.mark.usefixtures("no_locks")

@@ -118,8 +118,8 @@ def test_every_synonym_leads_to_a_setting() -> None:
     names = {
         full.rpartition(".")[2] for name in installed().names for full in names_of(load_stage(name).CONFIG)
     }
-    assert set(SYNONYMS.values()) <= names | {"seed"}
-    assert not SYNONYMS.keys() & {"steps", "max_size", "budget"}
+    assert set(SYNONYMS) <= names | {"seed"}
+    assert not {word for words in SYNONYMS.values() for word in words} & {"steps", "max_size", "budget"}
 
 
 def test_every_setting_has_a_meaning_and_a_range() -> None:
@@ -198,10 +198,7 @@ def test_marked_settings_stay_out_of_the_key(dag: Dag) -> None:
         ('input = "a\\u0000b"\n', "damaged"),
         ('input = "x"\nstore = "a\\u0000b"\n', "damaged"),
         ("input = 7\n", "damaged"),
-        ('input = "x"\na = ' + "[" * 5000, "nested deeper"),
-        ('input = "x"\n' + ".".join("a" * 50_000) + " = 1\n", "nested deeper"),
-        ('input = "x"\n"a" . ' + " . ".join("b" * 40) + " = 1\n", "nested deeper"),
-        ('input = "x"\na = ' + "[" * 40 + "]" * 40 + "\n", "nested deeper"),
+        ('input = "x"\na = ' + "[" * 5000, "nested too deeply"),
         ('input = "x"\nseed = ' + "9" * 5000 + "\n", "not valid TOML"),
     ],
 )
@@ -220,11 +217,6 @@ def test_a_pipe_for_a_run_file(bench: Bench) -> None:
         read_run_file(bench.folder, bench.dag)
     with pytest.raises(ConfigError, match="no regular file"):
         read_toml(bench.folder / "run.toml")
-
-
-def test_a_setting_of_very_many_parts(bench: Bench) -> None:
-    with pytest.raises(ConfigError, match="names no setting"):
-        bench.settings([".".join("a" * 5000) + "=1"])
 
 
 def test_disk_is_told_in_the_unit_that_says_something(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -272,35 +272,15 @@ def test_collecting_between_plan_and_work_costs_nothing(
         assert (bench.folder / name).resolve().is_dir(), "no link dangles"
 
 
-@pytest.mark.parametrize("place", ["out", "checkpoints"])
-@pytest.mark.parametrize("what", ["file", "link", "pipe"])
-def test_work_folders_that_are_none_are_thrown_away(bench: Bench, place: str, what: str) -> None:
-    healthy = bench.digests()
-    key = read_manifest(bench.folder / "square").key
-    shutil.rmtree(bench.store / "square")
-    found = bench.store / "work" / f"{key}" / place
-    found.parent.mkdir(parents=True)
-    if what == "file":
-        found.write_bytes(b"no folder")
-    elif what == "link":
-        found.symlink_to(bench.capture)
-    else:
-        os.mkfifo(found)
-    assert bench.digests() == healthy
-    assert any(f"square: {place} of an interrupted try" in line for line in bench.remarks.warnings)
-    assert len(list(bench.capture.iterdir())) == 6, "what a link names is not touched"
-
-
 def test_links_among_leftovers_are_not_published(bench: Bench) -> None:
     healthy = bench.digests()
     key = read_manifest(bench.folder / "count").key
     shutil.rmtree(bench.store / "count")
-    out = bench.store / "work" / f"{key}" / "out"
+    out = bench.store / "work" / key / "out"
     (out / "numbers").mkdir(parents=True)
-    (out / "numbers" / "1.txt").symlink_to(bench.capture / "1.txt")
+    (out / "numbers" / "1.txt").symlink_to("/nowhere")
     (out / "secret").symlink_to("/etc/passwd")
     assert bench.digests() == healthy
-    assert any("out/secret" in line for line in bench.remarks.warnings)
 
 
 def test_somebody_elses_store_can_be_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
