@@ -23,9 +23,9 @@ from cleargs.formation.search import (
 from cleargs.formation.warp import displacement_fields
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
-from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
 from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.splat.types import Render
 
 MARGIN_STEP = 4
 """Margins are multiples of this, px."""

@@ -13,8 +13,8 @@ from torch import Tensor
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.view import FormedView
-from cleargs.splat.engine import Engine
-from cleargs.splat.losses import psnr
+from cleargs.splat.backend import psnr, rasteriser_for
+from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import ImageCache, View, unseen_pixels
 
@@ -25,14 +25,14 @@ def photograph(
     exposure: Exposure | None = None,
     formation: FrameFormation | None = None,
     *,
-    engine: Engine | None = None,
+    engine: Rasteriser | None = None,
 ) -> Tensor:
     """What ``scene`` shows at a view: [H, W, 3] sRGB in [0, 1], own memory.
 
     Through the frame's colour affine where ``exposure`` is given, and through its motion and defocus where
     ``formation`` is.
     """
-    engine = engine or Engine(str(scene.gaussians.device))
+    engine = engine or rasteriser_for(str(scene.gaussians.device))
     affine = None if exposure is None else torch.from_numpy(exposure.of(view.frame_id).astype(np.float32))
     moved = formation if formation is not None and formation.model != "none" else None
     formed = FormedView(view.camera, view.weight, affine=affine, formation=moved)
@@ -70,11 +70,11 @@ def evaluate_views(
     exposure: Exposure | None = None,
     formations: Mapping[int, FrameFormation] | None = None,
     *,
-    engine: Engine | None = None,
+    engine: Rasteriser | None = None,
     cache: ImageCache | None = None,
 ) -> list[Fit]:
     """How well the scene shows every view as photographed, in their order, at full size."""
-    engine = engine or Engine(str(scene.gaussians.device))
+    engine = engine or rasteriser_for(str(scene.gaussians.device))
     cache = cache or ImageCache(0, scene.gaussians.device)
     formations = formations or {}
     fits = []

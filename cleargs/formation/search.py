@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from cleargs.formation.motion import TWIST, Floats, FrameMotion, Model, Vector, flow_basis
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
+from cleargs.splat.backend import SearchKernels, search_kernels
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import frame_warp as kernels
-from cleargs.splat.kernels.cpu import launch
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
@@ -111,13 +110,16 @@ def explained_share(misfit: float, misfit_still: float) -> float:
     return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
-def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Explanation]:
+def search(
+    sight: Sight, *, skew: bool = True, pose: bool = False, kernels: SearchKernels | None = None
+) -> list[Explanation]:
     """Every model at its best, from scratch. The first is ``none``.
 
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
+    kernels: what it computes with; None: the CPU's.
     """
-    levels = [_Level(sight, scale) for scale in _scales(sight)]
+    levels = [_Level(sight, scale, kernels) for scale in _scales(sight)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -135,9 +137,16 @@ def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Expla
     return [levels[-1].judged("none", still), *(levels[-1].judged(name, found[name]) for name in found)]
 
 
-def refine(sight: Sight, model: Model, motion: FrameMotion, *, pose: bool = False) -> list[Explanation]:
+def refine(
+    sight: Sight,
+    model: Model,
+    motion: FrameMotion,
+    *,
+    pose: bool = False,
+    kernels: SearchKernels | None = None,
+) -> list[Explanation]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = _Level(sight, _scales(sight)[-1])
+    level = _Level(sight, _scales(sight)[-1], kernels)
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
@@ -181,7 +190,8 @@ def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
 class _Level:
     """The problem at one size."""
 
-    def __init__(self, sight: Sight, scale: float) -> None:
+    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels | None) -> None:
+        self._kernels = kernels or search_kernels()
         margin = sight.margin
         height, width = sight.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
@@ -216,7 +226,6 @@ class _Level:
         self._down = (rows / sight.camera.height - 0.5).astype(np.float32)
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
         self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
-        self._rows = np.empty(size[1])
 
     def judged(self, model: Model, motion: FrameMotion) -> Explanation:
         """How well a motion explains the pixels that judge."""
@@ -279,9 +288,7 @@ class _Level:
 
     def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
         fields = self._fields(motion)
-        with launch.exclusive():
-            kernels.misfits(self._image, self._observed, weight, *fields, times, LIMIT, self._rows)
-        return math.fsum(self._rows)
+        return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
     def _fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
         """Offset, sweep and radius: see `DisplacementFields`."""
@@ -321,26 +328,19 @@ class _Level:
         return motion
 
     def _normal_equations(self, motion: FrameMotion, active: Vector) -> tuple[Vector, Vector]:
-        (offset, sweep, _), height = self._fields(motion), len(self._observed)
-        count = len(active)
-        matrices, sides = np.empty((height, count, count)), np.empty((height, count))
-        with launch.exclusive():
-            kernels.normal_equations(
-                self._stack,
-                self._observed,
-                self._fitting,
-                self._basis,
-                self._down,
-                offset,
-                sweep,
-                FINE[:, 0].copy(),
-                OUTLIER,
-                active,
-                matrices,
-                sides,
-            )
-        lower = matrices.sum(axis=0)
-        return lower + np.tril(lower, -1).T, sides.sum(axis=0)
+        offset, sweep, _ = self._fields(motion)
+        return self._kernels.normal_equations(
+            self._stack,
+            self._observed,
+            self._fitting,
+            self._basis,
+            self._down,
+            offset,
+            sweep,
+            FINE[:, 0].copy(),
+            OUTLIER,
+            active,
+        )
 
 
 def _samples_for(model: Model) -> Floats:

@@ -18,8 +18,8 @@ from cleargs.formation.warp import (
     times_slope,
 )
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Render
 from cleargs.splat.kernels.warp_layout import CHANNELS
+from cleargs.splat.types import Render
 
 
 @dataclass(eq=False)

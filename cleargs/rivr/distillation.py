@@ -25,14 +25,14 @@ from cleargs.rivr.candidates import Image
 from cleargs.rivr.harm import Fidelity
 from cleargs.rivr.restoring import Deblurred, Explained, observation
 from cleargs.rivr.selection import hide_masked
+from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import DistilConfig, FormationConfig
-from cleargs.splat.engine import Engine, Render
-from cleargs.splat.losses import psnr
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import train
+from cleargs.splat.types import Render
 from cleargs.splat.views import View
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
@@ -51,7 +51,7 @@ class Snapshot:
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
         self.formations, self._weights = read_formation(folder / FORMATION)
-        self._engine = Engine(device)
+        self._engine = rasteriser_for(device)
 
     @property
     def exposure(self) -> Exposure | None:

@@ -1,6 +1,6 @@
 """Optimise a scene against weighted views: the one loop that G0, RIVR and the consolidation share.
 
-No torch autograd: engine forward -> loss and its gradient -> engine backward -> Adam -> densification. All
+No torch autograd: render -> loss and its gradient -> backward pass -> Adam -> densification. All
 randomness is drawn afresh from (seed, stream, step), so that a resumed training is the same training.
 """
 
@@ -22,22 +22,20 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.adam import Moments, step_gaussians
-from cleargs.splat.backend import backend_for
+from cleargs.splat.backend import backend_for, photometric_loss, psnr, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.effort import decided, seconds_by_step
-from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.preview import preview_camera, write_preview
 from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.strategy.mcmc import MCMC
 from cleargs.splat.train_log import TrainLog
+from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, View, require_views
 
 _NOTE_INTERVAL = 10
@@ -147,8 +145,9 @@ class Trainer:
         self.length = config.length
         self._seed = tuple(seed)
         self._scene = scene
-        self._engine = Engine(device)
         self._device = torch.device(device)
+        self._backend = backend_for(self._device)
+        self._rasteriser = self._backend.rasteriser(self._device)
         self._gaussians = scene.gaussians.detach().clone().to(self._device)
         if fault := _fault(self._gaussians):
             raise InputError(
@@ -162,7 +161,7 @@ class Trainer:
         self._strategy = MCMC(config, config.budget, seed)
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._meter = backend_for(self._device).meter(config.ssim_lambda)
+        self._meter = self._backend.meter(config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
@@ -206,8 +205,8 @@ class Trainer:
         slope = self._measure(image, target, mask, weight)
         if config.densify and self._strategy.wants_errors(at + 1):
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
-        gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
-        backend_for(self._device).regularise(
+        gradients = self._rasteriser.backward(slope if formed is None else formed.backward(slope))
+        self._backend.regularise(
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
         )
         step_gaussians(
@@ -296,7 +295,7 @@ class Trainer:
         return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
 
     def _render(self, camera: Camera, *, depth: bool) -> Render:
-        return self._engine.forward(
+        return self._rasteriser.forward(
             self._gaussians,
             camera,
             sh_degree=self._sh_degree(),
@@ -334,7 +333,7 @@ class Trainer:
         error = (image - target).square_().mul_(weight)
         if mask is not None:
             error *= mask[..., None]
-        shares = self._engine.backward(error if formed is None else formed.backward(error))
+        shares = self._rasteriser.backward(error if formed is None else formed.backward(error))
         return shares.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 
     def _read_meter(self) -> None:

@@ -38,8 +38,8 @@ def compare_on_device(monkeypatch: pytest.MonkeyPatch, device: torch.device) -> 
     """``splat_scenes.compare`` makes its scene on the CPU: take it to the device and the pictures back."""
     import splat_scenes
 
-    from cleargs.splat.engine import Render
     from cleargs.splat.render import render
+    from cleargs.splat.types import Render
 
     def on_device(gaussians: Gaussians, camera: Camera, **settings: Any) -> Render:
         outputs = render(gaussians.to(device), camera, **settings)

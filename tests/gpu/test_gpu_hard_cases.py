@@ -8,13 +8,12 @@ import torch
 from gpu_checks import assert_close
 from splat_scenes import BACKGROUND, at, compare, leaves, make_camera, make_gaussians, make_needles
 
-from cleargs.splat.adam import adam_step
+from cleargs.splat.backend import adam_step, photometric_loss, rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
-from cleargs.splat.losses import photometric_loss
 from cleargs.splat.render import render
+from cleargs.splat.types import AdamStep
 
 pytestmark = pytest.mark.usefixtures("compare_on_device")
 
@@ -54,7 +53,7 @@ def test_no_thickness_at_all(device):
     gaussians.log_scales[4:8, 1] = -100.0
     gaussians.log_scales[8:12] = -100.0
     assert_close(compare(gaussians, camera))
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(gaussians.to(device), camera, antialias=True).image
     assert not engine.visible[4:12].any()
     assert engine.visible[12:].any()
@@ -80,7 +79,7 @@ def test_all_transparent(device):
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12)
     gaussians.logit_opacities[:] = float(-np.log(255.1 - 1))
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     result = engine.forward(gaussians.to(device), camera, background=BACKGROUND, depth=True)
     assert torch.equal(result.image.cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not result.alpha.any()
@@ -105,7 +104,7 @@ def test_what_saturated_pixels_hide_has_no_gradient(device):
     assert_close(result)
     assert (result.alpha > 1 - 1.5e-4).any()
     assert (result.alpha < 0.5).any()
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(gaussians.to(device), camera).image
     gradients = engine.backward(torch.ones_like(image))
     assert engine.visible[hidden].all()
@@ -129,7 +128,7 @@ def test_weight_zero_gives_exactly_no_gradient_and_weight_two_twice_that_of_one(
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12).to(device)
     target = torch.rand(18, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(gaussians, camera, background=BACKGROUND).image
 
     def gradients(weight: float) -> Gaussians:
@@ -157,14 +156,14 @@ def test_training_on_every_hard_case_at_once_stays_finite(device):
     scene = join(odd, needles, far).to(device)
     target = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(1)).to(device)
     moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     for step in range(1, 5):
         image = engine.forward(scene, camera, antialias=step % 2 == 0).image
         loss = photometric_loss(image, target, ssim_lambda=0.2)
         assert np.isfinite(loss.loss)
         for name, gradient in engine.backward(loss.grad_image).tensors().items():
             assert gradient.isfinite().all(), (step, name)
-            adam_step(getattr(scene, name), gradient, *moments[name], step=step, lr=1e-2)
+            adam_step(AdamStep(getattr(scene, name), gradient, *moments[name], step, 1e-2))
             assert getattr(scene, name).isfinite().all(), (step, name)
 
 

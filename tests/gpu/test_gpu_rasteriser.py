@@ -5,8 +5,6 @@ Scenes are small, since Triton's interpreter takes milliseconds for every (tile,
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 import torch
@@ -14,10 +12,9 @@ from gpu_checks import assert_close
 from splat_scenes import BACKGROUND, compare, make_camera, make_gaussians
 
 from cleargs.errors import StageError
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
-from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import splat_layout
+from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.render import render
 
@@ -76,7 +73,7 @@ def test_behind_and_across_the_near_plane(device):
     gaussians.means[: len(depths)] = torch.tensor((local - translation) @ rotation)
     # Splats centred 0.011 in front hide most of the image, as in the CPU's test.
     assert_close(compare(gaussians, camera), image=1e-5, gradient=3e-5)
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     engine.forward(gaussians.to(device), camera)
     assert engine.visible[:7].tolist() == [False, False, False, False, True, True, True]
     assert not engine.visible[:4].any()
@@ -98,7 +95,7 @@ def test_opacity_zero_and_one(device):
     assert_close(compare(gaussians, camera))
     gaussians.logit_opacities[12] = float("-inf")
     gaussians.logit_opacities[13] = float("inf")
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(gaussians.to(device), camera).image
     gradients = engine.backward(torch.ones_like(image))
     assert all(tensor.isfinite().all() for tensor in gradients.tensors().values())
@@ -121,7 +118,7 @@ def test_nothing_visible(n, device):
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, n)
     gaussians.means[:] = -gaussians.means - 20.0
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     result = engine.forward(gaussians.to(device), camera, background=BACKGROUND, depth=True)
     expected = torch.tensor(BACKGROUND, device=device).expand(18, 20, 3)
     torch.testing.assert_close(result.image, expected, rtol=0, atol=0)
@@ -147,7 +144,7 @@ def test_a_splat_that_is_not_finite_is_culled(name, value, device):
     gaussians = make_gaussians(camera, 8)
     others = gaussians.select(torch.arange(8) != 3).to(device)
     getattr(gaussians, name)[3] = value
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(gaussians.to(device), camera).image.clone()
     gradients = engine.backward(torch.ones_like(image))
     assert not engine.visible[3]
@@ -158,7 +155,7 @@ def test_a_splat_that_is_not_finite_is_culled(name, value, device):
 def test_two_runs_give_the_same_bits_and_buffers_are_used_again(device):
     camera = make_camera(36, 27)
     gaussians = make_gaussians(camera, 20).to(device)
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     outcomes = []
     for _ in range(2):
         image = engine.forward(gaussians, camera).image
@@ -173,26 +170,25 @@ def test_two_runs_give_the_same_bits_and_buffers_are_used_again(device):
 
 def test_depth_gradient_needs_a_forward_with_depth(device):
     camera = make_camera(16, 16)
-    engine = Engine(device)
+    engine = rasteriser_for(device)
     image = engine.forward(make_gaussians(camera, 4).to(device), camera).image
     with pytest.raises(ValueError, match="depth"):
         engine.backward(image, None, image[..., 0])
 
 
 def test_too_many_pairs_is_an_error(device, monkeypatch):
-    monkeypatch.setattr(splat_layout, "MAX_PAIRS", 10)
+    monkeypatch.setattr(rasteriser, "MAX_PAIRS", 10)
     camera = make_camera(36, 27)
     with pytest.raises(StageError, match="pairs"):
-        Engine(device).forward(make_gaussians(camera, 20).to(device), camera)
+        rasteriser_for(device).forward(make_gaussians(camera, 20).to(device), camera)
 
 
 def test_pairs_that_do_not_fit_are_refused_before_they_are_made(device, monkeypatch):
-    pipeline = importlib.import_module("cleargs.splat.kernels.cuda.pipeline")
-    monkeypatch.setattr(pipeline, "UNASKED", 0)
+    monkeypatch.setattr(rasteriser, "UNASKED", 0)
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12).to(device)
-    engine = Engine(device)
-    monkeypatch.setattr(pipeline, "available_memory", lambda device: 100)
+    engine = rasteriser_for(device)
+    monkeypatch.setattr(rasteriser, "available_memory", lambda device: 100)
     with pytest.raises(StageError, match=r"12 Gaussians touch .* more than fit"):
         engine.forward(gaussians.select(torch.arange(12, device=device)), camera)
     monkeypatch.undo()
@@ -203,22 +199,3 @@ def test_exhausted_memory_names_the_settings():
     with pytest.raises(StageError, match="memory") as caught, support.memory_errors():
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nMore.")
     assert "budget" in caught.value.hint
-
-
-def test_the_gradients_on_the_screen_are_the_cpus(device):
-    from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
-
-    camera = make_camera(36, 27)
-    doubles = make_gaussians(camera, 30)
-    gaussians = Gaussians(**{name: tensor.float() for name, tensor in doubles.tensors().items()})
-    upstream = torch.randn(27, 36, 3, generator=torch.Generator().manual_seed(0))
-    found = []
-    for rasteriser, place in ((CpuRasteriser(), "cpu"), (Engine(device)._rasteriser, device)):
-        rasteriser.forward(
-            gaussians.to(place), camera, sh_count=1, background=(0.0, 0.0, 0.0), antialias=False, depth=False
-        )
-        rasteriser.backward(upstream.to(place), None, None)
-        found.append(rasteriser.screen_gradients().cpu())
-    assert found[0].abs().max() > 1e-2 and not torch.isnan(found[1]).any()
-    # Two back ends in float32 over some hundred pixels a Gaussian.
-    torch.testing.assert_close(found[1], found[0], rtol=2e-3, atol=2e-4)

@@ -15,13 +15,13 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, affine_backward, apply_affine
 from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
-from cleargs.splat.adam import adam_step
+from cleargs.splat.backend import adam_step, photometric_loss, psnr
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.losses import photometric_loss, psnr
 from cleargs.splat.state import load_state
-from cleargs.splat.strategy import mcmc
+from cleargs.splat.strategy import rules
 from cleargs.splat.trainer import Trainer, train
+from cleargs.splat.types import AdamStep, Moments
 from cleargs.splat.views import ImageCache
 
 
@@ -108,7 +108,7 @@ def test_adam_equals_torch(shape, device):
         gradient[0] = 0.0
         theirs.grad = gradient.double()
         optimiser.step()
-        adam_step(mine, gradient.to(device), first, second, step=step, lr=1e-2)
+        adam_step(AdamStep(mine, gradient.to(device), first, second, step, 1e-2))
     assert (mine.cpu() - theirs).abs().max() < 2e-6
     assert torch.equal(mine.cpu()[0], start[0])
 
@@ -118,7 +118,7 @@ def test_adam_takes_a_rate_per_column(device):
     start, gradient = (torch.randn(50, 4, 3, generator=generator).to(device) for _ in range(2))
     rates = torch.linspace(0.001, 0.012, 12)
     mine, first, second = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
-    adam_step(mine, gradient, first, second, step=1, lr=rates)
+    adam_step(AdamStep(mine, gradient, first, second, 1, rates))
     expected = gradient.sign() * rates.to(device).reshape(4, 3)
     torch.testing.assert_close(start - mine, expected, rtol=1e-4, atol=1e-6)
 
@@ -148,12 +148,15 @@ def test_a_refinement_is_that_of_the_cpu(device, densify):
     assert dead == 13  # 2, 4, and of 8 all but one, which is new, as 16 more are
     errors = torch.zeros(40, device=device)
     errors[[20, 33]] = 2.0
-    moments = [{name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()}]
+    first, second = (
+        {name: torch.ones_like(tensor) for name, tensor in gaussians.tensors().items()} for _ in range(2)
+    )
     arrays = {name: tensor.cpu().numpy().copy() for name, tensor in gaussians.tensors().items()}
     running = [{name: np.ones_like(array) for name, array in arrays.items()}]
     settings = {"rate": 0.5, "budget": 57, "min_opacity": 0.01}
-    grown, (reset,) = densify.refine(gaussians, moments, errors=errors, seed=1, **settings)
-    expected, (emptied,) = mcmc.refine(
+    grown, moments = densify.refine(gaussians, Moments(first, second), errors=errors, seed=(1,), **settings)
+    reset = moments.first
+    expected, (emptied,) = rules.refine(
         arrays, running, errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
     )
     assert grown.num == len(expected["means"]) == 57
@@ -167,10 +170,10 @@ def test_a_refinement_is_that_of_the_cpu(device, densify):
 
 
 def test_a_refinement_repeats_itself_and_keeps_to_the_budget(device, densify):
-    settings = {"rate": 0.5, "budget": 55, "min_opacity": 0.005, "seed": 5}
+    settings = {"rate": 0.5, "budget": 55, "min_opacity": 0.005, "seed": (5,)}
     errors = torch.linspace(0.0, 1.0, 40, device=device)
-    once, _ = densify.refine(crowd(40, device), [], errors=errors, **settings)
-    again, _ = densify.refine(crowd(40, device), [], errors=errors, **settings)
+    once, _ = densify.refine(crowd(40, device), Moments({}, {}), errors=errors, **settings)
+    again, _ = densify.refine(crowd(40, device), Moments({}, {}), errors=errors, **settings)
     assert once.num == 55
     assert all(
         torch.equal(a, b) for a, b in zip(once.tensors().values(), again.tensors().values(), strict=True)
@@ -187,10 +190,10 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     gaussians.logit_opacities[:10] = 2.0
     gaussians = gaussians.to(device)
     start = gaussians.means.clone()
-    densify.add_position_noise(gaussians, amount=2.0, min_opacity=0.005, seed=11)
+    densify.add_position_noise(gaussians, amount=2.0, min_opacity=0.005, seed=(11,))
     offsets = (gaussians.means - start).double().cpu()
     assert not offsets[:10].any()
-    rotation = mcmc.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
+    rotation = rules.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
     covariance = rotation @ np.diag(np.exp(2.0 * one.log_scales[0].double().numpy())) @ rotation.T
     # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ²; a sample's entries are good to some per cent.
     fade = 1.0 / (1.0 + math.exp(-100.0 * (0.005 - 1.0 / (1.0 + math.exp(9.0)))))
@@ -311,4 +314,4 @@ def test_a_parameter_that_is_not_finite_is_named(toy, device):
 def test_adam_refuses_tensors_that_do_not_fit(device):
     one = torch.zeros(4, device=device)
     with pytest.raises(InputError, match="Adam got"):
-        adam_step(one, one[:2], one.clone(), one.clone(), step=1, lr=0.1)
+        adam_step(AdamStep(one, one[:2], one.clone(), one.clone(), 1, 0.1))

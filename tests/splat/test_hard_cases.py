@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_scenes import BACKGROUND, at, compare, leaves, make_camera, make_gaussians, make_needles
 
-from cleargs.splat.adam import adam_step
+from cleargs.splat.backend import adam_step, photometric_loss, rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
-from cleargs.splat.losses import photometric_loss
 from cleargs.splat.render import render
+from cleargs.splat.types import AdamStep
 
 
 def assert_close(result, image, gradient):
@@ -71,7 +70,7 @@ def test_no_thickness_at_all():
     gaussians.log_scales[20:30] = -100.0
     assert_close(compare(gaussians, camera), image=3e-6, gradient=1e-5)
     # Anti-aliasing makes what has no area invisible, with no gradient rather than one of 0 / 0.
-    engine = Engine()
+    engine = rasteriser_for()
     image = engine.forward(gaussians, camera, antialias=True).image
     assert not engine.visible[10:30].any()
     assert engine.visible[30:].any()
@@ -128,7 +127,7 @@ def test_what_saturated_pixels_hide_has_no_gradient():
     assert_close(result, image=3e-6, gradient=1e-5)
     assert (result.alpha > 1 - 1.5e-4).any()
     assert (result.alpha < 0.5).any()
-    engine = Engine()
+    engine = rasteriser_for()
     image = engine.forward(gaussians, camera).image
     gradients = engine.backward(torch.ones_like(image))
     assert engine.visible[hidden].all()
@@ -154,7 +153,7 @@ def test_weight_zero_gives_exactly_no_gradient_and_weight_one_that_of_no_weight(
     camera = make_camera()
     gaussians = make_gaussians(camera, 60)
     target = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(1))
-    engine = Engine()
+    engine = rasteriser_for()
     image = engine.forward(gaussians, camera, background=BACKGROUND).image
 
     def gradients(**weight: float) -> Gaussians:
@@ -183,14 +182,14 @@ def test_training_on_every_hard_case_at_once_stays_finite():
     scene = join(odd, needles, far)
     target = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(1))
     moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
-    engine = Engine()
+    engine = rasteriser_for()
     for step in range(1, 21):
         image = engine.forward(scene, camera, antialias=step % 2 == 0).image
         loss = photometric_loss(image, target, ssim_lambda=0.2)
         assert np.isfinite(loss.loss)
         for name, gradient in engine.backward(loss.grad_image).tensors().items():
             assert gradient.isfinite().all(), (step, name)
-            adam_step(getattr(scene, name), gradient, *moments[name], step=step, lr=1e-2)
+            adam_step(AdamStep(getattr(scene, name), gradient, *moments[name], step, 1e-2))
             assert getattr(scene, name).isfinite().all(), (step, name)
 
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F  # noqa: N812  # torch's own name for it
 
 from cleargs.errors import InputError
 from cleargs.formation.exposure import affine_backward, apply_affine
-from cleargs.splat.adam import adam_step
-from cleargs.splat.losses import photometric_loss, psnr
+from cleargs.splat.backend import adam_step, photometric_loss, psnr
+from cleargs.splat.types import AdamStep
 
 
 def images(height: int, width: int, noise: float = 0.2, seed: int = 0):
@@ -158,7 +158,7 @@ def test_adam_equals_torch(shape):
         gradient[0] = 0.0
         theirs.grad = gradient.double()
         optimiser.step()
-        adam_step(mine, gradient, first, second, step=step, lr=1e-2)
+        adam_step(AdamStep(mine, gradient, first, second, step, 1e-2))
     # Seven updates of 1e-2 on numbers up to 4: rounding of the parameter itself, 2.4e-7 each time.
     assert (mine - theirs).abs().max() < 2e-6
     assert torch.equal(mine[0], start[0])
@@ -169,13 +169,13 @@ def test_adam_takes_a_rate_per_column():
     start, gradient = (torch.randn(700, 4, 3, generator=generator) for _ in range(2))
     rates = torch.linspace(0.001, 0.012, 12)
     mine, first, second = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
-    adam_step(mine, gradient, first, second, step=1, lr=rates)
+    adam_step(AdamStep(mine, gradient, first, second, 1, rates))
     # The first step of Adam moves by the rate, against the sign of the gradient.
     torch.testing.assert_close(start - mine, gradient.sign() * rates.reshape(4, 3), rtol=1e-4, atol=1e-6)
     with pytest.raises(InputError, match="learning rates"):
-        adam_step(mine, gradient, first, second, step=1, lr=torch.ones(5))
+        adam_step(AdamStep(mine, gradient, first, second, 1, torch.ones(5)))
     with pytest.raises(InputError, match="Adam got"):
-        adam_step(mine, gradient[:5], first, second, step=1, lr=0.1)
+        adam_step(AdamStep(mine, gradient[:5], first, second, 1, 0.1))
 
 
 def test_exposure_equals_autograd():

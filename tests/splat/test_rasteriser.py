@@ -14,8 +14,8 @@ import torch
 from splat_scenes import BACKGROUND, compare, leaves, make_camera, make_gaussians
 
 from cleargs.errors import InputError, StageError
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.render import render
@@ -125,7 +125,7 @@ def test_behind_and_across_the_near_plane():
     # Splats centred 0.011 in front span thousands of pixels and hide most of the image; the few pixels left
     # make the largest gradient small beside the terms that it is the sum of (measured: 1e-5).
     assert_close(result, image=1e-5, gradient=3e-5)
-    engine = Engine()
+    engine = rasteriser_for()
     engine.forward(gaussians, camera)
     assert engine.visible[:7].tolist() == [False, False, False, False, True, True, True]
     assert not engine.visible[:4].any()
@@ -220,7 +220,7 @@ def test_a_splat_that_is_not_finite_is_culled(name, value):
     gaussians = make_gaussians(camera, 30)
     others = gaussians.select(torch.arange(30) != 7)
     getattr(gaussians, name)[7] = value
-    engine = Engine()
+    engine = rasteriser_for()
     image = engine.forward(gaussians, camera, background=BACKGROUND).image.clone()
     gradients = engine.backward(torch.ones_like(image))
     assert image.isfinite().all()
@@ -236,7 +236,7 @@ def test_too_many_pairs_is_an_error_before_allocation():
     gaussians = make_gaussians(camera, 2000)
     gaussians.log_scales[:] = 6.0
     with pytest.raises(StageError, match="pairs"):
-        Engine().forward(gaussians, camera)
+        rasteriser_for().forward(gaussians, camera)
 
 
 def test_gradients_of_two_views_do_not_disturb_each_other():
@@ -264,7 +264,7 @@ def test_backward_twice_through_one_render():
 def test_engine_agrees_with_render_and_reuses_its_buffers():
     camera = make_camera()
     gaussians = make_gaussians(camera, 60)
-    engine = Engine()
+    engine = rasteriser_for()
     first = engine.forward(gaussians, camera, background=BACKGROUND)
     address = first.image.data_ptr()
     assert first.depth is None
@@ -303,7 +303,7 @@ def test_errors():
     with pytest.raises(InputError, match="meta"):
         render(gaussians.to("meta"), camera)
     with pytest.raises(InputError, match="float32"):
-        Engine().forward(leaves(gaussians, torch.float64), camera)
+        rasteriser_for().forward(leaves(gaussians, torch.float64), camera)
     with pytest.raises(InputError, match="rotations"):
         Gaussians(**{**gaussians.tensors(), "rotations": torch.zeros(3, 3)})
     with pytest.raises(InputError, match="coefficients"):

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import triton
@@ -24,19 +23,11 @@ from torch import Tensor
 from cleargs.splat import constants
 from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.support import memory_errors
+from cleargs.splat.types import Reading
 
 ROWS = 4
 COLUMNS = 128
 """Rows and values of a row that a program treats."""
-
-
-class Reading(NamedTuple):
-    """What was measured, as numbers."""
-
-    loss: float
-    l1: float
-    ssim: float
-    psnr: float
 
 
 def reading(totals: Sequence[float], *, ssim_lambda: float, weight: float) -> Reading:
@@ -250,7 +241,7 @@ class Meter:
         weight: float,
         gradient: Tensor,
     ) -> None:
-        """Write the gradient of a step's loss (see ``losses.photometric_loss``) and keep its sums."""
+        """Write the gradient of a step's loss (see ``backend.photometric_loss``) and keep its sums."""
         totals = self._photometer(
             image,
             target,
