@@ -14,10 +14,9 @@ from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
-from cleargs.formation.photograph import evaluate_views, photograph, pooled_unseen
+from cleargs.formation.photograph import FormedView, evaluate_views, photograph, pooled_unseen
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.formation.undo import undo
-from cleargs.formation.view import FormedView
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
