@@ -21,8 +21,7 @@ from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.progress import Task
 from cleargs.splat.backend import rasteriser_for
-from cleargs.splat.camera import Camera
-from cleargs.splat.cameras_json import cameras_json
+from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 

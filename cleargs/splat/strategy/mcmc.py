@@ -23,10 +23,6 @@ from cleargs.splat.config import TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.types import Moments
 
-LOOKS = 5
-"""Steps before a refinement whose errors say what is to grow, one frame each. Where refinements follow each
-other within eight times as many steps there are fewer, since each costs a backward pass."""
-
 
 class MCMC:
     """Change the number and the places of the Gaussians of a training, of which there may be ``budget``.
@@ -41,19 +37,6 @@ class MCMC:
         self._seed = tuple(seed)
         self._errors: Tensor | None = None  # [N]
 
-    def wants_errors(self, step: int) -> bool:
-        """Return whether `add_errors` is to be called in this step: in the last ones up to a refinement.
-
-        It costs the step another backward pass.
-        """
-        config = self._config
-        interval = config.refine_interval
-        refined = -(-step // interval) * interval
-        return (
-            refined - step < min(LOOKS, max(1, interval // 8))
-            and config.refine_start * config.planned <= refined <= config.refine_stop * config.planned
-        )
-
     def add_errors(self, errors: Tensor) -> None:
         """Add what each Gaussian contributes to squared errors of this step's frame: [N], at least 0.
 
@@ -65,8 +48,7 @@ class MCMC:
     def refine(self, gaussians: Gaussians, moments: Moments, step: int) -> tuple[Gaussians, Moments]:
         """Cut what takes part in errors; without any there is nothing to do.
 
-        Called every ``refine_interval`` steps between ``refine_start`` and ``refine_stop``. Returns the
-        Gaussians to continue with and their moments; those given must not be used again.
+        Returns the Gaussians to continue with and their moments; those given must not be used again.
         """
         errors, self._errors = self._errors, None
         if errors is None:

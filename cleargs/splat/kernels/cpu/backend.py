@@ -110,9 +110,13 @@ def adam_step(step: AdamStep) -> None:
     rates = np.asarray(step.rate, np.float64).reshape(-1)
     beta1, beta2 = step.betas
     corrected = np.broadcast_to(rates / (1.0 - beta1**number), (columns,)).astype(np.float32)
+    parameter, gradient, first, second = (tensor.detach().view(-1).numpy() for tensor in step.tensors)
     with launch.exclusive():
         adam.adam(
-            *(tensor.detach().view(-1).numpy() for tensor in step.tensors),
+            parameter,
+            gradient,
+            first,
+            second,
             np.tile(corrected, max(1, ADAM_BLOCK // columns)),
             np.float32(beta1),
             np.float32(beta2),

@@ -32,9 +32,12 @@ class Frame(rasteriser.Frame):
     last: Floats  # [H, W]
 
 
-def read_parameters(gaussians: Gaussians) -> list[Array]:
+def read_parameters(gaussians: Gaussians) -> tuple[Array, Array, Array, Array, Array]:
     """Views of the five parameters in the order in which the kernels take them."""
-    return [tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values()]
+    means, log_scales, rotations, logits, sh = (
+        tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values()
+    )
+    return means, log_scales, rotations, logits, sh
 
 
 class CpuRasteriser(rasteriser.Rasteriser):
