@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import make_camera, make_gaussians
-from warp_oracle import ALL, LONG, ROLLED
+from helpers.splat_scenes import make_camera, make_gaussians
+from helpers.warp_oracle import ALL, LONG, ROLLED
 
 from cleargs.formation.warp import Warp, displacement_fields
 from cleargs.splat.backend import rasteriser_for

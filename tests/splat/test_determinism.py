@@ -12,7 +12,7 @@ import pytest
 PROGRAM = """
 import hashlib, sys
 import torch
-from splat_scenes import make_camera, make_gaussians
+from helpers.splat_scenes import make_camera, make_gaussians
 from cleargs.splat.backend import adam_step, photometric_loss, psnr, rasteriser_for
 from cleargs.formation.exposure import affine_backward
 from cleargs.splat.kernels.runtime import set_threads
@@ -65,7 +65,7 @@ def test_training_steps_are_bitwise_equal_for_1_2_and_16_threads_and_for_two_run
 
 PROJECTION = """
 import hashlib
-from splat_scenes import make_camera, make_gaussians
+from helpers.splat_scenes import make_camera, make_gaussians
 from test_projection import project
 
 camera = make_camera()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from splat_scenes import make_camera, make_gaussians
+from helpers.splat_scenes import make_camera, make_gaussians
 
 from cleargs.errors import StageError
 from cleargs.splat.backend import rasteriser_for

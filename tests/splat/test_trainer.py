@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
+from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
 
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
