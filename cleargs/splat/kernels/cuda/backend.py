@@ -19,7 +19,7 @@ from cleargs.splat.kernels.cuda.frame_warp import expose as expose
 from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
 from cleargs.splat.kernels.cuda.frame_warp import through_curve as through_curve
 from cleargs.splat.kernels.cuda.frame_warp import times_slope as times_slope
-from cleargs.splat.kernels.cuda.loss import Meter, Photometer, reading
+from cleargs.splat.kernels.cuda.loss import Meter
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.types import PhotometricLoss
 
@@ -43,15 +43,9 @@ def photometric_loss(
     mask: Tensor | None,
     gradient: Tensor,
 ) -> PhotometricLoss:
-    totals = Photometer()(
-        image,
-        target,
-        mask,
-        l1_weight=weight * (1.0 - ssim_lambda),
-        ssim_weight=-weight * ssim_lambda,
-        gradient=gradient,
-    )
-    read = reading(totals.tolist(), ssim_lambda=ssim_lambda, weight=weight)
+    meter = Meter(ssim_lambda)
+    meter.add(0, image, target, mask, weight=weight, gradient=gradient)
+    ((_, read),) = meter.take()
     return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
 
 
