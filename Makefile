@@ -71,7 +71,7 @@ fuzz: .venv/test.stamp
 	CLEARGS_FUZZ=2000 $(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-seed=$(or $(SEED),0)
 
 test-gpu-kernels: .venv/cuda.stamp
-	TRITON_INTERPRET=1 $(BIN)/python -m pytest tests/gpu
+	TRITON_INTERPRET=1 $(BIN)/python -m pytest -m gpu tests/gpu tests/splat tests/formation
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from cleargs.rivr.restoring import Deblurred
     from cleargs.splat.camera import Camera
     from cleargs.splat.config import G0Config, TrainConfig
-    from cleargs.splat.engine import Render
     from cleargs.splat.formation import Formation
     from cleargs.splat.scene import Scene
     from cleargs.splat.trainer import Trained
+    from cleargs.splat.types import Render
     from cleargs.splat.views import View
 
     Image = NDArray[np.uint8] | NDArray[np.float32]

@@ -160,9 +160,7 @@ class _OpenRasteriser(CudaRasteriser):
 def count_pairs(gaussians: Gaussians, camera: Camera, device: torch.device) -> tuple[int, int]:
     """(tile, splat) pairs of a view, and those before every pixel of their tile has stopped."""
     rasteriser = _OpenRasteriser(device)
-    rasteriser.forward(
-        gaussians, camera, sh_count=1, background=(0.0, 0.0, 0.0), antialias=False, depth=False
-    )
+    rasteriser.forward(gaussians, camera)
     return rasteriser.work
 
 

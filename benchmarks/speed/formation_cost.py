@@ -24,7 +24,7 @@ from benchmarks.speed.random_scenes import surface_scene
 from benchmarks.speed.timing import Quartiles, ratio, take_turns
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
-from cleargs.formation.view import FormedView
+from cleargs.formation.photograph import FormedView
 from cleargs.formation.warp import (
     displacement_fields,
     linear_curve,
@@ -33,10 +33,10 @@ from cleargs.formation.warp import (
     times_slope,
 )
 from cleargs.progress import Reporter
+from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.losses import psnr
+from cleargs.splat.kernels.rasteriser import Rasteriser
 
 PLAIN, FORMED = "sharp render", "formation"
 """A step that takes the frame for sharp, and one through `cleargs.formation`."""
@@ -155,7 +155,7 @@ def _ways(
 def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
     """The exposure [H, W, 3] as the mean of many renders along the true path, sRGB."""
     motion = motion_of(length, _median_depth(gaussians, camera))
-    engine, total = Engine(), np.zeros((camera.height, camera.width, 3))
+    engine, total = rasteriser_for(), np.zeros((camera.height, camera.width, 3))
     poses = poses_along(camera, motion, max(9, round(TRUTH_PER_PIXEL * length)))
     for pose in poses:
         total += through_curve(engine.forward(gaussians, pose).image, linear_curve(CPU))[0].numpy()
@@ -163,10 +163,10 @@ def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _median_depth(gaussians: Gaussians, camera: Camera) -> float:
-    return float(np.median(_depth(Engine(), gaussians, camera)))
+    return float(np.median(_depth(rasteriser_for(), gaussians, camera)))
 
 
-def _depth(engine: Engine, gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
+def _depth(engine: Rasteriser, gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
     rendered = engine.forward(gaussians, camera, depth=True)
     assert rendered.depth is not None
     depth: NDArray[np.float32] = rendered.depth.numpy() / np.maximum(rendered.alpha.numpy(), 1e-3)
@@ -197,7 +197,7 @@ class _MeanOfRenders(Iteration):
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion, count: int) -> None:
         super().__init__(gaussians, camera)
         self._poses = poses_along(camera, motion, count)
-        self._engines = [Engine() for _ in self._poses]
+        self._engines = [rasteriser_for() for _ in self._poses]
 
     def image(self) -> Tensor:
         total = torch.zeros(self.camera.height, self.camera.width, 3)

@@ -8,13 +8,12 @@ from torch import Tensor
 from benchmarks.speed.probe import timed_kernels
 from benchmarks.speed.random_scenes import random_image
 from benchmarks.speed.timing import Clock
-from cleargs.splat.adam import Moments, step_gaussians
+from cleargs.splat.backend import photometric_loss, rasteriser_for, step_gaussians
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
 from cleargs.splat.kernels.runtime import set_threads
-from cleargs.splat.losses import photometric_loss
+from cleargs.splat.types import Moments
 
 PARTS = ("forward", "loss", "backward", "adam")
 WHOLE = "iteration"
@@ -37,7 +36,7 @@ class Iteration:
     def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device | str = "cpu") -> None:
         self.gaussians = gaussians.to(device)
         self.camera = camera
-        self.engine = Engine(device)
+        self.engine = rasteriser_for(device)
         self._target = random_image(camera.width, camera.height).to(device)
         self._slope = torch.empty_like(self._target)
         self._moments = Moments.zeros(self.gaussians)
@@ -100,7 +99,5 @@ class _OpenRasteriser(CpuRasteriser):
 def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
     """Packed splats, (tile, splat) pairs and each pixel's last contributor of a view (SH degree 3)."""
     rasteriser = _OpenRasteriser()
-    rasteriser.forward(
-        gaussians, camera, sh_count=16, background=(0.0, 0.0, 0.0), antialias=False, depth=False
-    )
+    rasteriser.forward(gaussians, camera)
     return rasteriser.frame

@@ -110,9 +110,9 @@ def export(
     from cleargs.capture.model import moved, read_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
-    from cleargs.splat.cameras_json import cameras_json
+    from cleargs.splat.camera import cameras_json
     from cleargs.splat.ply import read_ply
-    from cleargs.splat.similarity import transform_scene
+    from cleargs.splat.transforms import transform_scene
     from cleargs.splat.views import view_of
 
     ingest = run / dag.names[0]
@@ -122,7 +122,7 @@ def export(
     if world == "input":
         similarity = _similarity(run, dag.names[0])
     elif up is not None:
-        from cleargs.splat.upright import upright
+        from cleargs.splat.transforms import upright
 
         similarity = upright(named[0][1], up)
 

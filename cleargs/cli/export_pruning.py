@@ -18,7 +18,7 @@ from cleargs.formation.photograph import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
-from cleargs.splat.engine import Engine
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.pruning import central_box, contributions, inside
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import View, real_views
@@ -88,7 +88,7 @@ def _psnr(scene: Scene, views: Sequence[View], folder: Path, seen: Callable[[], 
     """Mean over ``views``, through the exposure and the motion that the stage in ``folder`` found, dB."""
     exposure = read_exposure(folder / "exposure.parquet")
     formations, _ = read_formation(folder / "formation.parquet")
-    engine, values = Engine(), []
+    engine, values = rasteriser_for(), []
     for view in views:
         (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)
         values.append(fit.psnr)

@@ -29,8 +29,8 @@ from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.progress import Reporter
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
@@ -137,7 +137,7 @@ class _Renderer:
 
     def __init__(self, scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> None:
         self._scene = scene
-        self._engine = Engine(scene.gaussians.device)
+        self._engine = rasteriser_for(scene.gaussians.device)
         self._steps = refine_steps
         self._points = points
 

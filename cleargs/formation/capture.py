@@ -20,9 +20,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import NUMBERS, FrameFormation, explain, packed, unpacked
-from cleargs.formation.unexplained import Doubt
-from cleargs.formation.view import FormedView
-from cleargs.splat.camera import Camera
+from cleargs.formation.photograph import Doubt, FormedView
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.views import View
@@ -120,26 +118,42 @@ class CaptureFormation:
         render: Renderer,
     ) -> FormedView | None:
         """See `cleargs.splat.formation.Formation`."""
-        camera = view.camera.scaled(factor)
+        frame_id, camera = view.frame_id, view.camera.scaled(factor)
         affines = self._affines
-        affine = None if affines is None else affines.affine(view.frame_id)
+        affine = None if affines is None else affines.affine(frame_id)
+
+        def explained() -> FrameFormation:
+            """How the frame was taken, in the light of the scene as it is."""
+            frame = self._frames[frame_id]
+            return explain(
+                frame,
+                self._config,
+                camera,
+                affine,
+                target,
+                mask,
+                render,
+                factor=factor,
+                warm=(frame.draws // self._config.every) % SEARCH_EVERY != 0,
+                rolling=self._rolls(),
+                test_rolling=frame_id in self._tested,
+            )
+
         begun = progress >= self._config.start
         searched = self._config.enabled and view.kind == "real"
         if searched and not begun:
-            if progress >= ROLLING_START and self._untested(view.frame_id) and not self._rolls():
-                gain = self._explained(view.frame_id, factor, camera, affine, target, mask, render).skew_gain
-                self._frames[view.frame_id] = replace(self._frames[view.frame_id], skew_gain=gain)
+            if progress >= ROLLING_START and self._untested(frame_id) and not self._rolls():
+                gain = explained().skew_gain
+                self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
             searched = self._rolls()
-        if searched and self._due(view.frame_id):
-            self._frames[view.frame_id] = self._explained(
-                view.frame_id, factor, camera, affine, target, mask, render
-            )
+        if searched and self._due(frame_id):
+            self._frames[frame_id] = explained()
         weight = view.weight
         motion = None
         if searched:
-            frame = self._frames[view.frame_id]
-            self._frames[view.frame_id] = replace(frame, draws=frame.draws + 1)
-            weight = self.weight(view.frame_id)
+            frame = self._frames[frame_id]
+            self._frames[frame_id] = replace(frame, draws=frame.draws + 1)
+            weight = self.weight(frame_id)
             if frame.model != "none":
                 motion = frame
         doubt = None
@@ -150,7 +164,7 @@ class CaptureFormation:
         return FormedView(
             camera,
             weight,
-            frame_id=view.frame_id,
+            frame_id=frame_id,
             affine=affine,
             affines=affines,
             formation=motion,
@@ -199,33 +213,6 @@ class CaptureFormation:
 
     def _untested(self, frame_id: int) -> bool:
         return frame_id in self._tested and self._frames[frame_id].skew_gain is None
-
-    def _explained(
-        self,
-        frame_id: int,
-        factor: float,
-        camera: Camera,
-        affine: Tensor | None,
-        target: Tensor,
-        mask: Tensor | None,
-        render: Renderer,
-    ) -> FrameFormation:
-        """How the frame was taken, in the light of the scene as it is."""
-        frame = self._frames[frame_id]
-        again = (frame.draws // self._config.every) % SEARCH_EVERY != 0
-        return explain(
-            frame,
-            self._config,
-            camera,
-            affine,
-            target,
-            mask,
-            render,
-            factor=factor,
-            warm=again,
-            rolling=self._rolls(),
-            test_rolling=frame_id in self._tested,
-        )
 
 
 def _tested_frames(count: int) -> list[int]:

@@ -9,30 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.formation.comparison import Explanation, Sight, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model
-from cleargs.formation.search import (
-    Explanation,
-    Sight,
-    explained_share,
-    luminance,
-    preferred,
-    refine,
-    search,
-)
+from cleargs.formation.search import preferred, refine, search
 from cleargs.formation.warp import displacement_fields
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
-from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
 from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.splat.types import Render
 
 MARGIN_STEP = 4
 """Margins are multiples of this, px."""
 MARGIN_SHARE = 0.25
 """Largest margin, as a share of the shorter side."""
 
-NUMBERS = 3 + 3 * TWIST + 3 + 2 + 4 + 1
+LENS = ("disc_px", "focus", "median_depth")
+MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
+"""Numbers of a frame's motion beyond its twists, and of the frame, as checkpoints and tables hold them."""
+
+NUMBERS = 3 + 3 * TWIST + len(LENS) + len(MEASURED) + 1
 """How many numbers of a frame a checkpoint holds."""
 
 
@@ -44,7 +41,7 @@ class FrameFormation:
     motion: FrameMotion = field(default_factory=FrameMotion)
     model: Model = "none"
     misfit: float = 0.0
-    """Mean difference of high-passed linear luminance that the model leaves, see `search.Explanation`."""
+    """Mean difference of high-passed linear luminance that the model leaves, see `comparison.Explanation`."""
     misfit_still: float = 0.0
     blur_px: float = 0.0
     """Mean length of the pixels' paths while they were exposed."""
@@ -148,7 +145,7 @@ def widened(camera: Camera, margin: int) -> Camera:
 def sight_of(
     rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
 ) -> Sight:
-    """What `search` compares: masked pixels of the frame show the render."""
+    """What a search compares: masked pixels of the frame show the render."""
     assert rendered.depth is not None
     image = rendered.image if affine is None else apply_affine(rendered.image, affine)
     shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
@@ -218,33 +215,22 @@ def _search_margin(camera: Camera) -> int:
 
 
 def packed(frame: FrameFormation) -> NDArray[np.float64]:
-    motion = frame.motion
-    return np.concatenate(
-        [
-            [frame.frame_id, MODELS.index(frame.model), frame.draws],
-            motion.vector,
-            [motion.disc_px, motion.focus, motion.median_depth],
-            [frame.misfit, frame.misfit_still],
-            [frame.blur_px, frame.skew_px, frame.defocus_px, frame.reach_px],
-            [-1.0 if frame.skew_gain is None else frame.skew_gain],
-        ]
-    )
+    """Return the numbers of a frame for a checkpoint, `NUMBERS` in all."""
+    gain = -1.0 if frame.skew_gain is None else frame.skew_gain
+    head = [frame.frame_id, MODELS.index(frame.model), frame.draws]
+    rest = [getattr(frame.motion, name) for name in LENS] + [getattr(frame, name) for name in MEASURED]
+    return np.concatenate([head, frame.motion.vector, [*rest, gain]])
 
 
 def unpacked(row: NDArray[np.float64]) -> FrameFormation:
+    """Return the frame of which `packed` gave these numbers."""
     frame_id, model, draws = (int(value) for value in row[:3])
     vector, rest = row[3 : 3 + 3 * TWIST], [float(value) for value in row[3 + 3 * TWIST :]]
-    disc_px, focus, median_depth, misfit, misfit_still, blur_px, skew_px, defocus_px, reach_px, gain = rest
     return FrameFormation(
         frame_id,
-        FrameMotion(disc_px=disc_px, focus=focus, median_depth=median_depth).with_vector(vector),
+        FrameMotion(**dict(zip(LENS, rest, strict=False))).with_vector(vector),
         MODELS[model],
-        misfit,
-        misfit_still,
-        blur_px,
-        skew_px,
-        defocus_px,
-        reach_px,
-        gain if gain >= 0.0 else None,
-        draws,
+        skew_gain=rest[-1] if rest[-1] >= 0.0 else None,
+        draws=draws,
+        **dict(zip(MEASURED, rest[len(LENS) : -1], strict=True)),
     )

@@ -1,22 +1,141 @@
-"""What a finished scene shows at a frame: sharp, and as the frame's camera saw it."""
+"""A render as the camera of a frame saw it, the way back of its gradient, and how well it fits the frame."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
-from cleargs.formation.exposure import Exposure
-from cleargs.formation.frame import FrameFormation
-from cleargs.formation.view import FormedView
-from cleargs.splat.engine import Engine
-from cleargs.splat.losses import psnr
+from cleargs.formation.exposure import AffineOptimiser, Exposure, affine_backward, apply_affine
+from cleargs.formation.frame import FrameFormation, margin_for, widened
+from cleargs.formation.warp import (
+    Warp,
+    displacement_fields,
+    linear_curve,
+    srgb_curve,
+    through_curve,
+    times_slope,
+)
+from cleargs.splat.backend import psnr, rasteriser_for
+from cleargs.splat.camera import Camera
+from cleargs.splat.kernels.rasteriser import Rasteriser
+from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.splat.scene import Scene
+from cleargs.splat.types import Render
 from cleargs.splat.views import ImageCache, View, unseen_pixels
+
+CELLS = 24
+"""Cells along the longer side of a frame. Over a cell, detail that is missing or lies a little beside its
+place cancels out; what does not belong to the scene does not."""
+
+ORDINARY = 5.0
+"""Multiple of the frame's median difference that is an ordinary one still: where all of a frame differs, as
+with an exposure that is not known yet, nothing moves."""
+
+NONE = 1e-6
+"""Difference, and share of the pixels, that stands for none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """What a frame must be explained as, and how well, lest its pixels count less."""
+
+    target: Tensor
+    """The frame as taken, [H, W, 3] sRGB."""
+    mask: Tensor | None
+    """[H, W], True counts."""
+    tolerance: float
+    """Difference in sRGB, of [0, 1], up to which every pixel counts."""
+
+    def counts(self, photograph: Tensor) -> Tensor:
+        """How much each pixel counts, [H, W] in (0, 1], where the scene gives ``photograph`` [H, W, 3] sRGB.
+
+            w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
+
+        r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
+        rho, w is 1 to the bit. Differences are pooled as in Sabour et al., "RobustNeRF" (2023).
+        """
+        height, width = photograph.shape[:2]
+        per_pixel = CELLS / max(height, width)
+        cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
+        counted = torch.ones_like(photograph[..., 0]) if self.mask is None else self.mask.float()
+        difference = (photograph - self.target).permute(2, 0, 1) * counted
+        shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
+        unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
+        ordinary = (ORDINARY * unexplained.median()).clamp_min(self.tolerance)
+        here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
+        return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
+
+
+@dataclass(eq=False)
+class FormedView:
+    """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
+
+    With a ``doubt``, pixels that stay unexplained teach less.
+    """
+
+    camera: Camera
+    weight: float
+    frame_id: int = -1
+    affine: Tensor | None = None
+    affines: AffineOptimiser | None = None
+    formation: FrameFormation | None = None
+    factor: float = 1.0
+    doubt: Doubt | None = None
+
+    def __post_init__(self) -> None:
+        self._photo = self.camera
+        self._margin = 0
+        if self.formation is not None:
+            self._margin = margin_for(self.formation.reach_px * self.factor, self._photo)
+            self.camera = widened(self._photo, self._margin)
+        self.needs_depth = self.formation is not None
+
+    def forward(self, render: Render) -> Tensor:
+        photograph = self._photograph(render)
+        if self.doubt is not None:
+            self._counts = self.doubt.counts(photograph)
+        return photograph
+
+    def _photograph(self, render: Render) -> Tensor:
+        image = render.image
+        if self.affine is not None:
+            self._rendered = render.image
+            image = apply_affine(image, self.affine)
+        if self.formation is None:
+            return image
+        self._warp = self.warp(render)
+        linear, self._to_linear = through_curve(image, linear_curve(image.device), CHANNELS)
+        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(image.device))
+        return photograph
+
+    def warp(self, render: Render) -> Warp:
+        """B of the frame, from a render at ``camera`` with depth."""
+        assert self.formation is not None and render.depth is not None
+        fields = displacement_fields(
+            self.formation.motion, self._photo, render.depth, render.alpha, self._margin, self.factor
+        )
+        return Warp.of(fields, self._margin)
+
+    def backward(self, gradient: Tensor) -> Tensor:
+        if self.doubt is not None:
+            gradient = gradient * self._counts[..., None]
+        if self.formation is not None:
+            light = times_slope(gradient, self._to_srgb, CHANNELS)
+            gradient = times_slope(self._warp.transpose(light), self._to_linear)
+        if self.affine is not None:
+            gradient, self._affine_gradient = affine_backward(self._rendered, self.affine, gradient)
+        return gradient
+
+    def learn(self) -> None:
+        if self.affines is not None:
+            self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
 
 
 def photograph(
@@ -25,14 +144,14 @@ def photograph(
     exposure: Exposure | None = None,
     formation: FrameFormation | None = None,
     *,
-    engine: Engine | None = None,
+    engine: Rasteriser | None = None,
 ) -> Tensor:
     """What ``scene`` shows at a view: [H, W, 3] sRGB in [0, 1], own memory.
 
     Through the frame's colour affine where ``exposure`` is given, and through its motion and defocus where
     ``formation`` is.
     """
-    engine = engine or Engine(str(scene.gaussians.device))
+    engine = engine or rasteriser_for(str(scene.gaussians.device))
     affine = None if exposure is None else torch.from_numpy(exposure.of(view.frame_id).astype(np.float32))
     moved = formation if formation is not None and formation.model != "none" else None
     formed = FormedView(view.camera, view.weight, affine=affine, formation=moved)
@@ -70,11 +189,11 @@ def evaluate_views(
     exposure: Exposure | None = None,
     formations: Mapping[int, FrameFormation] | None = None,
     *,
-    engine: Engine | None = None,
+    engine: Rasteriser | None = None,
     cache: ImageCache | None = None,
 ) -> list[Fit]:
     """How well the scene shows every view as photographed, in their order, at full size."""
-    engine = engine or Engine(str(scene.gaussians.device))
+    engine = engine or rasteriser_for(str(scene.gaussians.device))
     cache = cache or ImageCache(0, scene.gaussians.device)
     formations = formations or {}
     fits = []

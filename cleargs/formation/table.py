@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.frame import FrameFormation
+from cleargs.formation.frame import LENS, MEASURED, FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.parquet import column, read_table, write_table
 
@@ -89,7 +89,7 @@ def read_formation(path: Path) -> tuple[dict[int, FrameFormation], dict[int, flo
 def _row(frame: FrameFormation, before: float, after: float) -> dict[str, Any]:
     motion = frame.motion
     row = {name: getattr(frame, name) for name in FORMATION.names if hasattr(frame, name)}
-    row |= {name: getattr(motion, name) for name in ("disc_px", "focus", "median_depth")}
+    row |= {name: getattr(motion, name) for name in LENS}
     for name in _TWISTS:
         row |= {f"{name}_{axis}": float(v) for axis, v in zip(_AXES, getattr(motion, name), strict=True)}
     return row | {"weight_before": before, "weight_after": after}
@@ -97,14 +97,11 @@ def _row(frame: FrameFormation, before: float, after: float) -> dict[str, Any]:
 
 def _frame(row: dict[str, Any]) -> FrameFormation:
     twists = np.array([[row[f"{name}_{axis}"] for axis in _AXES] for name in _TWISTS])
-    motion = FrameMotion(disc_px=row["disc_px"], focus=row["focus"], median_depth=row["median_depth"])
-    lengths = {name: row[name] for name in ("blur_px", "skew_px", "defocus_px", "reach_px")}
+    motion = FrameMotion(**{name: row[name] for name in LENS})
     return FrameFormation(
         row["frame_id"],
         motion.with_vector(twists.ravel()),
         row["model"],
-        misfit=row["misfit"],
-        misfit_still=row["misfit_still"],
         skew_gain=row["skew_gain"],
-        **lengths,
+        **{name: row[name] for name in MEASURED},
     )

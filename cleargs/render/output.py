@@ -20,10 +20,10 @@ from cleargs.media.encode import Codec, require_even, write_video
 from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.progress import Task
-from cleargs.splat.camera import Camera
-from cleargs.splat.cameras_json import cameras_json
-from cleargs.splat.engine import Engine, Render
+from cleargs.splat.backend import rasteriser_for
+from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.scene import Scene
+from cleargs.splat.types import Render
 
 Kind = Literal["film", "still", "folder"]
 Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
@@ -49,7 +49,7 @@ class Photographer:
 
     def __init__(self, scene: Scene, device: str = "cpu") -> None:
         self._scene = scene.to(device)
-        self._engine = Engine(device)
+        self._engine = rasteriser_for(device)
 
     def picture(self, shot: Shot) -> Picture:
         """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""

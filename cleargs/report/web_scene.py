@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import view_of
@@ -110,7 +110,7 @@ class Renderer:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._engine = Engine()
+        self._engine = rasteriser_for()
 
     def __call__(
         self, camera: Camera, affine: NDArray[np.float64] | None = None

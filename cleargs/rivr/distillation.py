@@ -14,10 +14,9 @@ from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
 from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
-from cleargs.formation.photograph import evaluate_views, photograph, pooled_unseen
+from cleargs.formation.photograph import FormedView, evaluate_views, photograph, pooled_unseen
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.formation.undo import undo
-from cleargs.formation.view import FormedView
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
@@ -25,14 +24,14 @@ from cleargs.rivr.candidates import Image
 from cleargs.rivr.harm import Fidelity
 from cleargs.rivr.restoring import Deblurred, Explained, observation
 from cleargs.rivr.selection import hide_masked
+from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import DistilConfig, FormationConfig
-from cleargs.splat.engine import Engine, Render
-from cleargs.splat.losses import psnr
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import train
+from cleargs.splat.types import Render
 from cleargs.splat.views import View
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
@@ -51,7 +50,7 @@ class Snapshot:
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
         self.formations, self._weights = read_formation(folder / FORMATION)
-        self._engine = Engine(device)
+        self._engine = rasteriser_for(device)
 
     @property
     def exposure(self) -> Exposure | None:

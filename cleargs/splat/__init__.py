@@ -2,5 +2,5 @@
 
 Nothing heavy is imported here, and Numba only where a CPU kernel is first needed. Start with
 :func:`cleargs.splat.render.render` for a differentiable picture and with
-:class:`cleargs.splat.engine.Engine` for training.
+:class:`cleargs.splat.kernels.rasteriser.Rasteriser` for training.
 """

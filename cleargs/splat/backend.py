@@ -3,55 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.errors import InputError
 from cleargs.plugins import plugin
-from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
+from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.splat.types import AdamStep, Moments, PhotometricLoss, Reading
 
-if TYPE_CHECKING:
-    from cleargs.splat.adam import Moments
-    from cleargs.splat.kernels.cuda.loss import Meter
-    from cleargs.splat.losses import PhotometricLoss
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 
-class Rasteriser(Protocol):
-    """Renders and differentiates views; outputs may be views that the next call overwrites."""
+class Meter(Protocol):
+    """The losses of some steps, kept on a device until they are read together."""
 
-    radii: Tensor
+    def __len__(self) -> int:
+        """Number of steps that wait to be read."""
+        ...
 
-    def forward(
+    def add(
         self,
-        gaussians: Gaussians,
-        camera: Camera,
+        step: int,
+        image: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
         *,
-        sh_count: int,
-        background: tuple[float, float, float],
-        antialias: bool,
-        depth: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]: ...
+        weight: float,
+        gradient: Tensor,
+    ) -> None:
+        """Write the gradient of a step's loss (see `photometric_loss`) and keep its sums."""
+        ...
 
-    def backward(
-        self, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
-    ) -> Gaussians: ...
-
-    def screen_gradients(self) -> Tensor:
-        """dL/d(projected mean) [N, 2] of the last `backward`, by px."""
+    def take(self) -> Sequence[tuple[int, Reading]]:
+        """What waits, by step, and forget it."""
         ...
 
 
 class Backend(Protocol):
     """The kernels of one kind of device; `cleargs.splat.kernels.cpu.backend` and ``cuda.backend`` are two.
 
-    What is called like a function of `cleargs.splat.losses`, ``adam``, `cleargs.formation.exposure` or
-    ``warp`` does what that function says. No sum depends on an order that may change. Tensors lie on the
-    device.
+    What is called like a function of this module, of `cleargs.formation.exposure` or of ``warp`` does what
+    that function says. No sum depends on an order that may change. Tensors lie on the device.
     """
 
     def rasteriser(self, device: torch.device) -> Rasteriser:
@@ -79,18 +79,7 @@ class Backend(Protocol):
         """Keeps the losses of some steps where they are; None where they are known at once."""
         ...
 
-    def adam_step(
-        self,
-        parameter: Tensor,
-        gradient: Tensor,
-        first_moment: Tensor,
-        second_moment: Tensor,
-        *,
-        step: int,
-        lr: float | Tensor,
-        betas: tuple[float, float],
-        eps: float,
-    ) -> None: ...
+    def adam_step(self, step: AdamStep) -> None: ...
 
     def regularise(self, gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
         """Add to the gradients those of opacity * mean(opacity) + scale * mean(scale) (3DGS-MCMC)."""
@@ -107,7 +96,7 @@ class Backend(Protocol):
         min_opacity: float,
         seed: Sequence[int],
     ) -> tuple[Gaussians, Moments]:
-        """A refinement by the rules of `strategy.mcmc`. What is given must not be used again."""
+        """A refinement by `cleargs.splat.strategy.rules`. What is given must not be used again."""
         ...
 
     def add_position_noise(
@@ -143,6 +132,38 @@ class Backend(Protocol):
     def times_slope(self, light: Tensor, slope: Tensor, channels: int) -> Tensor: ...
 
 
+class SearchKernels(Protocol):
+    """What the search for a frame's motion computes with, on arrays of the CPU; the CPU's back end is one."""
+
+    def misfit(
+        self,
+        image: Floats,
+        observed: Floats,
+        weight: Floats,
+        fields: tuple[Floats, Floats, Floats],
+        samples: Floats,
+        limit: float,
+    ) -> float:
+        """The sum of weight * min(|observed - photographed image|, limit), by offset, sweep and radius."""
+        ...
+
+    def normal_equations(
+        self,
+        stack: Floats,
+        observed: Floats,
+        weight: Floats,
+        basis: Floats,
+        down: Floats,
+        offset: Floats,
+        sweep: Floats,
+        times: Floats,
+        outlier: float,
+        active: NDArray[np.int64],
+    ) -> tuple[Doubles, Doubles]:
+        """Matrix [A, A] and right side [A] of the Gauss-Newton equations: see the kernel of the CPU."""
+        ...
+
+
 def backend_for(device: torch.device | str) -> Backend:
     """The kernels for a device. Raises InputError where there are none."""
     device = torch.device(device)
@@ -161,3 +182,89 @@ def backend_for(device: torch.device | str) -> Backend:
         backend: Backend = found.load()
         return backend
     raise InputError(f"there is no {device.type} back end for the splatting kernels", hint="use --device cpu")
+
+
+def search_kernels() -> SearchKernels:
+    """The kernels of the CPU for a search."""
+    from cleargs.splat.kernels.cpu import backend as cpu
+
+    return cpu
+
+
+def rasteriser_for(device: torch.device | str = "cpu") -> Rasteriser:
+    """A rasteriser on a device. Raises InputError where there is none."""
+    return backend_for(device).rasteriser(torch.device(device))
+
+
+def adam_step(step: AdamStep) -> None:
+    """Do a step of Adam, in place."""
+    if step.parameter.numel():
+        backend_for(step.parameter.device).adam_step(step)
+
+
+def step_gaussians(
+    gaussians: Gaussians,
+    gradients: Gaussians,
+    moments: Moments,
+    rates: dict[str, float | Tensor],
+    *,
+    step: int,
+) -> None:
+    """One Adam step of every group in place; ``step`` counts from 1 (bias correction)."""
+    slopes = gradients.tensors()
+    for name, parameter in gaussians.tensors().items():
+        adam_step(
+            AdamStep(parameter, slopes[name], moments.first[name], moments.second[name], step, rates[name])
+        )
+
+
+def photometric_loss(
+    image: Tensor,  # [H, W, 3]
+    target: Tensor,  # [H, W, 3]
+    *,
+    ssim_lambda: float,
+    weight: float = 1.0,
+    mask: Tensor | None = None,  # [H, W] bool, True = counts
+    gradient: Tensor | None = None,  # [H, W, 3] written and returned, where given
+) -> PhotometricLoss:
+    """L1 + D-SSIM of 3DGS and its gradient with respect to ``image``, without autograd.
+
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5 and zero padding, as in the Inria code.
+    Means run over the pixels that ``mask`` keeps. Masked pixels are zero in both images for the
+    windows of SSIM, as are pixels beyond the border, and get no gradient. With nothing kept, or with
+    weight 0, the loss and the gradient are exactly 0.
+
+    Raises:
+        InputError: when shapes or precision do not fit.
+    """
+    _check(image, target, mask)
+    if gradient is None:
+        gradient = torch.empty_like(image, memory_format=torch.contiguous_format, requires_grad=False)
+    return backend_for(image.device).photometric_loss(
+        image, target, ssim_lambda=ssim_lambda, weight=weight, mask=mask, gradient=gradient
+    )
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1; infinite when nothing differs."""
+    _check(image, target, mask)
+    return backend_for(image.device).psnr(image, target, mask)
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape != target.shape:
+        raise InputError(
+            f"images of the shapes {tuple(image.shape)} and {tuple(target.shape)} cannot be compared",
+            hint="both must be [H, W, 3]",
+        )
+    for tensor in (image, target):
+        if tensor.dtype != torch.float32 or tensor.device != image.device:
+            raise InputError(
+                f"an image is {tensor.dtype} on {tensor.device}",
+                hint="give float32 images, both on the CPU or both on one GPU",
+            )
+    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
+        raise InputError(
+            f"the mask is {mask.dtype} with the shape {tuple(mask.shape)}",
+            hint=f"give a bool mask of the shape {tuple(image.shape[:2])}",
+        )

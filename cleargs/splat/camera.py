@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -98,3 +100,31 @@ class Camera:
     def scaled(self, factor: float) -> Camera:
         """The camera of the view resampled by ``factor``, its size rounded to whole pixels (at least 1)."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+
+def cameras_json(
+    cameras: Sequence[tuple[str, Camera]],
+    *,
+    scale: float = 1.0,
+    rotation: npt.NDArray[np.float64] | None = None,  # [3, 3]
+    translation: npt.NDArray[np.float64] | None = None,  # [3]
+) -> list[dict[str, Any]]:
+    """``cameras.json`` in the layout of the Inria code, which viewers import next to a PLY.
+
+    One entry per named camera, moved by x -> scale rotation x + translation: its centre, camera to world.
+    """
+    turn = np.eye(3) if rotation is None else rotation
+    shift = np.zeros(3) if translation is None else translation
+    return [
+        {
+            "id": index,
+            "img_name": name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": (scale * turn @ camera.centre + shift).tolist(),
+            "rotation": (turn @ camera.world_to_camera[:3, :3].T).tolist(),
+            "fy": camera.fy,
+            "fx": camera.fx,
+        }
+        for index, (name, camera) in enumerate(cameras)
+    ]

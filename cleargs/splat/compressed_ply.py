@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
 CHUNK = 256
 """Gaussians that share their ranges."""
 
-_C0 = 0.28209479177387814  # Y_00, the constant spherical harmonic
 LOG_SCALE_MAX = 20.0
 """Log scales beyond this would spoil the range of the others."""
 
@@ -89,7 +89,7 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
     count = gaussians.num
     chunks = -(-count // CHUNK)
     rows = np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0))
-    colours = gaussians.sh.numpy()[:, 0] * np.float32(_C0) + np.float32(0.5)
+    colours = gaussians.sh.numpy()[:, 0] * np.float32(SH_C0) + np.float32(0.5)
     scales = gaussians.log_scales.numpy().clip(-LOG_SCALE_MAX, LOG_SCALE_MAX)
     ranges, places = [], []
     for values in (gaussians.means.numpy(), scales, colours):

@@ -8,7 +8,7 @@ from typing import Protocol
 from torch import Tensor
 
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Render
+from cleargs.splat.types import Render
 from cleargs.splat.views import View
 
 Renderer = Callable[[Camera], Render]

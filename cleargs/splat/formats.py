@@ -20,9 +20,9 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.splat.similarity import transform_scene
 from cleargs.splat.sog import sog
 from cleargs.splat.spz import spz
+from cleargs.splat.transforms import transform_scene
 from cleargs.splat.usd import write_usd
 
 _AS_IS = (1.0, 1.0, 1.0)

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cleargs.splat.constants import SH_C0
 from cleargs.splat.scene import Scene
 
 _NAME = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_C0 = 0.28209479177387814
 
 
 def glb(scene: Scene) -> bytes:
@@ -81,7 +81,7 @@ def _columns(scene: Scene) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]
     sh = gaussians.sh.numpy()
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()[:, None]
     unit = torch.nn.functional.normalize(gaussians.rotations.double(), dim=1).float().numpy()
-    colour = np.concatenate([sh[:, 0] * _C0 + 0.5, alpha], axis=1)
+    colour = np.concatenate([sh[:, 0] * SH_C0 + 0.5, alpha], axis=1)
     columns: dict[str, NDArray[np.float32] | NDArray[np.uint8]] = {
         "POSITION": gaussians.means.numpy(),
         "COLOR_0": np.rint(colour.clip(0, 1) * 255).astype(np.uint8),

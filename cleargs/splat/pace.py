@@ -141,17 +141,16 @@ def _measure() -> float:
     """
     import torch
 
-    from cleargs.splat.adam import Moments, step_gaussians
-    from cleargs.splat.engine import Engine
+    from cleargs.splat.backend import photometric_loss, rasteriser_for, step_gaussians
     from cleargs.splat.kernels.runtime import set_threads
-    from cleargs.splat.losses import photometric_loss
+    from cleargs.splat.types import Moments
 
     set_threads(1)
     torch.set_num_threads(1)
     gaussians, camera = random_scene(SPLATS, WIDTH, HEIGHT)
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     slope = torch.empty_like(target)
-    engine, moments = Engine("cpu"), Moments.zeros(gaussians)
+    engine, moments = rasteriser_for(), Moments.zeros(gaussians)
     rates: dict[str, float | torch.Tensor] = dict.fromkeys(gaussians.tensors(), 0.0)
     times = []
     for step in range(1, REPEATS + 1):

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import SH_C0
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 
@@ -26,7 +26,7 @@ def contributions(scene: Scene, cameras: Iterable[Camera], seen: Callable[[], No
     """
     gaussians = scene.gaussians.detach()
     grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})
-    engine = Engine(gaussians.device)
+    engine = rasteriser_for(gaussians.device)
     most = torch.zeros(gaussians.num, device=gaussians.device)
     for camera in cameras:
         image = engine.forward(grey, camera, antialias=scene.antialias).image

@@ -7,9 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine, Render, sh_count
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.rasteriser import sh_count
+from cleargs.splat.types import Render
 
 
 def render(
@@ -27,7 +29,7 @@ def render(
     SH degree (None: all that is stored). ``antialias`` applies the opacity compensation of Mip-Splatting.
 
     The device of the tensors chooses the kernels; float64 tensors go to the brute-force reference.
-    Every call allocates its own buffers: for training loops use ``Engine``.
+    Every call allocates its own buffers: for training loops use ``Rasteriser``.
 
     Raises:
         InputError: when there is no back end for the device or the SH degree is not stored.
@@ -51,12 +53,12 @@ def render(
 
 
 class _Rasterise(torch.autograd.Function):
-    """Hands ``Engine`` to autograd. Each call has an engine of its own, which keeps its buffers alive."""
+    """Hands ``Rasteriser`` to autograd. Each call has an engine of its own, which keeps its buffers alive."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         *parameters, camera, background, sh_degree, antialias = inputs
-        engine = Engine(parameters[0].device)
+        engine = rasteriser_for(parameters[0].device)
         image, alpha, depth = engine.forward(
             Gaussians(*parameters),
             camera,

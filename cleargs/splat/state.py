@@ -14,8 +14,8 @@ from torch import Tensor
 from cleargs.errors import StoreError
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
-from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.types import Moments
 from cleargs.untrusted import cause
 
 

@@ -1,15 +1,19 @@
-"""The log of a training: one row a step, as arrays while it runs, a table at the end."""
+"""What shows how a training goes: its log, one row per step, and ``preview.png`` next to a checkpoint."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor
 
+from cleargs.files import write_bytes
+from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.views import View
 
@@ -31,6 +35,9 @@ _ROW = np.dtype(
 
 _RECENT = 50
 """Steps that a running mean looks back."""
+
+_SIDE = 640
+"""Longer side of a preview in px, at most."""
 
 
 class TrainLog:
@@ -86,3 +93,15 @@ class TrainLog:
         }
         columns |= {name: rows[name] for name in _ROW.names or () if name != "pseudo"}
         return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)
+
+
+def preview_camera(camera: Camera) -> Camera:
+    """``camera`` reduced to the size of a preview."""
+    return camera.scaled(min(1.0, _SIDE / max(camera.width, camera.height)))
+
+
+def write_preview(path: Path, image: Tensor) -> None:  # [H, W, 3] sRGB
+    """Write ``image`` atomically as a PNG, its values clipped to [0, 1]."""
+    levels = (image.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
+    _, data = cv2.imencode(".png", cv2.cvtColor(levels, cv2.COLOR_RGB2BGR))
+    write_bytes(path, data.tobytes())

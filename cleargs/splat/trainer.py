@@ -1,6 +1,6 @@
 """Optimise a scene against weighted views: the one loop that G0, RIVR and the consolidation share.
 
-No torch autograd: engine forward -> loss and its gradient -> engine backward -> Adam -> densification. All
+No torch autograd: render -> loss and its gradient -> backward pass -> Adam -> densification. All
 randomness is drawn afresh from (seed, stream, step), so that a resumed training is the same training.
 """
 
@@ -22,22 +22,19 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.adam import Moments, step_gaussians
-from cleargs.splat.backend import backend_for
+from cleargs.splat.backend import backend_for, photometric_loss, psnr, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.effort import decided, seconds_by_step
-from cleargs.splat.engine import Engine, Render
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.losses import photometric_loss, psnr
-from cleargs.splat.preview import preview_camera, write_preview
-from cleargs.splat.rates import Rates
 from cleargs.splat.scene import Scene
+from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.strategy.mcmc import MCMC
-from cleargs.splat.train_log import TrainLog
+from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
+from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, View, require_views
 
 _NOTE_INTERVAL = 10
@@ -147,8 +144,9 @@ class Trainer:
         self.length = config.length
         self._seed = tuple(seed)
         self._scene = scene
-        self._engine = Engine(device)
         self._device = torch.device(device)
+        self._backend = backend_for(self._device)
+        self._rasteriser = self._backend.rasteriser(self._device)
         self._gaussians = scene.gaussians.detach().clone().to(self._device)
         if fault := _fault(self._gaussians):
             raise InputError(
@@ -157,12 +155,12 @@ class Trainer:
             )
         self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
         self._before = 0 if moments is None else config.first
-        self._rates = Rates(config, self._gaussians.sh.shape[1], self._device)
+        self._schedule = Schedule(config, self._gaussians.sh.shape[1], self._device)
         assert config.budget is not None  # decided above
         self._strategy = MCMC(config, config.budget, seed)
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._meter = backend_for(self._device).meter(config.ssim_lambda)
+        self._meter = self._backend.meter(config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
@@ -194,7 +192,7 @@ class Trainer:
     def step(self) -> None:
         """One iteration: one view, one Adam step, and what densification is due."""
         config, view, at = self._config, self._view(self.done), self._at
-        factor = config.coarse_factor if at < config.coarse_share * config.planned else 1.0
+        factor = self._schedule.image_factor(at)
         target, mask = self._cache.get(view, factor)
         formed = self._formed(view, factor, target, mask)
         weight = view.weight if formed is None else formed.weight
@@ -204,14 +202,18 @@ class Trainer:
         image = render.image if formed is None else formed.forward(render)
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
-        if config.densify and self._strategy.wants_errors(at + 1):
+        if config.densify and self._schedule.wants_errors(at):
             self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
-        gradients = self._engine.backward(slope if formed is None else formed.backward(slope))
-        backend_for(self._device).regularise(
+        gradients = self._rasteriser.backward(slope if formed is None else formed.backward(slope))
+        self._backend.regularise(
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
         )
         step_gaussians(
-            self._gaussians, gradients, self._moments, self._rates.at(at), step=self._before + self.done + 1
+            self._gaussians,
+            gradients,
+            self._moments,
+            self._schedule.rates(at),
+            step=self._before + self.done + 1,
         )
         if formed is not None:  # last, since it may have to wait for the device
             formed.learn()
@@ -296,7 +298,7 @@ class Trainer:
         return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
 
     def _render(self, camera: Camera, *, depth: bool) -> Render:
-        return self._engine.forward(
+        return self._rasteriser.forward(
             self._gaussians,
             camera,
             sh_degree=self._sh_degree(),
@@ -306,9 +308,7 @@ class Trainer:
         )
 
     def _sh_degree(self) -> int:
-        every = self._config.sh_every * self._config.planned
-        largest = self._gaussians.sh_degree
-        return largest if every == 0 else min(largest, int(self._at / every))
+        return self._schedule.sh_degree(self._at, self._gaussians.sh_degree)
 
     def _measure(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
         """The gradient of the loss by the image; its value goes into the log, from a GPU with some delay."""
@@ -334,7 +334,7 @@ class Trainer:
         error = (image - target).square_().mul_(weight)
         if mask is not None:
             error *= mask[..., None]
-        shares = self._engine.backward(error if formed is None else formed.backward(error))
+        shares = self._rasteriser.backward(error if formed is None else formed.backward(error))
         return shares.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 
     def _read_meter(self) -> None:
@@ -350,12 +350,11 @@ class Trainer:
 
     def _densify(self) -> None:
         """What the strategy does, and its refinement where one is due."""
-        config, at = self._config, self._at
-        between = config.refine_start * config.planned <= at <= config.refine_stop * config.planned
-        if between and at % config.refine_interval == 0:
+        at = self._at
+        if self._schedule.refines(at):
             self.check_finite()  # a refinement takes one whose opacity is NaN for dead, and hides it
             self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, at)
-        self._strategy.after_step(self._gaussians, self._rates.means(at), at)
+        self._strategy.after_step(self._gaussians, self._schedule.rate_of_means(at), at)
 
     def _on_device(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         return {name: tensor.to(self._device) for name, tensor in tensors.items()}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.capture.tables import Frame
 from cleargs.errors import InputError, StageError
 from cleargs.random_streams import Stream
 from cleargs.splat.camera import Camera
@@ -25,6 +24,47 @@ Mask = NDArray[np.bool_]
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 """Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
+
+
+class Frame(Protocol):
+    """What a view needs to know of a frame of ingest; see `cleargs.capture.tables.Frame`."""
+
+    @property
+    def frame_id(self) -> int: ...
+    @property
+    def image(self) -> str: ...
+    @property
+    def mask(self) -> str | None: ...
+    @property
+    def registered(self) -> bool: ...
+    @property
+    def split(self) -> str: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+    @property
+    def qw(self) -> float | None: ...
+    @property
+    def qx(self) -> float | None: ...
+    @property
+    def qy(self) -> float | None: ...
+    @property
+    def qz(self) -> float | None: ...
+    @property
+    def tx(self) -> float | None: ...
+    @property
+    def ty(self) -> float | None: ...
+    @property
+    def tz(self) -> float | None: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError, StoreError
 from cleargs.media.colour import linear_from_srgb
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import view_of
@@ -41,7 +41,7 @@ class SplatWorld:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._engine = Engine()
+        self._engine = rasteriser_for()
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
         """The mean over the samples. Off the optical axis the principal point moves with the lens, so that

@@ -21,7 +21,7 @@ from benchmarks.speed.formation_cost import (
 )
 from benchmarks.speed.random_scenes import surface_scene
 from cleargs.progress import SilentReporter
-from cleargs.splat.engine import Engine
+from cleargs.splat.backend import rasteriser_for
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_the_path_is_centred_on_the_pose() -> None:
     np.testing.assert_allclose(middle.world_to_camera, camera.world_to_camera, atol=1e-12)
     first, last = poses_along(camera, motion, 2)
     assert not np.allclose(first.world_to_camera, last.world_to_camera)
-    assert Engine().forward(gaussians, first).image.isfinite().all()
+    assert rasteriser_for().forward(gaussians, first).image.isfinite().all()
 
 
 @pytest.mark.slow

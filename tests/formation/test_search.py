@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from photographs import (
+from helpers.photographs import (
     CAMERA,
     HEIGHT,
     MEDIAN,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from photographs import ALPHA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall_fields
+from helpers.photographs import ALPHA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall_fields
 
 from cleargs.formation import undo as module
 from cleargs.formation.motion import FrameMotion

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.unexplained import Doubt
+from cleargs.formation.photograph import Doubt
 
 HEIGHT, WIDTH = 108, 192
 TOLERANCE = 0.05

@@ -55,15 +55,15 @@ if wanted bench; then
   gsplat_build=$!
 fi
 
-step tests 400 "$python" -m pytest tests/gpu --deselect tests/gpu/test_gpu_against_cpu.py
+step tests 400 "$python" -m pytest -m gpu tests/gpu tests/splat tests/formation --deselect tests/gpu/test_gpu_against_cpu.py
 step agreement 300 "$python" -m pytest tests/gpu/test_gpu_against_cpu.py
 # Under memcheck: forward and backward pass, several chunks a tile, pixels that stop; the frame warp beyond borders.
 if ! wanted sanitizer; then
   :
 elif command -v compute-sanitizer >/dev/null; then
   step sanitizer 300 compute-sanitizer --tool memcheck --error-exitcode 9 \
-    "$python" -m pytest tests/gpu/test_gpu_rasteriser.py tests/gpu/test_gpu_frame_warp.py \
-    -k "ordinary or chunks or near_plane or oracle_and_cpu"
+    "$python" -m pytest -m gpu tests/splat/test_rasteriser.py tests/formation/test_warp.py \
+    -k "ordinary or chunks or near_plane or hard_cases"
 else
   echo "compute-sanitizer is not installed" | tee "$out/sanitizer.log"
   failed+=(sanitizer)

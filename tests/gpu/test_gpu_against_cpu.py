@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import make_camera, make_gaussians
-from warp_oracle import ALL, LONG, ROLLED
+from helpers.splat_scenes import make_camera, make_gaussians
+from helpers.warp_oracle import ALL, LONG, ROLLED
 
 from cleargs.formation.warp import Warp, displacement_fields
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.kernels.cuda import support
 
 
@@ -28,7 +28,7 @@ def test_the_gpu_agrees_with_the_cpu(count, size_px, aspect, antialias, device):
     upstream = torch.randn(357, 633, 3, generator=torch.Generator().manual_seed(0))
     results = []
     for where in ("cpu", device):
-        engine = Engine(where)
+        engine = rasteriser_for(where)
         image = engine.forward(gaussians.to(where), camera, antialias=antialias).image
         gradients = engine.backward(upstream.to(where))
         results.append((image.cpu(), gradients.to("cpu"), engine.visible.cpu()))
@@ -65,7 +65,7 @@ def test_the_warp_agrees_with_the_cpu_and_with_itself(motion, device):
 
 
 def test_memory_is_bounded_and_grows_with_the_scene(device):
-    engine, camera = Engine(device), make_camera(640, 360)
+    engine, camera = rasteriser_for(device), make_camera(640, 360)
     small, large = (make_gaussians(camera, count, size_px=2.0).to(device) for count in (5_000, 50_000))
     for gaussians in (small, large, small, large):
         engine.backward(torch.ones_like(engine.forward(gaussians, camera).image))

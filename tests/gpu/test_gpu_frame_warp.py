@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import splat_toy
 import torch
+from helpers import splat_toy
+from helpers.warp_oracle import ALL, SCALE, SMALL, constant_fields, placed, random_image, scenery
 from torch import Tensor
-from warp_oracle import ALL, LONG, ROLLED, constant_fields, dot, oracle, random_image
 
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
@@ -27,15 +27,10 @@ from cleargs.formation.warp import (
     times_slope,
 )
 from cleargs.progress import SilentReporter
-from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST, DisplacementFields
+from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST
 from cleargs.splat.trainer import Trained, train
-
-SMALL = Camera(30, 18, 25.0, 26.0, 14.0, 9.5, np.eye(4))
-SCALE = 0.25
-"""Of a small photograph over that of `ALL`, whose blur is 10 px long."""
 
 Both = Callable[..., tuple[Any, Any]]
 
@@ -53,17 +48,6 @@ def both(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> Both:
     return call
 
 
-def scenery(margin: int) -> tuple[Tensor, Tensor]:
-    """Accumulated depth and alpha: an edge, a floater, holes, and what is no number."""
-    height, width = SMALL.height + 2 * margin, SMALL.width + 2 * margin
-    depth = torch.full((height, width), 3.0)
-    depth[:, width // 2 :] = 1.5
-    alpha = torch.linspace(0.4, 1.0, width).repeat(height, 1)
-    depth[6, 8:16] = torch.tensor([np.nan, np.inf, 0.0, -1.0, 1e-4, 1e-30, 3e38, 5.0])
-    alpha[9, 10:14] = torch.tensor([np.nan, 0.0, 0.5, 1.0])
-    return depth, alpha
-
-
 @pytest.mark.parametrize("margin", [0, 4])
 def test_the_fields_are_those_of_the_cpu(both: Both, margin: int) -> None:
     found, expected = both(
@@ -76,72 +60,6 @@ def test_the_fields_are_those_of_the_cpu(both: Both, margin: int) -> None:
     assert enough_samples(found) == enough_samples(expected)
 
 
-def moved(motion: FrameMotion) -> tuple[DisplacementFields, int]:
-    return displacement_fields(motion, SMALL, *scenery(4), 4, SCALE), 4
-
-
-def placed(fields: DisplacementFields, device: torch.device) -> DisplacementFields:
-    return DisplacementFields(*(field.to(device) for field in fields[:3]))
-
-
-def aside(height: int, width: int) -> tuple[DisplacementFields, int]:
-    """One sample between pixels, beyond all borders in places."""
-    fields = constant_fields(height, width, 0.0, 0.0)
-    fields.offset.copy_(torch.linspace(-3.3, 2.9, fields.offset.numel()).reshape(fields.offset.shape))
-    return fields, 0
-
-
-CASES = {
-    "many samples": lambda: moved(ALL),
-    "one sample": lambda: moved(ROLLED),
-    "two passes": lambda: moved(LONG),
-    "longer than the image": lambda: (constant_fields(9, 14, 60.0, 0.0), 0),
-    "higher than the image": lambda: (constant_fields(9, 14, 0.0, 60.0, 2.0), 0),
-    "one pixel": lambda: (constant_fields(1, 1, 5.0, 5.0, 1.0), 0),
-    "one row": lambda: (constant_fields(1, 9, 3.0, 2.0), 0),
-    "one column": lambda: (constant_fields(40, 1, 0.0, 7.0, 3.0), 0),
-    "one pixel, one sample": lambda: aside(1, 1),
-    "one row, one sample": lambda: aside(1, 9),
-    "two by two, one sample": lambda: aside(2, 2),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_forward_and_transpose_equal_oracle_and_cpu(case: str, both: Both) -> None:
-    fields, margin = CASES[case]()
-    warp = Warp.of(fields, margin)
-    assert (len(warp.samples) == 1) == ("one sample" in case)
-    height, width = fields.radius.shape
-    image, light = random_image(height + 2 * margin, width + 2 * margin), random_image(height, width) - 0.5
-
-    def both_ways(image: Tensor, light: Tensor, *fields: Tensor) -> tuple[Tensor, Tensor]:
-        warp = Warp.of(DisplacementFields(*fields), margin)
-        return warp.forward(image).cpu(), warp.transpose(light).cpu()
-
-    (made, back), (cpu_made, cpu_back) = both(both_ways, image, light, *fields[:3])
-    expected = oracle(image[..., :3], warp)
-    expected.backward(light[..., :3].double())
-    gradient = expected.image.grad
-    # Positions of some 40 px in float32 are good to 4e-6 px, and the image changes by at most 1 a pixel; the
-    # worst is 1.4e-6. Light piles up at the borders: errors relative to the most that is sent to a place.
-    pile = max(1.0, float(gradient.abs().max()))
-    assert (made[..., :3] - expected).abs().max() < 6e-6
-    assert (made - cpu_made).abs().max() < 6e-6
-    assert (back[..., :3] - gradient).abs().max() < 6e-6 * pile
-    assert (back - cpu_back)[..., :3].abs().max() < 6e-6 * pile
-    assert not back[..., 3].any()
-    # The same shares both ways, so that only the sums are rounded: the worst is 5e-9 of the norms.
-    assert abs(dot(made, light) - dot(image, back)) < 5e-8 * made.norm() * light.norm()
-
-
-def test_a_still_frame_is_the_image_itself(device: torch.device) -> None:
-    warp = Warp.of(placed(constant_fields(9, 14, 0.0, 0.0), device))
-    image = random_image(9, 14).to(device)
-    assert torch.equal(warp.forward(image), image)
-    # Shares of 2^-54 of the brightest pixel are lost, which is less than float32 keeps of any of these.
-    assert torch.equal(warp.transpose(image), image)
-
-
 def test_the_order_of_the_sums_does_not_matter(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     kernels = importlib.import_module("cleargs.splat.kernels.cuda.frame_warp")
     warp = Warp.of(placed(constant_fields(12, 14, 5.0, 9.0), device))
@@ -151,14 +69,6 @@ def test_the_order_of_the_sums_does_not_matter(device: torch.device, monkeypatch
         monkeypatch.setattr(kernels, "BLOCK", block)
         found.append(warp.transpose(light))
     assert torch.equal(*found)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-15, 1e-6, 1e20])
-def test_light_of_any_size_comes_back(size: float, device: torch.device) -> None:
-    warp = Warp.of(placed(constant_fields(7, 8, 3.0, 1.0), device))
-    light = random_image(7, 8).to(device)
-    expected = size * warp.transpose(light)
-    assert (warp.transpose(size * light) - expected).abs().max() <= 1e-6 * expected.max()
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy, of the interpreter

@@ -24,7 +24,7 @@ from cleargs.progress import PREVIEW
 from cleargs.report.serve import Server
 from cleargs.report.watched_run import Watched
 from cleargs.report.web_scene import Renderer
-from cleargs.splat.preview import write_preview
+from cleargs.splat.train_log import write_preview
 
 
 @dataclass

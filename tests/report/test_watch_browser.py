@@ -14,7 +14,7 @@ from watched import reported, serving, working
 from cleargs.pipeline import live
 from cleargs.progress import PREVIEW
 from cleargs.report.web_scene import Renderer
-from cleargs.splat.preview import write_preview
+from cleargs.splat.train_log import write_preview
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 

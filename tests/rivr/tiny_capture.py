@@ -23,7 +23,6 @@ from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.rivr.config import ConsolidateConfig, RivrConfig
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
-from cleargs.splat.adam import Moments
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.gaussians import Gaussians
@@ -31,6 +30,7 @@ from cleargs.splat.ply import write_ply
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import save_state
+from cleargs.splat.types import Moments
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 ROLES = ("strong", "suppressed", "geometric", "strong", "auxiliary", "strong", "reactivated", "suppressed")

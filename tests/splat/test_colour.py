@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splat_toy import HEIGHT, WIDTH, camera, keep
+from helpers.splat_toy import HEIGHT, WIDTH, camera, keep
 
 from cleargs.formation.exposure import (
     IDENTITY,

@@ -12,12 +12,11 @@ import pytest
 PROGRAM = """
 import hashlib, sys
 import torch
-from splat_scenes import make_camera, make_gaussians
-from cleargs.splat.adam import adam_step
-from cleargs.splat.engine import Engine
+from helpers.splat_scenes import make_camera, make_gaussians
+from cleargs.splat.backend import adam_step, photometric_loss, psnr, rasteriser_for
 from cleargs.formation.exposure import affine_backward
 from cleargs.splat.kernels.runtime import set_threads
-from cleargs.splat.losses import photometric_loss, psnr
+from cleargs.splat.types import AdamStep
 
 def digest(threads):
     set_threads(threads)
@@ -27,7 +26,7 @@ def digest(threads):
     scene.means[:300, 2] = scene.means[0, 2]
     target = torch.rand(101, 150, 3, generator=torch.Generator().manual_seed(1))
     mask = target[..., 0] > 0.2
-    engine = Engine()
+    engine = rasteriser_for()
     moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in scene.tensors().items()}
     for step in range(1, 4):
         view = engine.forward(scene, camera, depth=True, antialias=step == 2)
@@ -38,7 +37,7 @@ def digest(threads):
             result.update(tensor.numpy().tobytes())
         result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())
         for name, tensor in scene.tensors().items():
-            adam_step(tensor, getattr(gradients, name), *moments[name], step=step, lr=0.01)
+            adam_step(AdamStep(tensor, getattr(gradients, name), *moments[name], step, 0.01))
     for tensor in scene.tensors().values():
         assert tensor.isfinite().all()
         result.update(tensor.numpy().tobytes())
@@ -66,7 +65,7 @@ def test_training_steps_are_bitwise_equal_for_1_2_and_16_threads_and_for_two_run
 
 PROJECTION = """
 import hashlib
-from splat_scenes import make_camera, make_gaussians
+from helpers.splat_scenes import make_camera, make_gaussians
 from test_projection import project
 
 camera = make_camera()

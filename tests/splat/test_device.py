@@ -13,21 +13,21 @@ from cleargs.errors import InputError
 from cleargs.manifest import KeyParts
 from cleargs.pipeline import session
 from cleargs.pipeline.keys import key_config, library_versions
-from cleargs.splat.engine import Engine
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.kernels.cuda import support
 
 
 def test_engine_refuses_a_gpu_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError) as caught:
-        Engine("cuda")
+        rasteriser_for("cuda")
     assert "--device cpu" in caught.value.hint
     monkeypatch.setattr(support.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="Triton") as caught:
-        Engine("cuda")
+        rasteriser_for("cuda")
     assert "cleargs[cuda]" in caught.value.hint
     with pytest.raises(InputError, match="no meta back end"):
-        Engine("meta")
+        rasteriser_for("meta")
 
 
 def test_the_command_line_names_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:

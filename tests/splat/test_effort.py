@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 import pytest
-from splat_toy import gaussians, images, start, views
+from helpers.splat_toy import gaussians, images, start, views
 
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config, override

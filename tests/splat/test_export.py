@@ -15,7 +15,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.reference import sh_basis
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
-from cleargs.splat.similarity import sh_rotation, transform_scene
+from cleargs.splat.transforms import sh_rotation, transform_scene
 
 SCALE = 3.7
 ROTATION = Rotation.from_rotvec([0.9, -1.3, 0.4]).as_matrix()

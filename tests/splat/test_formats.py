@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from test_compressed_ply import make
 
 from cleargs.errors import InputError
-from cleargs.splat.camera import Camera
-from cleargs.splat.cameras_json import cameras_json
+from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import FORMATS, format_of, padded, write_scene
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.reference import sh_basis

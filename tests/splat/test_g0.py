@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pytest
+from helpers.splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 from pydantic import ValidationError
-from splat_toy import HEIGHT, WIDTH, angles, camera, gaussians, images
 
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
 from cleargs.errors import InputError

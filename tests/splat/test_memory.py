@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from splat_scenes import make_camera, make_gaussians
+import torch
+from helpers.splat_scenes import make_camera, make_gaussians
 
 from cleargs.errors import StageError
-from cleargs.splat.engine import Engine
-from cleargs.splat.kernels.cpu import pipeline
+from cleargs.splat.backend import rasteriser_for
+from cleargs.splat.kernels import rasteriser
+from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.memory import available_memory
 
 GB = 2**30
@@ -63,18 +65,18 @@ def test_without_proc_it_is_all_that_the_machine_has(tmp_path: Path) -> None:
 def test_pairs_that_do_not_fit_are_refused_before_they_are_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = make_camera()
     gaussians = make_gaussians(camera, 200)
-    buffers = pipeline.Buffers()
-    monkeypatch.setattr(pipeline, "Buffers", lambda: buffers)
-    monkeypatch.setattr(pipeline, "UNASKED", 0)
-    monkeypatch.setattr(pipeline, "available_memory", lambda: 1000)
-    engine = Engine()
+    buffers = rasteriser.Buffers(torch.device("cpu"))
+    monkeypatch.setattr(rasteriser, "Buffers", lambda device: buffers)
+    monkeypatch.setattr(rasteriser, "UNASKED", 0)
+    monkeypatch.setattr(rasteriser, "available_memory", lambda device: 1000)
+    engine = rasteriser_for()
     with pytest.raises(StageError, match=r"pairs at 64x48, more than fit: they need another .* GB"):
         engine.forward(gaussians, camera)
-    assert not any(name in buffers.arrays for name in pipeline.PAIR_BUFFERS)
+    assert not any(name in buffers.memory for name in CpuRasteriser.pair_buffers)
     # What the buffers hold already is no longer free, and need not be.
-    monkeypatch.setattr(pipeline, "available_memory", lambda: 10**6)
+    monkeypatch.setattr(rasteriser, "available_memory", lambda device: 10**6)
     image = engine.forward(gaussians, camera).image
     engine.backward(image)
-    assert set(pipeline.PAIR_BUFFERS) <= set(buffers.arrays)
-    monkeypatch.setattr(pipeline, "available_memory", lambda: 0)
+    assert set(CpuRasteriser.pair_buffers) <= set(buffers.memory)
+    monkeypatch.setattr(rasteriser, "available_memory", lambda device: 0)
     engine.forward(gaussians, camera)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians, make_needles
+from helpers.splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians, make_needles
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera

@@ -7,13 +7,13 @@ import torch
 
 from cleargs.rivr.config import ConsolidationDistilConfig, RivrConfig, RoundsDistilConfig
 from cleargs.splat.config import G0Config, TrainConfig
-from cleargs.splat.rates import INRIA_STEPS, Rates, rate_factor
+from cleargs.splat.schedule import INRIA_STEPS, Schedule, rate_factor
 
 GROUPS = ("means", "log_scales", "rotations", "sh", "logit_opacities")
 
 
 def rates(config: TrainConfig, step: int) -> dict[str, float]:
-    found = Rates(config, coefficients=4).at(step)
+    found = Schedule(config, coefficients=4).rates(step)
     return {
         name: float(value.max() if isinstance(value, torch.Tensor) else value)
         for name, value in found.items()

@@ -10,24 +10,25 @@ import pytest
 from numba import config
 
 from cleargs.splat.kernels import runtime
+from cleargs.splat.kernels.cpu import jit
 
 
 def test_the_cache_is_named_by_the_sources(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(config, "CACHE_DIR", config.CACHE_DIR)  # put back at the end
-    runtime.configure_numba()
-    assert Path(config.CACHE_DIR) == tmp_path / f"kernels-{runtime.kernel_digest()}"
+    jit.configure_numba()
+    assert Path(config.CACHE_DIR) == tmp_path / f"kernels-{jit.kernel_digest()}"
     assert Path(config.CACHE_DIR).is_dir()
 
 
 def test_digest_follows_every_kernel_source(monkeypatch):
-    before = runtime.kernel_digest()
+    before = jit.kernel_digest()
     read = Path.read_bytes
     for name in ("constants.py", "simd.py", "harmonics.py", "splat_layout.py", "warp_layout.py"):
         with monkeypatch.context() as patch:
             patch.setattr(Path, "read_bytes", lambda path, name=name: read(path) + b"#" * (path.name == name))
-            assert runtime.kernel_digest() != before
-    assert runtime.kernel_digest() == before
+            assert jit.kernel_digest() != before
+    assert jit.kernel_digest() == before
 
 
 def test_set_threads():
@@ -47,7 +48,7 @@ def test_set_threads():
 
 def test_importing_the_core_imports_neither_numba_nor_media_libraries():
     program = (
-        "import sys, cleargs.splat.render, cleargs.splat.engine, cleargs.splat.losses, cleargs.splat.adam\n"
+        "import sys, cleargs.splat.render, cleargs.splat.backend, cleargs.splat.types\n"
         "print([name for name in ('numba', 'pycolmap', 'OpenImageIO', 'cv2') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

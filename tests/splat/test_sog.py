@@ -11,10 +11,9 @@ import pytest
 import torch
 from test_compressed_ply import make
 
-from cleargs.splat.codebook import codebook, nearest, palette
 from cleargs.splat.compressed_ply import morton_order
 from cleargs.splat.scene import Scene
-from cleargs.splat.sog import sog
+from cleargs.splat.sog import codebook, nearest, palette, sog
 
 gsply = pytest.importorskip("gsply")
 pytest.importorskip("imagecodecs")  # with which gsply reads WebP

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import add_position_noise
 from cleargs.splat.kernels.runtime import set_threads
-from cleargs.splat.strategy.mcmc import (
+from cleargs.splat.strategy.rules import (
     refine,
     rotation_matrices,
     sample_once,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
+from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, start, views
 
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
@@ -21,16 +21,16 @@ from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat import trainer
-from cleargs.splat.adam import Moments
+from cleargs.splat.backend import photometric_loss
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.runtime import set_threads
-from cleargs.splat.losses import PhotometricLoss, photometric_loss
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer, train
+from cleargs.splat.types import Moments, PhotometricLoss
 from cleargs.splat.views import ImageCache, View, unseen_pixels
 
 CONFIG = TrainConfig(

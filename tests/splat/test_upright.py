@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cleargs.splat.camera import Camera
-from cleargs.splat.upright import UP, upright
+from cleargs.splat.transforms import UP, upright
 
 AHEAD = {"-y": [0, 0, 1], "y": [0, 0, -1], "z": [0, 1, 0]}
 """Where a program with that up axis looks before its camera is moved: COLMAP's viewers, three.js, Blender."""

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Render
 from cleargs.splat.formation import Renderer
+from cleargs.splat.types import Render
 from cleargs.splat.views import View
 
 

@@ -8,6 +8,6 @@ over reusable buffers. ``splat_layout`` names the columns of what they hand on, 
 Numba fixes the place of its cache when a kernel is defined, hence the one call below.
 """
 
-from cleargs.splat.kernels.runtime import configure_numba
+from cleargs.splat.kernels.cpu.jit import configure_numba
 
 configure_numba()

@@ -11,14 +11,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from cleargs.splat.adam import Moments
+from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import adam, affine_colour, frame_warp, launch, loss, position_noise
+from cleargs.splat.kernels.cpu.jit import Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
-from cleargs.splat.kernels.runtime import warm_up as warm_up
-from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
-from cleargs.splat.losses import PhotometricLoss
-from cleargs.splat.strategy import mcmc
+from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
+from cleargs.splat.strategy import rules
+from cleargs.splat.types import AdamStep, Moments, PhotometricLoss
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -73,13 +73,13 @@ def meter(ssim_lambda: float) -> None:
 
 
 class _Padded(NamedTuple):
-    image: npt.NDArray[np.float32]  # [H, padded length]
-    target: npt.NDArray[np.float32]
-    counted: npt.NDArray[np.float32]
+    image: Floats  # [H, padded length]
+    target: Floats
+    counted: Floats
 
 
-def _read(tensor: Tensor) -> npt.NDArray[np.float32]:
-    array: npt.NDArray[np.float32] = tensor.detach().contiguous().numpy()
+def _read(tensor: Tensor) -> Floats:
+    array: Floats = tensor.detach().contiguous().numpy()
     return array
 
 
@@ -90,7 +90,7 @@ def _pad(image: Tensor, target: Tensor, mask: Tensor | None) -> _Padded:
     return padded
 
 
-def _measure(padded: _Padded) -> tuple[float, float, float, npt.NDArray[np.float32]]:
+def _measure(padded: _Padded) -> tuple[float, float, float, Floats]:
     """Mean |x - y|, mean SSIM, the number of values that count, and the derivative maps of SSIM."""
     # The kernels read maps between the padding only, so what is there need not be set.
     maps = np.empty((3, *padded.image.shape), np.float32)
@@ -105,40 +105,29 @@ def _measure(padded: _Padded) -> tuple[float, float, float, npt.NDArray[np.float
 # -- optimiser ---------------------------------------------------------------------------------------------
 
 
-def adam_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    *,
-    step: int,
-    lr: float | Tensor,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    columns = parameter.numel() // len(parameter)
-    rates = np.asarray(lr, np.float64).reshape(-1)
-    beta1, beta2 = betas
-    corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
-    tensors = (parameter, gradient, first_moment, second_moment)
-    flat = [tensor.detach().view(-1).numpy() for tensor in tensors]
+def adam_step(step: AdamStep) -> None:
+    columns, number = step.columns, step.number
+    rates = np.asarray(step.rate, np.float64).reshape(-1)
+    beta1, beta2 = step.betas
+    corrected = np.broadcast_to(rates / (1.0 - beta1**number), (columns,)).astype(np.float32)
+    parameter, gradient, first, second = (tensor.detach().view(-1).numpy() for tensor in step.tensors)
     with launch.exclusive():
         adam.adam(
-            flat[0],
-            flat[1],
-            flat[2],
-            flat[3],
+            parameter,
+            gradient,
+            first,
+            second,
             np.tile(corrected, max(1, ADAM_BLOCK // columns)),
             np.float32(beta1),
             np.float32(beta2),
-            np.float32(eps),
-            np.float32(math.sqrt(1.0 - beta2**step)),
+            np.float32(step.epsilon),
+            np.float32(math.sqrt(1.0 - beta2**number)),
         )
 
 
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
     if opacity > 0.0:
-        opacities = mcmc.sigmoid(gaussians.logit_opacities.numpy())
+        opacities = rules.sigmoid(gaussians.logit_opacities.numpy())
         gradients.logit_opacities.numpy()[:] += (
             np.float32(opacity / gaussians.num) * opacities * (1 - opacities)
         )
@@ -164,7 +153,7 @@ def refine(
     running = [
         {name: tensor.numpy() for name, tensor in group.items()} for group in (moments.first, moments.second)
     ]
-    arrays, running = mcmc.refine(
+    arrays, running = rules.refine(
         arrays,
         running,
         errors=errors.double().numpy(),
@@ -191,7 +180,7 @@ def add_position_noise(
             gaussians.logit_opacities.numpy(),
             amount,
             min_opacity,
-            mcmc.NOISE_CUT,
+            rules.NOISE_CUT,
             key,
         )
 
@@ -278,3 +267,111 @@ def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
     with launch.exclusive():
         frame_warp.multiply(_read(light), _read(slope), out.numpy())
     return out
+
+
+# -- search for the motion -----------------------------------------------------------------------------------
+
+
+def misfit(
+    image: Floats,  # [H, W]
+    observed: Floats,  # [H, W]
+    weight: Floats,  # [H, W]
+    fields: tuple[Floats, Floats, Floats],
+    samples: Floats,  # [K, 3]
+    limit: float,
+) -> float:
+    rows = np.empty(len(image))
+    with launch.exclusive():
+        frame_warp.misfits(image, observed, weight, *fields, samples, limit, rows)
+    return math.fsum(rows)
+
+
+def normal_equations(
+    stack: Floats,  # [H, W, 3]
+    observed: Floats,  # [H, W]
+    weight: Floats,  # [H, W]
+    basis: Floats,  # [6, 2, H, W]
+    down: Floats,  # [H]
+    offset: Floats,
+    sweep: Floats,
+    times: Floats,  # [K]
+    outlier: float,
+    active: npt.NDArray[np.int64],  # [A]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    height, count = len(observed), len(active)
+    matrices, sides = np.empty((height, count, count)), np.empty((height, count))
+    with launch.exclusive():
+        frame_warp.normal_equations(
+            stack, observed, weight, basis, down, offset, sweep, times, outlier, active, matrices, sides
+        )
+    lower = matrices.sum(axis=0)
+    return lower + np.tril(lower, -1).T, sides.sum(axis=0)
+
+
+# -- compiling ahead of use ------------------------------------------------------------------------------
+
+SIZE = 16
+"""Of the tiny images on which `warm_up` runs the kernels."""
+
+
+def _scene() -> Gaussians:
+    """One grey Gaussian in front of the camera."""
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        log_scales=torch.full((1, 3), -2.0),
+        rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        logit_opacities=torch.zeros(1),
+        sh=torch.zeros(1, 16, 3),
+    )
+
+
+def warm_up() -> None:
+    """Run every kernel with the types that a training has, in the order of its steps; the backward pass with
+    and without alpha and depth."""
+    scene = _scene()
+    camera = Camera(SIZE, SIZE, float(SIZE), float(SIZE), SIZE / 2, SIZE / 2, np.eye(4))
+    pipeline = CpuRasteriser()
+    image = torch.zeros(SIZE, SIZE, 3)
+    plane = torch.zeros(SIZE, SIZE)
+    mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    affine = torch.eye(3, 4)
+    row = torch.zeros(1, 3)
+    for depth in (False, True):
+        pipeline.forward(scene, camera, depth=depth)
+    pipeline.backward(image)
+    pipeline.backward(image, plane)
+    pipeline.backward(image, plane, plane)
+    for counted in (None, mask):
+        photometric_loss(image, image, ssim_lambda=0.2, weight=1.0, mask=counted, gradient=image.clone())
+        psnr(image, image, counted)
+    adam_step(AdamStep(row, row.clone(), row.clone(), row.clone(), number=1, rate=0.0))
+    add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
+    apply_affine(image, affine)
+    affine_backward(image, affine, image)
+    _photograph()
+
+
+def _photograph() -> None:
+    """What a moving camera makes of an image, and the search for its motion."""
+    plane, colours = torch.ones(SIZE, SIZE), torch.zeros(SIZE, SIZE, CHANNELS)
+    curve, still = torch.zeros(CURVE_STEPS + 1), torch.ones(MOTION_COLUMNS)
+    _, slope = through_curve(colours, curve, CHANNELS)
+    times_slope(colours, slope, CHANNELS)
+    fields = displacements(plane, plane, still, margin=0)
+    light = expose(colours, fields, torch.zeros(1, 3), margin=0)
+    expose_backward(light, fields, torch.zeros(1, 3), margin=0)
+    pixels = plane.numpy()
+    offset, sweep, radius = (field.numpy() for field in fields[:3])
+    misfit(pixels, pixels, pixels, (offset, sweep, radius), np.zeros((1, 3), np.float32), 1.0)
+    normal_equations(
+        np.zeros((SIZE, SIZE, 3), np.float32),
+        pixels,
+        pixels,
+        np.zeros((6, 2, SIZE, SIZE), np.float32),
+        np.zeros(SIZE, np.float32),
+        offset,
+        sweep,
+        np.zeros(1, np.float32),
+        1.0,
+        np.arange(6),
+    )

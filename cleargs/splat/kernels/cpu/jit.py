@@ -10,12 +10,16 @@ its neighbours in the loop, which makes results bitwise independent of the numbe
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+
+from cleargs import kernel_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -23,6 +27,29 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
 FAST = frozenset({"contract", "nsz", "arcp"})
+
+
+def kernel_digest() -> str:
+    """Digest of every source file that ends up in compiled kernels.
+
+    Numba's own cache is keyed by the file of the kernel itself and misses changes in functions that it
+    calls from other files; a folder named by this digest does not.
+    """
+    folder = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in (
+        folder.parents[1] / "constants.py",
+        *sorted(folder.parent.glob("*_layout.py")),  # their numbers are compiled in
+        *sorted(folder.glob("*.py")),
+    ):
+        digest.update(source.name.encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def configure_numba() -> None:
+    """Give the kernels a folder of the cache and a threading layer; to be called before one is defined."""
+    kernel_cache.configure_numba(f"kernels-{kernel_digest()}")
 
 
 def kernel(function: F) -> F:

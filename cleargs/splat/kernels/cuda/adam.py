@@ -9,6 +9,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from cleargs.splat.types import AdamStep
+
 BLOCK = 1024
 
 
@@ -45,40 +47,23 @@ def adam(
     tl.store(parameter + i, value, mask=mask)
 
 
-def adam_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rates: Tensor,  # [columns] float32 on the same device
-    *,
-    step: int,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    """One step of contiguous tensors of one shape; see ``cleargs.splat.adam.adam_step``."""
-    size = parameter.numel()
-    beta1, beta2 = betas
+def adam_step(step: AdamStep) -> None:
+    """Do one step of tensors on a GPU."""
+    size, rates = step.parameter.numel(), step.rate
+    if not isinstance(rates, Tensor):
+        rates = torch.full((1,), rates, device=step.parameter.device)
+    rates = rates.to(step.parameter.device, torch.float32).reshape(-1)
+    beta1, beta2 = step.betas
     adam[(-(-size // BLOCK),)](
-        parameter,
-        gradient,
-        first,
-        second,
+        *step.tensors,
         rates,
         size,
         len(rates),
         beta1,
         beta2,
-        eps,
-        1.0 - beta1**step,
-        math.sqrt(1.0 - beta2**step),
+        step.epsilon,
+        1.0 - beta1**step.number,
+        math.sqrt(1.0 - beta2**step.number),
         BLOCK=BLOCK,
         num_warps=4,
     )
-
-
-def rates_tensor(lr: float | Tensor, device: torch.device) -> Tensor:
-    """Rates as the kernel reads them: float32 [1] or [columns]."""
-    if isinstance(lr, Tensor):
-        return lr.to(device, torch.float32).reshape(-1)
-    return torch.full((1,), lr, device=device)

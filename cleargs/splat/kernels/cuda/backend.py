@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from cleargs.splat.adam import Moments
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda import adam, densify, support
+from cleargs.splat.kernels.cuda import support
+from cleargs.splat.kernels.cuda.adam import adam_step as adam_step
 from cleargs.splat.kernels.cuda.affine_colour import affine_backward as affine_backward
 from cleargs.splat.kernels.cuda.affine_colour import apply_affine as apply_affine
+from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
+from cleargs.splat.kernels.cuda.densify import refine as refine
 from cleargs.splat.kernels.cuda.frame_warp import displacements as displacements
 from cleargs.splat.kernels.cuda.frame_warp import expose as expose
 from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
 from cleargs.splat.kernels.cuda.frame_warp import through_curve as through_curve
 from cleargs.splat.kernels.cuda.frame_warp import times_slope as times_slope
-from cleargs.splat.kernels.cuda.loss import Meter, Photometer, reading
+from cleargs.splat.kernels.cuda.loss import Meter
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
-from cleargs.splat.losses import PhotometricLoss
+from cleargs.splat.types import PhotometricLoss
 
 
 def rasteriser(device: torch.device) -> CudaRasteriser:
@@ -42,15 +43,9 @@ def photometric_loss(
     mask: Tensor | None,
     gradient: Tensor,
 ) -> PhotometricLoss:
-    totals = Photometer()(
-        image,
-        target,
-        mask,
-        l1_weight=weight * (1.0 - ssim_lambda),
-        ssim_weight=-weight * ssim_lambda,
-        gradient=gradient,
-    )
-    read = reading(totals.tolist(), ssim_lambda=ssim_lambda, weight=weight)
+    meter = Meter(ssim_lambda)
+    meter.add(0, image, target, mask, weight=weight, gradient=gradient)
+    ((_, read),) = meter.take()
     return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
 
 
@@ -65,52 +60,9 @@ def meter(ssim_lambda: float) -> Meter:
     return Meter(ssim_lambda)
 
 
-def adam_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    *,
-    step: int,
-    lr: float | Tensor,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    rates = adam.rates_tensor(lr, parameter.device)
-    adam.adam_step(parameter, gradient, first_moment, second_moment, rates, step=step, betas=betas, eps=eps)
-
-
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
     if opacity > 0.0:
         opacities = gaussians.logit_opacities.sigmoid()
         gradients.logit_opacities += opacity / gaussians.num * opacities * (1 - opacities)
     if scale > 0.0:
         gradients.log_scales += scale / gaussians.log_scales.numel() * gaussians.log_scales.exp()
-
-
-def refine(
-    gaussians: Gaussians,
-    moments: Moments,
-    *,
-    errors: Tensor,
-    rate: float,
-    budget: int,
-    min_opacity: float,
-    seed: Sequence[int],
-) -> tuple[Gaussians, Moments]:
-    gaussians, running = densify.refine(
-        gaussians,
-        [moments.first, moments.second],
-        errors=errors,
-        rate=rate,
-        budget=budget,
-        min_opacity=min_opacity,
-        seed=densify.seed_of(*seed),
-    )
-    return gaussians, Moments(*running)
-
-
-def add_position_noise(
-    gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
-) -> None:
-    densify.add_position_noise(gaussians, amount=amount, min_opacity=min_opacity, seed=densify.seed_of(*seed))

@@ -1,4 +1,4 @@
-"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.mcmc``.
+"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.rules``.
 
 A refinement happens every so many steps and is made of torch operations; the noise of every step is one
 kernel. Draws come from Philox counters keyed by the step's seed: the same device draws the same each time.
@@ -18,41 +18,38 @@ from torch import Tensor
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
 from cleargs.splat.kernels.reference import rotation_matrices
-from cleargs.splat.strategy import mcmc
+from cleargs.splat.strategy import rules
+from cleargs.splat.types import Moments
 
 BLOCK = 256
 
 
-def seed_of(*numbers: int) -> int:
-    """A 63-bit seed from a tuple of numbers, stateless as NumPy's."""
-    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
-
-
-def generator_of(seed: int, device: torch.device) -> torch.Generator:
-    """torch's generator on ``device`` in the state that ``seed`` names."""
-    return torch.Generator(device).manual_seed(seed)
+def seed_of(numbers: Sequence[int]) -> int:
+    """A 63-bit seed from some numbers, stateless as NumPy's."""
+    return int(np.random.SeedSequence([*numbers]).generate_state(1, np.uint64)[0] >> 1)
 
 
 def refine(
     gaussians: Gaussians,
-    moments: Sequence[dict[str, Tensor]],
+    moments: Moments,
     *,
     errors: Tensor,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
-    seed: int,
-) -> tuple[Gaussians, list[dict[str, Tensor]]]:
-    """``mcmc.refine``. What is given is changed and must not be used again."""
-    running, generator = list(moments), generator_of(seed, gaussians.device)
+    seed: Sequence[int],
+) -> tuple[Gaussians, Moments]:
+    """``rules.refine``. What is given is changed and must not be used again."""
+    running = [moments.first, moments.second]
+    generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
     errors, start = errors.double(), gaussians.num
     growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
-    for done in range(1, mcmc.ROUNDS + 1):
+    for done in range(1, rules.ROUNDS + 1):
         opacity = gaussians.logit_opacities.double().sigmoid()
         alive = opacity > min_opacity
         weights, dead = torch.where(alive, errors, 0.0), torch.nonzero(~alive).squeeze(1)
         count = gaussians.num
-        room = max(0, start + growth * done // mcmc.ROUNDS - count)
+        room = max(0, start + growth * done // rules.ROUNDS - count)
         cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), generator)
         others = _halves(gaussians, cut, opacity[cut], min_opacity)
         errors = torch.cat([errors, errors.new_zeros(max(0, len(cut) - len(dead)))])
@@ -70,11 +67,11 @@ def refine(
             {name: _placed(tensor, places, torch.zeros_like(others[name])) for name, tensor in moment.items()}
             for moment in running
         ]
-    return gaussians, running
+    return gaussians, Moments(*running)
 
 
 def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
-    """``mcmc._placed``."""
+    """``rules._placed``."""
     longer = max(len(tensor), 1 + int(places.max())) if len(places) else len(tensor)
     if longer > len(tensor):
         tensor = torch.cat([tensor, tensor.new_zeros(longer - len(tensor), *tensor.shape[1:])])
@@ -83,19 +80,19 @@ def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
 
 
 def sample_once(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``mcmc.sample_once`` of float64 ``weights`` [N]."""
+    """``rules.sample_once`` of float64 ``weights`` [N]."""
     draws = torch.rand(len(weights), generator=generator, dtype=torch.float64, device=weights.device)
     return torch.sort(-torch.log1p(-draws) / weights, stable=True).indices[:count]
 
 
 def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: float) -> dict[str, Tensor]:
-    """``mcmc._halves``: make the Gaussians ``cut`` one of their halves, and return the other ones."""
+    """``rules._halves``: make the Gaussians ``cut`` one of their halves, and return the other ones."""
     rows = torch.arange(len(cut), device=cut.device)
     longest = gaussians.log_scales[cut].argmax(dim=1)
     axes = rotation_matrices(gaussians.rotations[cut])[rows, :, longest]
-    away = axes * (mcmc.PART * gaussians.log_scales[cut, longest].exp())[:, None]
-    faint = (1.0 - (1.0 - opacity) ** (0.5 / mcmc.PART)).clamp(min_opacity, 1.0 - 1e-6)
-    gaussians.log_scales[cut, longest] += math.log(mcmc.PART)
+    away = axes * (rules.PART * gaussians.log_scales[cut, longest].exp())[:, None]
+    faint = (1.0 - (1.0 - opacity) ** (0.5 / rules.PART)).clamp(min_opacity, 1.0 - 1e-6)
+    gaussians.log_scales[cut, longest] += math.log(rules.PART)
     gaussians.logit_opacities[cut] = (faint.log() - torch.log1p(-faint)).float()
     others = {name: tensor[cut] for name, tensor in gaussians.tensors().items()}
     gaussians.means[cut] -= away
@@ -131,18 +128,20 @@ def position_noise_kernel(
         tl.store(means + g * 3 + axis, value + offset * fade, mask=felt)
 
 
-def add_position_noise(gaussians: Gaussians, *, amount: float, min_opacity: float, seed: int) -> None:
-    """Noise on the means for one step, in place; only Gaussians below ``mcmc.NOISE_CUT`` feel it."""
+def add_position_noise(
+    gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
+) -> None:
+    """Noise on the means for one step, in place; only Gaussians below ``rules.NOISE_CUT`` feel it."""
     position_noise_kernel[(-(-gaussians.num // BLOCK),)](
         gaussians.means,
         gaussians.log_scales,
         gaussians.rotations,
         gaussians.logit_opacities,
         gaussians.num,
-        seed,
+        seed_of(seed),
         amount,
         min_opacity,
-        mcmc.NOISE_CUT,
+        rules.NOISE_CUT,
         BLOCK=BLOCK,
         num_warps=4,
     )

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import triton
@@ -24,19 +23,11 @@ from torch import Tensor
 from cleargs.splat import constants
 from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.support import memory_errors
+from cleargs.splat.types import Reading
 
 ROWS = 4
 COLUMNS = 128
 """Rows and values of a row that a program treats."""
-
-
-class Reading(NamedTuple):
-    """What was measured, as numbers."""
-
-    loss: float
-    l1: float
-    ssim: float
-    psnr: float
 
 
 def reading(totals: Sequence[float], *, ssim_lambda: float, weight: float) -> Reading:
@@ -250,7 +241,7 @@ class Meter:
         weight: float,
         gradient: Tensor,
     ) -> None:
-        """Write the gradient of a step's loss (see ``losses.photometric_loss``) and keep its sums."""
+        """Write the gradient of a step's loss (see ``backend.photometric_loss``) and keep its sums."""
         totals = self._photometer(
             image,
             target,
@@ -280,6 +271,7 @@ class Photometer:
     def __init__(self) -> None:
         self._memory: Tensor | None = None
 
+    @memory_errors()
     def __call__(
         self,
         image: Tensor,  # [H, W, 3]
@@ -295,18 +287,6 @@ class Photometer:
         Returns the sums of |x - y|, SSIM and (x - y)² over the values that count, and their number: on the
         device, so that reading them can wait.
         """
-        with memory_errors():
-            return self._run(image.detach(), target, mask, l1_weight, ssim_weight, gradient)
-
-    def _run(
-        self,
-        image: Tensor,
-        target: Tensor,
-        mask: Tensor | None,
-        l1_weight: float,
-        ssim_weight: float,
-        gradient: Tensor,
-    ) -> Tensor:
         height, length = image.shape[0], 3 * image.shape[1]
         size = height * length
         if self._memory is None or len(self._memory) < 8 * size or self._memory.device != image.device:
@@ -315,7 +295,7 @@ class Photometer:
         sums, maps = self._memory[: 5 * size], self._memory[5 * size : 8 * size]
         grid = (-(-length // COLUMNS), -(-height // ROWS))
         partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
-        image, target = image.contiguous(), target.contiguous()
+        image, target = image.detach().contiguous(), target.contiguous()
         bits = image if mask is None else mask.contiguous().view(torch.uint8)
         block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "num_warps": 4}
         has_mask = mask is not None

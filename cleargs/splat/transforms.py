@@ -1,9 +1,11 @@
-"""A scene in another world: similarity transforms of Gaussians, spherical harmonics included."""
+"""A scene in another world: similarity transforms of Gaussians, and worlds with an up axis of their own."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,12 +14,21 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from cleargs.errors import InputError
+from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.reference import sh_basis
 from cleargs.splat.scene import Scene
 
 MAX_REACH = 1e18
 """Farthest that a scene may reach, and the inverse of the least: their squares are single precision's."""
+
+UP: Mapping[str, tuple[tuple[float, ...], ...]] = {
+    "-y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+}
+"""Up axis -> the matrix from x right, y down, z forward. Programs with y up look along -z, and with z up
+along y, before anyone moves their camera."""
 
 _DIRECTIONS = 64
 """Directions in which two SH functions are compared; 16 coefficients need at least 16."""
@@ -98,3 +109,13 @@ def _multiply(first: Tensor, second: Tensor) -> Tensor:
         ]
     )
     return second @ matrix.T
+
+
+def upright(first: Camera, up: str) -> dict[str, Any]:
+    """Scale, rotation [3, 3] and translation [3] from the normalised world to one with ``up`` of `UP`, in
+    which ``first`` stands at the origin and looks ahead. Up stays up, whatever its pitch and roll."""
+    ahead = first.world_to_camera[2, :3] * [1.0, 0.0, 1.0]
+    length = float(np.linalg.norm(ahead))
+    x, _, z = ahead / length if length > 1e-6 else (0.0, 0.0, 1.0)  # straight up or down: as it lies
+    rotation = np.array(UP[up]) @ [[z, 0.0, -x], [0.0, 1.0, 0.0], [x, 0.0, z]]
+    return {"scale": 1.0, "rotation": rotation, "translation": -rotation @ first.centre}

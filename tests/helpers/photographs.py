@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from cleargs.formation.comparison import Sight, luminance
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.search import Sight, luminance
 from cleargs.formation.warp import Warp, displacement_fields, padded, samples
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.camera import Camera

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.engine import Engine
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import View
@@ -43,7 +43,7 @@ def camera(angle: float) -> Camera:
 
 def images(truth: Gaussians, count: int) -> list[Image]:
     """What the cameras at ``count`` angles over half a circle see of ``truth``, as uint8."""
-    engine = Engine("cpu")
+    engine = rasteriser_for("cpu")
     shown = [engine.forward(truth, camera(angle)).image.numpy().copy() for angle in angles(count)]
     return [np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8) for image in shown]
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from photographs import MEDIAN, twist
+from helpers.photographs import MEDIAN, twist
 from torch import Tensor
 
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.warp import Warp, padded
+from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.warp_layout import DisplacementFields
 
 ALL = FrameMotion(
@@ -83,3 +84,23 @@ def constant_fields(height: int, width: int, dx: float, dy: float, radius: float
 def dot(a: Tensor, b: Tensor) -> float:
     """The scalar product, in float64."""
     return float((a.double() * b.double()).sum())
+
+
+SMALL = Camera(30, 18, 25.0, 26.0, 14.0, 9.5, np.eye(4))
+SCALE = 0.25
+"""Of a small photograph over that of `ALL`, whose blur is 10 px long."""
+
+
+def scenery(margin: int) -> tuple[Tensor, Tensor]:
+    """Accumulated depth and alpha: an edge, a floater, holes, and what is no number."""
+    height, width = SMALL.height + 2 * margin, SMALL.width + 2 * margin
+    depth = torch.full((height, width), 3.0)
+    depth[:, width // 2 :] = 1.5
+    alpha = torch.linspace(0.4, 1.0, width).repeat(height, 1)
+    depth[6, 8:16] = torch.tensor([np.nan, np.inf, 0.0, -1.0, 1e-4, 1e-30, 3e38, 5.0])
+    alpha[9, 10:14] = torch.tensor([np.nan, 0.0, 0.5, 1.0])
+    return depth, alpha
+
+
+def placed(fields: DisplacementFields, device: torch.device) -> DisplacementFields:
+    return DisplacementFields(*(field.to(device) for field in fields[:3]))

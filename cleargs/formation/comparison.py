@@ -1,0 +1,215 @@
+"""How well numbers of a motion explain a raw frame: the comparison of frame and render at one size.
+
+The difference of high-passed luminance in linear light counts. A quarter of the pixels, in blocks, takes no
+part in a fit: they judge which model explains the frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis
+from cleargs.formation.warp import samples
+from cleargs.media.colour import LUMA, linear_from_srgb
+from cleargs.splat.backend import SearchKernels, search_kernels
+from cleargs.splat.camera import Camera
+from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
+
+LEVELS = ((160, 6), (320, 5), (640, 3))
+"""Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
+NEAR_SIZE = 1.5
+"""An image that is larger than a level by less is that level itself."""
+
+FINE, COARSE = samples(13), samples(9)
+"""Sample times of an exposure."""
+DISC = samples(32)
+
+HIGH_PASS = 6.0
+"""Standard deviation in pixels of the Gaussian whose blur is taken from both images: what differs slowly, as
+light does, says nothing of motion."""
+
+OUTLIER, LIMIT = 0.03, 0.1
+"""Differences of linear light from which they count linearly, and no further."""
+
+MIN_MISFIT = 5e-4
+"""Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
+
+JUDGE_BLOCK, JUDGE_EVERY = 16, 4
+"""Side in pixels of the blocks of which every fourth judges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A raw frame and the render that should explain it.
+
+    ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
+    every side; ``camera`` is the frame's.
+    """
+
+    luminance: Floats  # [H + 2 margin, W + 2 margin] linear light
+    depth: Floats
+    alpha: Floats
+    observed: Floats  # [H, W] linear luminance
+    weight: Floats  # [H, W] 0 where a pixel does not count
+    camera: Camera
+    margin: int
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A model of a frame, and how well it explains it."""
+
+    model: Model
+    motion: FrameMotion
+    misfit: float
+    """Mean difference that remains on the judging pixels, each at most `LIMIT`."""
+    misfit_still: float
+    """The same without any motion."""
+
+    @property
+    def explained(self) -> float:
+        """Share of the misfit that the model takes away."""
+        return explained_share(self.misfit, self.misfit_still)
+
+
+def explained_share(misfit: float, misfit_still: float) -> float:
+    """Share of ``misfit_still`` that is gone in ``misfit``; 0 where there was next to nothing."""
+    return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
+
+
+def luminance(image: Floats) -> Floats:
+    """Linear luminance [H, W] of an sRGB image."""
+    kr, kb = LUMA["bt709"]
+    # einsum, not BLAS, whose order of summation may depend on its threads.
+    weights = np.array([kr, 1.0 - kr - kb, kb], np.float32)
+    return np.asarray(np.einsum("hwc,c->hw", linear_from_srgb(image), weights))
+
+
+def scales(sight: Sight) -> list[float]:
+    """The sizes at which a frame is compared, as shares of its own, the coarsest first."""
+    longest = max(sight.observed.shape)
+    sizes = [size for size, _ in LEVELS if size < longest] or [longest]
+    if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
+        sizes[-1] = longest
+    elif sizes[-1] < longest <= LEVELS[-1][0]:
+        sizes.append(longest)
+    return [size / longest for size in sizes]
+
+
+class Level:
+    """The problem at one size."""
+
+    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels | None) -> None:
+        self._kernels = kernels or search_kernels()
+        margin = sight.margin
+        height, width = sight.luminance.shape
+        size = max(2, round(scale * width)), max(2, round(scale * height))
+
+        def reduced(image: Floats) -> Floats:
+            return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+        inner = np.s_[margin : height - margin, margin : width - margin]
+        # Beyond the frame's border the render stands in, so that both are high-passed alike there.
+        observed, weight = sight.luminance.copy(), np.zeros_like(sight.luminance)
+        observed[inner], weight[inner] = sight.observed, sight.weight
+        self._image, self._observed = _high_passed(reduced(sight.luminance)), _high_passed(reduced(observed))
+        counted = (reduced(weight) > 0.99).astype(np.float32)
+        judging = _judging(counted.shape)
+        self._fitting, self._judging = counted * ~judging, counted * judging
+        if not self._judging.any():  # an image of a few blocks
+            self._judging = self._fitting = counted
+        self._total = float(self._judging.sum(dtype=np.float64))
+        depth, alpha = reduced(sight.depth), reduced(sight.alpha)
+        self.median = _median_depth(sight)
+        self.nearness = _nearness(depth, alpha, self.median)
+        self._camera = replace(
+            sight.camera,
+            width=width,
+            height=height,
+            cx=sight.camera.cx + margin,
+            cy=sight.camera.cy + margin,
+        )
+        self._basis = flow_basis(self._camera, self.nearness)
+        self.scale = size[0] / width
+        rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
+        self._down = (rows / sight.camera.height - 0.5).astype(np.float32)
+        slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
+        self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
+
+    def judged(self, model: Model, motion: FrameMotion) -> Explanation:
+        """How well a motion explains the pixels that judge."""
+        total = max(self._total, 1.0)
+        still = self._misfit(FrameMotion(), FINE, self._judging) / total
+        misfit = (
+            still if model == "none" else self._misfit(motion, _samples_for(model), self._judging) / total
+        )
+        return Explanation(model, motion, misfit, still)
+
+    def cost(self, motion: FrameMotion, times: Floats | None = None) -> float:
+        """What is left on the pixels that fit."""
+        return self._misfit(motion, FINE if times is None else times, self._fitting)
+
+    def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
+        fields = self.fields(motion)
+        return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
+
+    def fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
+        """Offset, sweep and radius: see `DisplacementFields`."""
+
+        def flow(twist: Vector) -> Floats:
+            if not twist.any():
+                return np.zeros(self._basis.shape[1:], np.float32)
+            # einsum, for its fixed order of summation.
+            return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
+
+        offset = flow(motion.pose) + flow(motion.skew) * self._down[:, None]
+        radius = np.abs(self.nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self.scale)
+        return offset, flow(motion.blur), radius
+
+    def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[Vector, Vector]:
+        """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
+        offset, sweep, _ = self.fields(motion)
+        return self._kernels.normal_equations(
+            self._stack,
+            self._observed,
+            self._fitting,
+            self._basis,
+            self._down,
+            offset,
+            sweep,
+            FINE[:, 0].copy(),
+            OUTLIER,
+            active,
+        )
+
+
+def _samples_for(model: Model) -> Floats:
+    return DISC if model == "defocus" else FINE
+
+
+def _judging(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """True in every fourth block, no two of which share a side: bool [H, W]."""
+    row, column = (np.arange(side) // JUDGE_BLOCK for side in shape)
+    return np.asarray((column[None] + 2 * row[:, None]) % JUDGE_EVERY == 0)
+
+
+def _median_depth(sight: Sight) -> float:
+    depth, alpha = sight.depth[::4, ::4], sight.alpha[::4, ::4]
+    seen = (alpha > MIN_COVERED) & (depth > 0.0)
+    return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
+
+
+def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
+    """As in the kernel `displacements`."""
+    seen = (alpha > MIN_COVERED) & (depth > 0.0)
+    near = np.ones_like(depth)
+    near[seen] = np.minimum(np.float32(median) * alpha[seen] / depth[seen], MAX_NEARNESS)
+    return near
+
+
+def _high_passed(image: Floats) -> Floats:
+    return np.asarray(image - cv2.GaussianBlur(image, (0, 0), HIGH_PASS), np.float32)

@@ -1,0 +1,3 @@
+"""The back end of a test."""
+
+from helpers.devices import device as device
