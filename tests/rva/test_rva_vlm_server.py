@@ -22,7 +22,7 @@ from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
 from cleargs.rivr.supervision import load_supervision
 from cleargs.rva import tables
-from cleargs.rva.config import RvaConfig
+from cleargs.stages.rva import RvaConfig
 
 MODEL = "Qwen/Qwen3-VL-8B-Instruct"
 

@@ -22,7 +22,7 @@ from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_ope
 
 from cleargs.errors import InputError, StageError
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.picture_scorer import UnscoredError
+from cleargs.rva.vlm.picture import UnscoredError
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"

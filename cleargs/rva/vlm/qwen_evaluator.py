@@ -10,12 +10,10 @@ import numpy as np
 
 from cleargs.errors import StageError
 from cleargs.progress import Reporter
-from cleargs.rva.evaluator import View
-from cleargs.rva.item_cache import ItemCache, view_digest
-from cleargs.rva.scores import Floats
+from cleargs.rva.arrays import Floats
+from cleargs.rva.evaluator import ItemCache, View, view_digest
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.vlm.picture import load_picture
-from cleargs.rva.vlm.picture_scorer import PictureScorer, UnscoredError
+from cleargs.rva.vlm.picture import PictureScorer, UnscoredError, load_picture
 from cleargs.rva.vlm.prompt import VERSION
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.scores import Floats
 from cleargs.rva.vlm.chat import ChatClient, RefusedError, UnreachableError
-from cleargs.rva.vlm.picture import Picture
-from cleargs.rva.vlm.picture_scorer import UnscoredError
-from cleargs.rva.vlm.prompt import prompt_text, reply_schema
-from cleargs.rva.vlm.reply import ReplyError, parse_reply
+from cleargs.rva.vlm.picture import Picture, UnscoredError
+from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 _REPEATED = 2000  # characters of a faulty reply that the model is shown again
 
