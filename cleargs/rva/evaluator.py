@@ -12,8 +12,11 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
+from cleargs.errors import InputError, StoreError
 from cleargs.files import write_json
+from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
 from cleargs.rva.arrays import Floats
 from cleargs.untrusted import read_json
@@ -27,6 +30,18 @@ class View:
     image: Path
     mask: Path | None = None
     """8-bit image of the same size; pixels that are 0 in it are ignored."""
+
+
+def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
+    """The frame [H, W, 3] in sRGB and its mask [H, W]. Raises StoreError when one cannot be read."""
+    hint = "run again with --force ingest"
+    try:
+        rgb, mask = read_rgb(view.image), read_mask(view.mask) if view.mask else None
+    except InputError as error:
+        raise StoreError(str(error), hint=hint) from error
+    if mask is not None and mask.shape != rgb.shape[:2]:
+        raise StoreError(f"the mask {view.mask} differs in size from its image", hint=hint)
+    return rgb, mask
 
 
 class Evaluator(Protocol):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
+from cleargs.errors import InputError
 from cleargs.plugins import load_part
 from cleargs.rva.config import EVALUATORS, EvaluatorConfig
 from cleargs.rva.evaluator import Evaluator
 
 if TYPE_CHECKING:
-    from cleargs.rva.vlm.picture import PictureScorer
+    from cleargs.rva.vlm.evaluator import PictureScorer
 
 
 def check_evaluator(config: EvaluatorConfig) -> None:
@@ -27,9 +30,7 @@ def check_evaluator(config: EvaluatorConfig) -> None:
 
         check_folder(Path(config.qwen.model_dir).expanduser().absolute())
         return
-    from cleargs.rva.vlm.chat import ChatClient
-
-    ChatClient(config.qwen).check_model()
+    _server().ChatClient(config.qwen).check_model()
 
 
 def make_evaluator(
@@ -53,7 +54,7 @@ def make_evaluator(
     if config.evaluator not in EVALUATORS:
         maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
         return maker(seed=seed, device=device, cache=cache)
-    from cleargs.rva.vlm.qwen_evaluator import QwenEvaluator
+    from cleargs.rva.vlm.evaluator import QwenEvaluator
 
     if cache is None:
         raise ValueError("qwen3-vl needs a cache folder")
@@ -63,7 +64,16 @@ def make_evaluator(
 
         scorer = LocalPictureScorer(config.qwen, device=device)
     else:
-        from cleargs.rva.vlm.server import ServerPictureScorer
-
-        scorer = ServerPictureScorer(config.qwen, seed=seed)
+        scorer = _server().ServerPictureScorer(config.qwen, seed=seed)
     return QwenEvaluator(scorer, image_size=config.qwen.image_size, cache=cache)
+
+
+def _server() -> ModuleType:
+    """`cleargs.rva.vlm.server`. Raises InputError where its HTTP client is not installed."""
+    try:
+        return import_module("cleargs.rva.vlm.server")
+    except ImportError as error:
+        raise InputError(
+            f"the client of a qwen3-vl server cannot be loaded: {error.msg}",
+            hint="pip install 'cleargs[server]'",
+        ) from error

@@ -13,15 +13,13 @@ of length L acts along its own direction only, where s = L / sqrt(12), while def
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cleargs.errors import StoreError
 from cleargs.rva.arrays import Floats
-from cleargs.rva.evaluator import View
+from cleargs.rva.evaluator import View, load_view
 
 Plane = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -88,20 +86,7 @@ def _shrink(plane: Plane, size: tuple[int, int]) -> Plane:  # size: (width, heig
 
 def load_luminance(view: View) -> Luminance:
     """Read a frame and its mask from disk. Raises StoreError when one cannot be read."""
-    rgb = _read(view.image, cv2.IMREAD_COLOR_RGB)
-    mask = _read(view.mask, cv2.IMREAD_GRAYSCALE) if view.mask else None
-    if mask is not None and mask.shape != rgb.shape[:2]:
-        raise StoreError(
-            f"the mask {view.mask} differs in size from its image", hint="run again with --force ingest"
-        )
-    return reduce_luminance(rgb, mask)
-
-
-def _read(path: Path, flags: int) -> npt.NDArray[np.uint8]:
-    image = cv2.imread(str(path), flags)
-    if image is None:
-        raise StoreError(f"cannot read {path} as an image", hint="run again with --force ingest")
-    return np.asarray(image, dtype=np.uint8)
+    return reduce_luminance(*load_view(view))
 
 
 def away_from_masked(valid: Mask, radius: int) -> Mask:

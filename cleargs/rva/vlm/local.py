@@ -18,7 +18,7 @@ import torch
 from cleargs.errors import InputError
 from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.vlm.picture import Picture, UnscoredError
+from cleargs.rva.vlm.evaluator import Picture, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 _IMAGE = "<|image_pad|>"
