@@ -197,13 +197,12 @@ def score_frames(
     """
     import pyarrow as pa
 
-    from cleargs.rva.config import RvaConfig
-    from cleargs.rva.evaluator import View, make_evaluator
-    from cleargs.rva.scores import appearance_scores
+    from cleargs.rva.allocation import appearance_scores
+    from cleargs.rva.evaluator import View
+    from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import CUE_COLUMNS
 
-    config = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
-    assert isinstance(config, RvaConfig)
+    config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     with tempfile.TemporaryDirectory() as cache:
         views = [View(number, Path(path)) for number, path in enumerate(paths)]
         cues = make_evaluator(config, cache=Path(cache)).evaluate(

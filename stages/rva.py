@@ -6,7 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
-from cleargs.rva.config import RvaConfig
+from cleargs.rva.config import AssessmentConfig, EvaluatorConfig
+
+
+class RvaConfig(AssessmentConfig, EvaluatorConfig):
+    """Reliability-aware View Allocation. The defaults are the paper's but for `active_share`."""
+
 
 VERSION = 4
 CONFIG = RvaConfig
@@ -31,7 +36,7 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
 def preflight(config: RvaConfig) -> None:
     """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
     holds none that can be loaded."""
-    from cleargs.rva.evaluator import check_evaluator
+    from cleargs.rva.evaluators import check_evaluator
 
     check_evaluator(config)
 
@@ -62,10 +67,10 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
 
     from cleargs.capture.tables import load_frames, load_observations
     from cleargs.parquet import write_table
-    from cleargs.rva.assessment import Observations, assess
-    from cleargs.rva.evaluator import View, label, make_evaluator
+    from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
+    from cleargs.rva.evaluator import View, label
+    from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import BINS, FRAMES
-    from cleargs.rva.tabulate import bins_table, frames_table, poses_from, summary
 
     config, ingest = context.config, context.inputs["ingest"]
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]

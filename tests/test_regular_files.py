@@ -15,7 +15,7 @@ from cleargs.media.image import image_size
 from cleargs.models.install import read_checked
 from cleargs.models.registry import find_model, read_receipt
 from cleargs.report.report_json import noted
-from cleargs.rva.item_cache import ItemCache
+from cleargs.rva.evaluator import ItemCache
 
 DEEP = "[" * 200_000
 

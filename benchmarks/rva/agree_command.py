@@ -32,7 +32,6 @@ from cleargs.progress import Reporter
 if TYPE_CHECKING:
     from benchmarks.rva.agreement import Agreement, EvaluatorCues
     from cleargs.capture.tables import Frame
-    from cleargs.rva.config import RvaConfig
 
 FOLDER = "agree"
 """Where ``agree`` keeps scores, figures and pictures inside the run."""
@@ -128,10 +127,8 @@ def agree(
     return DONE_IN_PART if any(unscored.values()) else 0
 
 
-def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> RvaConfig:
+def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> Any:
     """The run's settings of RVA with another evaluator: NAME, or NAME:MODEL. Raises ConfigError."""
-    from cleargs.rva.config import RvaConfig
-
     evaluator, _, model = name.partition(":")
     document = config.document()
     for text in overrides:
@@ -139,12 +136,10 @@ def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> Rv
     change: dict[str, Any] = {"evaluator": evaluator}
     if model:
         change["qwen"] = {"model": model, "model_dir": ""}
-    section = check_document(dag, merge(document, {"rva": change})).sections["rva"]
-    assert isinstance(section, RvaConfig)
-    return section
+    return check_document(dag, merge(document, {"rva": change})).sections["rva"]
 
 
-def _own_cues(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Frame]) -> EvaluatorCues | None:
+def _own_cues(dag: Dag, run: Path, config: Any, frames: Sequence[Frame]) -> EvaluatorCues | None:
     """The cues in the run's own table, where this evaluator made them of these images; else None."""
     import numpy as np
 
@@ -172,7 +167,7 @@ def _own_cues(dag: Dag, run: Path, config: RvaConfig, frames: Sequence[Frame]) -
 def _cues_of(
     run: Path,
     ingest: Path,
-    config: RvaConfig,
+    config: Any,
     frames: Sequence[Frame],
     seed: int,
     device: Any,
@@ -181,7 +176,8 @@ def _cues_of(
 ) -> EvaluatorCues:
     """Score the frames, or take what RUN/agree keeps of an earlier call."""
     from benchmarks.rva.agreement import EvaluatorCues
-    from cleargs.rva.evaluator import View, label, make_evaluator
+    from cleargs.rva.evaluator import View, label
+    from cleargs.rva.evaluators import make_evaluator
 
     evaluator = make_evaluator(config, seed=seed, device=device, cache=run / FOLDER / "scores")
     views = [

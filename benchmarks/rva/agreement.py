@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import rankdata
 
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.scores import Floats, appearance_scores, is_reliable
+from cleargs.rva.allocation import appearance_scores, is_reliable
+from cleargs.rva.arrays import Floats
+from cleargs.rva.config import ScoreConfig
 from cleargs.rva.tables import CUE_COLUMNS
 
 
@@ -70,7 +71,7 @@ class Agreement:
         }
 
 
-def compare(first: EvaluatorCues, second: EvaluatorCues, config: RvaConfig, *, most: int) -> Agreement:
+def compare(first: EvaluatorCues, second: EvaluatorCues, config: ScoreConfig, *, most: int) -> Agreement:
     """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.

@@ -66,7 +66,7 @@ def _check(run: Path, dag: Dag) -> Check:
 
     from benchmarks.rva.truth import Faults, check
     from cleargs.parquet import read_table
-    from cleargs.rva.scores import Floats
+    from cleargs.rva.arrays import Floats
     from cleargs.rva.tables import B_CUES, FRAMES
     from cleargs.synth.develop import FRAMES as TRUE_FRAMES
 

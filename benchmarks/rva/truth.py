@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.rva.agreement import spearman
-from cleargs.rva.scores import Bools, Floats
+from cleargs.rva.arrays import Bools, Floats
 
 MIN_BLUR_PX = 1.0
 """px: a shorter motion is no fault, and all such frames are equal."""

@@ -53,7 +53,15 @@ class Capture:
 
 
 class Layout(Protocol):
-    """How an input is read; a module, say."""
+    """How an input is read; a module, say.
+
+    Another package's layout is taken by name and needs no ``detect``.
+    """
+
+    def detect(self, source: Path, *, poses: bool) -> bool:
+        """Whether the input at ``source`` has this layout. Looks at names only; without ``poses``, files of
+        poses count for nothing."""
+        ...
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Role -> file, folder, or single files by name: all that is read.
@@ -66,13 +74,4 @@ class Layout(Protocol):
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:
         """The frames in trajectory order, at most ``config.max_frames``, with what is known of cameras and
         poses. Decodes no frame; changes nothing. Raises InputError."""
-        ...
-
-
-class ShippedLayout(Layout, Protocol):
-    """A layout of ours, which ``ingest.layout=auto`` may find."""
-
-    def detect(self, source: Path, *, poses: bool) -> bool:
-        """Whether the input at ``source`` has this layout. Looks at names only; without ``poses``, files of
-        poses count for nothing."""
         ...

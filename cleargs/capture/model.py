@@ -36,6 +36,10 @@ class ModelImage:
     xy: NDArray[np.float64]  # [K, 2] px, the centre of the first pixel is 0.5
     point_ids: NDArray[np.int64]  # [K]
 
+    def kept(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
+        """With these keypoints alone."""
+        return replace(self, xy=self.xy[which], point_ids=self.point_ids[which])
+
 
 @dataclass(frozen=True)
 class SparseModel:
@@ -48,6 +52,12 @@ class SparseModel:
     error: NDArray[np.float64]  # [P] mean reprojection error, px
     dropped: int = 0
     """Points of the file that are not finite, and were left out."""
+
+    def kept(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
+        """With these points alone, in the images too."""
+        ids = self.point_ids[which]
+        images = {key: image.kept(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
+        return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -131,8 +141,10 @@ def _require_whole(folder: Path) -> None:
         return at + 24 + 8 * len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
 
     def image(data: bytes, at: int) -> int:
-        keypoints = data.index(b"\0", at + 64) + 1
-        return keypoints + 8 + _POINT2D.itemsize * _count(data, keypoints)
+        end = data.find(b"\0", at + 64)  # of the name
+        if end < 0:
+            raise struct.error
+        return end + 9 + _POINT2D.itemsize * _count(data, end + 1)
 
     def point(data: bytes, at: int) -> int:
         return at + 51 + 8 * _count(data, at + 43)

@@ -89,12 +89,8 @@ def publish(
             "no sparse point is seen by two frames",
             hint="record with more texture and overlap between frames",
         )
-    views = [_restricted(view, model.point_ids[kept]) for view in views]
     rgb_mean = np.rint(sums[kept] / samples[kept, None]).astype(np.uint8)
-    published = SparseModel(
-        cameras={}, images={}, point_ids=model.point_ids[kept], xyz=model.xyz[kept], error=model.error[kept]
-    )
-    published = _with_views(published, views)
+    published = _with_views(model, views).kept(kept)
     _write_tables(out, views, test, published, rgb_mean, counts[kept])
     write_model(out / "colmap" / "sparse" / "0", published, rgb_mean)
     return published
@@ -139,17 +135,7 @@ def _write_picture(
 def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
     """The observations in the published image; those in the cropped margin are gone."""
     xy = undistortion.points(image.xy)
-    inside = undistortion.inside(xy)
-    return ModelImage(image.name, image.camera_id, image.pose, xy[inside], image.point_ids[inside])
-
-
-def _restricted(view: _View, point_ids: NDArray[np.int64]) -> _View:
-    if view.image is None:
-        return view
-    image = view.image
-    keep = np.isin(image.point_ids, point_ids)
-    kept = ModelImage(image.name, image.camera_id, image.pose, image.xy[keep], image.point_ids[keep])
-    return replace(view, image=kept)
+    return replace(image, xy=xy).kept(undistortion.inside(xy))
 
 
 def _track_lengths(views: Sequence[_View], point_ids: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -167,10 +153,9 @@ def _with_views(model: SparseModel, views: Sequence[_View]) -> SparseModel:
     for index, view in enumerate(views):
         if view.image is not None:
             camera_id = ids.setdefault(view.camera, len(ids) + 1)
-            image = view.image
-            images[index + 1] = ModelImage(image.name, camera_id, image.pose, image.xy, image.point_ids)
+            images[index + 1] = replace(view.image, camera_id=camera_id)
     cameras = {camera_id: camera for camera, camera_id in ids.items()}
-    return SparseModel(cameras, images, model.point_ids, model.xyz, model.error)
+    return replace(model, cameras=cameras, images=images)
 
 
 def _write_tables(
@@ -181,7 +166,10 @@ def _write_tables(
     rgb: NDArray[np.uint8],
     track_length: NDArray[np.int32],
 ) -> None:
-    rows = [_frame_row(index, view, "test" if index in test else "train") for index, view in enumerate(views)]
+    rows = [
+        _frame_row(index, view, model.images.get(index + 1), "test" if index in test else "train")
+        for index, view in enumerate(views)
+    ]
     write_table(out / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
     points = {
         "point_id": model.point_ids,
@@ -191,9 +179,7 @@ def _write_tables(
         "track_length": track_length,
     }
     write_table(out / "points.parquet", pa.table(points, POINTS), POINTS)
-    seen = [
-        (index, np.sort(view.image.point_ids)) for index, view in enumerate(views) if view.image is not None
-    ]
+    seen = [(key - 1, np.sort(image.point_ids)) for key, image in model.images.items()]
     observations = {
         "frame_id": np.concatenate([np.full(len(ids), index, np.int32) for index, ids in seen]),
         "point_id": np.concatenate([ids for _, ids in seen]),
@@ -201,7 +187,7 @@ def _write_tables(
     write_table(out / "observations.parquet", pa.table(observations, OBSERVATIONS), OBSERVATIONS)
 
 
-def _frame_row(index: int, view: _View, split: str) -> dict[str, object]:
+def _frame_row(index: int, view: _View, image: ModelImage | None, split: str) -> dict[str, object]:
     (fx, fy), (cx, cy) = view.camera.focal, view.camera.centre
     row: dict[str, object] = {
         "frame_id": index,
@@ -214,13 +200,13 @@ def _frame_row(index: int, view: _View, split: str) -> dict[str, object]:
         "fy": fy,
         "cx": cx,
         "cy": cy,
-        "registered": view.image is not None,
-        "n_points": 0 if view.image is None else len(view.image.point_ids),
+        "registered": image is not None,
+        "n_points": 0 if image is None else len(image.point_ids),
         "split": split,
         "placed": view.placed,
     }
-    if view.image is not None:
-        pose = view.image.pose
+    if image is not None:
+        pose = image.pose
         row.update(zip(("qw", "qx", "qy", "qz"), pose.quaternion, strict=True))
         row.update(zip(("tx", "ty", "tz"), pose.translation.tolist(), strict=True))
     return row

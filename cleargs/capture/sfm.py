@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,16 +25,14 @@ from cleargs.capture.prepare import WorkFrame
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
+from cleargs.record import Record
 from cleargs.untrusted import FAULTS, cause, read_json
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
 
-GIVEN_POSES = "given_poses.json"
-"""In the folder of the model: how far the input's poses missed, and whether they were refined."""
-
-PLACED = "placed.json"
-"""In the folder of the model: how SfM placed each working image, or why it did not."""
+OUTCOME = "outcome.json"
+"""In the folder of the model: what COLMAP's process says of it, an `Outcome`."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -42,6 +41,17 @@ _ADVICE = (
     "record more frames (ingest.fps, ingest.max_frames) with slower motion, "
     "try another ingest.camera_model, or raise ingest.feature_size"
 )
+
+
+class Outcome(Record):
+    """How a model came about."""
+
+    placed: dict[str, str]
+    """How SfM placed each working image, or why it did not; empty where the input brought poses."""
+    missed_px: float | None
+    """Median reprojection error at the input's poses; None where it brought none."""
+    refined: bool
+    """Whether they were adjusted."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +85,10 @@ def reconstruct(
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
-        model = _run(_sfm_job(frames, config), folder, config, seed, threads, reporter)
+        model, outcome = _run(frames, None, folder, config, seed, threads, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity, None, False, _placed_by_sfm(folder))
+        return Reconstruction(_moved(model, similarity), similarity, None, False, outcome.placed)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
     adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
@@ -91,14 +101,14 @@ def reconstruct(
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             return Reconstruction(adopted, similarity, missed, False, _placed_by_input(frames, refined=False))
     poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
-    model = _run(_triangulation_job(posed, poses), folder, config, seed, threads, reporter)
+    model, outcome = _run(posed, poses, folder, config, seed, threads, reporter)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",
             hint="check that poses, axes (OpenGL camera to world) and images belong together, "
             "or set ingest.poses=sfm",
         )
-    missed, refined = _what_became_of_poses(folder)
+    missed, refined = outcome.missed_px or 0.0, outcome.refined
     if refined:
         reporter.info(
             f"at the input's poses features missed their points by {missed:.1f} px (median): adjusted to the "
@@ -121,84 +131,72 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What COLMAP gets: working images, their cameras, and the poses if they are known."""
+def _run(
+    frames: Sequence[WorkFrame],
+    poses: Sequence[Pose] | None,
+    folder: Path,
+    config: SfmConfig,
+    seed: int,
+    threads: int,
+    reporter: Reporter,
+) -> tuple[SparseModel, Outcome]:
+    """Let COLMAP do its work, unless a killed run got as far as the model."""
+    if (found := _resumed(folder, reporter)) is not None:
+        return found
+    masked = any(frame.masked for frame in frames)
+    job = {
+        **_job(frames, poses, config),
+        "folder": str(folder.resolve()),
+        "images": str((folder / "images").resolve()),
+        "masks": str((folder / "masks").resolve()) if masked else None,
+        "seed": seed,
+        "threads": threads,
+    }
+    write_json(folder / "job.json", job)
+    run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", reporter)
+    return _read(folder / "model")
 
-    names: list[str]
-    cameras: list[Camera]
-    camera_of: list[int]
-    poses: list[list[list[float]]] | None
-    exif_images: list[str | None]
-    """For each camera an input image that may state its focal length."""
-    masked: bool
 
+def _job(frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, config: SfmConfig) -> dict[str, Any]:
+    """What COLMAP gets: working images, their cameras, the poses if they are known, and settings.
 
-def _sfm_job(frames: Sequence[WorkFrame], config: SfmConfig) -> _Job:
-    """All frames of one size share a camera; without ``shared_camera`` each has its own."""
-    owners = [f"{frame.width}x{frame.height}" if config.shared_camera else frame.image for frame in frames]
+    Without poses, frames of one size share a camera, or each frame has its own; an input image of each camera
+    may state its focal length.
+    """
+    if poses is not None:
+        owners: list[object] = [frame.camera for frame in frames]
+    elif config.shared_camera:
+        owners = [(frame.width, frame.height) for frame in frames]
+    else:
+        owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
-    cameras = [_starting_camera(frames[owners.index(owner)], config) for owner in numbers]
-    first = [frames[owners.index(owner)].source for owner in numbers]
-    return _Job(
-        names=[frame.image for frame in frames],
-        cameras=cameras,
-        camera_of=[numbers[owner] for owner in owners],
-        poses=None,
-        exif_images=[None if source.pts is not None else str(source.path.resolve()) for source in first],
-        masked=any(frame.masked for frame in frames),
-    )
+    first = [frames[owners.index(owner)] for owner in numbers]
+    cameras = [_starting_camera(frame, config) if poses is None else frame.camera for frame in first]
+    stated = [poses is None and frame.source.pts is None for frame in first]
+    matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses or ()]
+    return {
+        "names": [frame.image for frame in frames],
+        "cameras": [asdict(camera) for camera in cameras if camera is not None],
+        "camera_of": [numbers[owner] for owner in owners],
+        "poses": None if poses is None else matrices,
+        "exif_images": [
+            str(frame.source.path.resolve()) if may else None
+            for frame, may in zip(first, stated, strict=True)
+        ],
+        **config.model_dump(
+            include={"max_features", "exhaustive_below", "overlap", "loop_candidates", "refine_above"}
+        ),
+    }
 
 
 def _starting_camera(frame: WorkFrame, config: SfmConfig) -> Camera:
     """COLMAP's first guess: focal length 1.2 long sides, no distortion."""
     focal = 1.2 * max(frame.width, frame.height)
     guess = pycolmap.Camera.create_from_model_name(1, config.camera_model, focal, frame.width, frame.height)
-    return Camera(
-        config.camera_model, frame.width, frame.height, tuple(float(value) for value in guess.params)
-    )
+    return Camera(config.camera_model, frame.width, frame.height, tuple(guess.params.tolist()))
 
 
-def _triangulation_job(frames: Sequence[WorkFrame], poses: Sequence[Pose]) -> _Job:
-    cameras: list[Camera] = []
-    camera_of: list[int] = []
-    for frame in frames:
-        assert frame.camera is not None
-        if frame.camera not in cameras:
-            cameras.append(frame.camera)
-        camera_of.append(cameras.index(frame.camera))
-    matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses]
-    masked = any(frame.masked for frame in frames)
-    return _Job(
-        [frame.image for frame in frames], cameras, camera_of, matrices, [None] * len(cameras), masked
-    )
-
-
-def _run(
-    job: _Job, folder: Path, config: SfmConfig, seed: int, threads: int, reporter: Reporter
-) -> SparseModel:
-    """Let COLMAP do the job, unless a killed run got as far as the model."""
-    if (model := _resumed(folder, reporter, posed=job.poses is not None)) is None:
-        settings = {
-            **asdict(job),
-            "folder": str(folder.resolve()),
-            "images": str((folder / "images").resolve()),
-            "masks": str((folder / "masks").resolve()) if job.masked else None,
-            "seed": seed,
-            "threads": threads,
-            "max_features": config.max_features,
-            "exhaustive_below": config.exhaustive_below,
-            "overlap": config.overlap,
-            "loop_candidates": config.loop_candidates,
-            "refine_above": config.refine_above,
-        }
-        write_json(folder / "job.json", settings)
-        run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", reporter)
-        model = read_model(folder / "model")
-    return model
-
-
-def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | None:
+def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | None:
     """The model that a killed run left in ``folder``, or None.
 
     What is damaged, COLMAP's database too, is thrown away with a warning.
@@ -206,9 +204,7 @@ def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | 
     model, database = folder / "model", folder / "database.db"
     if model.exists():
         try:
-            found = read_model(model)
-            (_what_became_of_poses if posed else _placed_by_sfm)(folder)
-            return found
+            return _read(model)
         except InputError as error:
             reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
             remove(model)
@@ -219,6 +215,14 @@ def _resumed(folder: Path, reporter: Reporter, *, posed: bool) -> SparseModel | 
     return None
 
 
+def _read(folder: Path) -> tuple[SparseModel, Outcome]:
+    """The model and the outcome that COLMAP's process wrote. Raises InputError where one is damaged."""
+    try:
+        return read_model(folder), Outcome.model_validate(read_json(folder / OUTCOME))
+    except FAULTS as error:
+        raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
+
+
 def _sound(database: Path) -> bool:
     """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
     try:
@@ -226,23 +230,6 @@ def _sound(database: Path) -> bool:
             return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
     except sqlite3.Error:
         return False
-
-
-def _what_became_of_poses(folder: Path) -> tuple[float, bool]:
-    """Median reprojection error at the given poses, px, and whether they were refined."""
-    try:
-        said = read_json(folder / "model" / GIVEN_POSES)
-        return float(said["missed_px"]), bool(said["refined"])
-    except FAULTS as error:
-        raise InputError(f"{GIVEN_POSES} cannot be read: {cause(error)}", hint="run ingest again") from error
-
-
-def _placed_by_sfm(folder: Path) -> dict[str, str]:
-    """What SfM says of each working image."""
-    try:
-        return {str(name): str(word) for name, word in read_json(folder / "model" / PLACED).items()}
-    except FAULTS as error:
-        raise InputError(f"{PLACED} cannot be read: {cause(error)}", hint="run ingest again") from error
 
 
 def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, str]:
@@ -257,16 +244,8 @@ def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
 
 def _within_reach(model: SparseModel) -> SparseModel:
     """The model without the points beyond `FARTHEST`, which single precision may not hold."""
-    near = (np.abs(model.xyz) < FARTHEST).all(axis=1)  # infinite ones, and NaN, are not
-    if near.all():
-        return model
-    ids = model.point_ids[near]
-    images = {}
-    for key, image in model.images.items():
-        seen = np.isin(image.point_ids, ids)
-        images[key] = replace(image, xy=image.xy[seen], point_ids=image.point_ids[seen])
-    dropped = model.dropped + int((~near).sum())
-    return SparseModel(model.cameras, images, ids, model.xyz[near], model.error[near], dropped)
+    near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
+    return replace(model.kept(near), dropped=model.dropped + int((~near).sum()))
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:

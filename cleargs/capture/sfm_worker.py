@@ -94,13 +94,15 @@ def main() -> int:
     _match(job, database, pairs, _FIRST, channel)
     partial = folder / "model.partial"
     make_folder(partial, empty=True)
+    placed: dict[str, str] = {}
+    missed, refined = None, False
     if job["poses"] is None:
         model = _map(job, database, partial, channel)
         if model is not None:
             model, placed = _place_the_rest(job, database, pairs, model, partial, channel)
     else:
         model = _triangulate(job, database, partial, channel)
-        missed, refined = _median_error(model), False
+        missed = _median_error(model)
         if missed > job["refine_above"]:
             adjusted = _refine(job, database, copy.deepcopy(model), partial, channel)
             if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
@@ -113,11 +115,8 @@ def main() -> int:
         return 3
     make_folder(partial, empty=True)
     model.write_binary(partial)
-    if job["poses"] is None:
-        (partial / "placed.json").write_text(json.dumps(placed), encoding="utf-8")
-    else:
-        said = {"missed_px": missed, "refined": refined}
-        (partial / "given_poses.json").write_text(json.dumps(said), encoding="utf-8")
+    outcome = {"placed": placed, "missed_px": missed, "refined": refined}
+    (partial / "outcome.json").write_text(json.dumps(outcome), encoding="utf-8")
     sync_tree(partial)
     partial.rename(folder / "model")
     sync(folder)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from cleargs.capture.capture import Capture, External, Layout, ShippedLayout
+from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.layouts import colmap, images, llff, transforms, video
 from cleargs.capture.layouts.video import MIN_FRAMES
 from cleargs.errors import InputError
 from cleargs.plugins import load_part
 
-LAYOUTS: tuple[ShippedLayout, ...] = (video, transforms, colmap, llff, images)
+LAYOUTS: tuple[Layout, ...] = (video, transforms, colmap, llff, images)
 
 
 def layout_of(source: Path, config: CaptureConfig) -> Layout:

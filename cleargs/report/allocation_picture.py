@@ -24,10 +24,10 @@ from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb
 from cleargs.parquet import read_table
 from cleargs.rva.allocation import Role, Roles, effective_sample_size
-from cleargs.rva.geometry import Ints, camera_centres, view_directions
-from cleargs.rva.scores import Bools, Floats
+from cleargs.rva.arrays import Bools, Floats, Ints
+from cleargs.rva.assessment import poses_from
+from cleargs.rva.geometry import camera_centres, view_directions
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.rva.tabulate import poses_from
 
 SHOWN = 6
 """Most frames in a row of pictures."""

@@ -1,5 +1,5 @@
-"""Roles, coverage compensation and weights (paper, Supervision assignment and Trajectory Coverage
-Compensation).
+"""From cues to scores, roles and weights: reliability R, degradation risk B, the reliable set A (paper,
+Appearance Evidence), Supervision assignment and Trajectory Coverage Compensation.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.scores import Floats, is_reliable
+from cleargs.rva.arrays import Bools, Floats
+from cleargs.rva.config import AllocationConfig, ScoreConfig
+from cleargs.rva.tables import R_CUES
 
 Roles = npt.NDArray[np.str_]
 
@@ -24,7 +25,7 @@ class Rule(StrEnum):
     COVERAGE = "coverage"
     """Its bin had no active frame (the paper's Trajectory Coverage Compensation)."""
     ACTIVE_SHARE = "active_share"
-    """Fewer frames than `RvaConfig.active_share` of all were active."""
+    """Fewer frames than `AllocationConfig.active_share` of all were active."""
 
 
 class Role(StrEnum):
@@ -37,7 +38,37 @@ class Role(StrEnum):
     SUPPRESSED = "suppressed"
 
 
-def standard_roles(R: Floats, B: Floats, G: Floats, config: RvaConfig) -> Roles:  # [N] each
+def appearance_scores(
+    cues: Floats,  # [N, 11] in [0, 1], columns as tables.CUE_COLUMNS
+    config: ScoreConfig,
+) -> tuple[Floats, Floats]:  # R [N], B [N], both in [0, 1]
+    """R = w_R . r and B = w_B . b. The sums run cue by cue, so that a row's score needs that row alone."""
+    r, b = cues[:, : len(R_CUES)], cues[:, len(R_CUES) :]
+    R = sum((w * r[:, k] for k, w in enumerate(config.w_R)), start=np.zeros(len(cues)))
+    B = sum((w * b[:, k] for k, w in enumerate(config.w_B)), start=np.zeros(len(cues)))
+    # The weights sum to 1 up to rounding: keep a perfect frame at 1 exactly.
+    return np.clip(R, 0.0, 1.0), np.clip(B, 0.0, 1.0)
+
+
+def is_reliable(R: Floats, B: Floats, config: ScoreConfig) -> Bools:
+    """Membership in the appearance-reliable set A = {R >= tau_R, B <= tau_B}."""
+    return np.asarray((config.tau_R <= R) & (config.tau_B >= B))
+
+
+def stand_in_set(R: Floats, B: Floats, config: ScoreConfig) -> Bools:
+    """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
+
+    They take the place of an empty set A in the geometry. Rows are in trajectory order: ties go to the
+    earlier.
+    """
+    chosen = np.zeros(len(R), dtype=bool)
+    if len(R):
+        count = max(1, round(config.stand_in_share * len(R)))
+        chosen[np.argsort(B - R, kind="stable")[:count]] = True
+    return chosen
+
+
+def standard_roles(R: Floats, B: Floats, G: Floats, config: AllocationConfig) -> Roles:  # [N] each
     """The standard supervision conditions, evaluated from top to bottom; suppressed where none holds."""
     geometric = (config.geometric_G <= G) & (config.geometric_B >= B)
     auxiliary = (config.auxiliary_R <= R) & (config.auxiliary_G <= G) & (config.auxiliary_B >= B)
@@ -48,7 +79,7 @@ def standard_roles(R: Floats, B: Floats, G: Floats, config: RvaConfig) -> Roles:
     )
 
 
-def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: RvaConfig) -> Floats:
+def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: AllocationConfig) -> Floats:
     """lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z (paper, eq. tca_selection)."""
     quality = config.lambda_R * R + config.lambda_B * (1.0 - B)
     return np.asarray(config.lambda_G * G + quality + config.lambda_Z * Z)
@@ -58,7 +89,7 @@ def reactivate(
     roles: Roles,  # [N] standard roles, in trajectory order
     bins: npt.NDArray[np.int32],  # [N]
     gain: Floats,  # [N] from `reactivation_gain`
-    config: RvaConfig,
+    config: AllocationConfig,
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
     """Which suppressed frames supervise after all, and why.
 
@@ -80,8 +111,8 @@ def reactivate(
     return rules
 
 
-def supervision_weights(roles: Roles, R: Floats, G: Floats, config: RvaConfig) -> Floats:  # w [N] in [0, 1]
-    """The weight that the table gives to each role."""
+def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AllocationConfig) -> Floats:
+    """The weight w in [0, 1] that the table gives to each role."""
 
     def attenuated(mix: tuple[float, float]) -> Floats:
         return config.attenuated_base + config.attenuated_gain * (mix[0] * R + mix[1] * G)
@@ -99,7 +130,9 @@ def supervision_weights(roles: Roles, R: Floats, G: Floats, config: RvaConfig) -
     return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
 
 
-def keep_sharp(R: Floats, B: Floats, share: float, config: RvaConfig) -> tuple[Roles, Floats]:  # [N] each
+def keep_sharp(
+    R: Floats, B: Floats, share: float, config: AllocationConfig
+) -> tuple[Roles, Floats]:  # [N] each
     """Roles and weights of the baseline that drops blurry frames.
 
     ``share`` of the frames (rounded up, so at least one), best by R - B, and every reliable frame beyond it

@@ -1,5 +1,5 @@
-"""Settings of the RVA stage: every number of the paper's table tab:rva_params, and what the paper leaves
-open.
+"""Settings of the functions here: every number of the paper's table tab:rva_params, and what the paper leaves
+open. The stage's own, `cleargs.stages.rva`, inherits them.
 """
 
 from __future__ import annotations
@@ -91,8 +91,102 @@ class QwenConfig(Record):
     )
 
 
-class RvaConfig(Record):
-    """Reliability-aware View Allocation. The defaults are the paper's but for `active_share`."""
+class EvaluatorConfig(Record):
+    """Who judges the appearance of frames."""
+
+    evaluator: str = Field(
+        "statistics",
+        json_schema_extra={"plugin": "evaluators"},
+        description="who judges appearance; statistics: image and video statistics, no network; "
+        "qwen3-vl: the paper's vision-language model; or one that another package brings",
+    )
+    qwen: QwenConfig = Field(QwenConfig(), description="how qwen3-vl is asked")
+
+    @field_validator("evaluator")
+    @classmethod
+    def _evaluator_is_known(cls, name: str) -> str:
+        return require_known("evaluators", name, EVALUATORS)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _model_from_environment(cls, data: Any) -> Any:
+        """Resolve the name of the model here, so that ``run.toml`` and the stage's key hold it."""
+        if not isinstance(data, Mapping) or data.get("evaluator") != "qwen3-vl":
+            return data
+        qwen = data.get("qwen", {})
+        if not isinstance(qwen, Mapping) or qwen.get("model") or qwen.get("model_dir"):
+            return data
+        return {**data, "qwen": {**qwen, "model": os.environ.get(MODEL_VARIABLE, "").strip()}}
+
+    @model_validator(mode="after")
+    def _model_is_known(self) -> EvaluatorConfig:
+        if self.qwen.base_url:
+            check_base_url(self.qwen.base_url)
+        if self.evaluator == "qwen3-vl" and bool(self.qwen.model) == bool(self.qwen.model_dir):
+            raise ValueError(
+                "qwen3-vl needs either qwen.model (the name of a model at the server) or qwen.model_dir "
+                "(a model folder)"
+            )
+        return self
+
+
+class ScoreConfig(Record):
+    """How cues become scores, and which frames are reliable."""
+
+    stand_in_share: float = Field(
+        0.10,
+        gt=0.0,
+        le=1.0,
+        description="when no frame is reliable, this share of the registered frames (at least one), "
+        "best by R - B, stands in for the reliable set in the geometry",
+    )
+    w_R: tuple[Unit, Unit, Unit, Unit, Unit] = Field(
+        (0.30, 0.25, 0.20, 0.15, 0.10),
+        description="weights in R of sharpness, structure, texture, cleanness, exposure; they sum to 1",
+    )
+    w_B: tuple[Unit, Unit, Unit, Unit, Unit, Unit] = Field(
+        (0.25, 0.15, 0.20, 0.15, 0.15, 0.10),
+        description="weights in B of motion blur, defocus, ghosting, exposure failure, unreliable texture, "
+        "artifacts; they sum to 1",
+    )
+    tau_R: float = Field(
+        0.70, ge=0.0, le=1.0, description="a reliable (and strong) frame has at least this R"
+    )
+    tau_B: float = Field(0.60, ge=0.0, le=1.0, description="a reliable (and strong) frame has at most this B")
+
+    @model_validator(mode="after")
+    def _weights_sum_to_one(self) -> ScoreConfig:
+        for name in ("w_R", "w_B"):
+            _require_sum_of_one(name, sum(getattr(self, name)))
+        return self
+
+
+class GeometryConfig(Record):
+    """How poses and observations become geometric evidence."""
+
+    frames_per_bin: int = Field(
+        8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
+    )
+    gamma_c: float = Field(
+        0.65, ge=0.0, le=1.0, description="share of the camera-centre distance in a pose distance"
+    )
+    gamma_v: float = Field(0.35, ge=0.0, le=1.0, description="share of the view angle in a pose distance")
+    alpha: float = Field(
+        0.45, ge=0.0, le=1.0, description="weight of the coverage gain C in the geometric utility G"
+    )
+    beta: float = Field(0.35, ge=0.0, le=1.0, description="weight of the pose diversity D in G")
+    eta: float = Field(
+        0.30, ge=0.0, le=1.0, description="weight of the visibility redundancy O, subtracted from G"
+    )
+
+    @model_validator(mode="after")
+    def _distances_stay_in_range(self) -> GeometryConfig:
+        _require_sum_of_one("gamma_c + gamma_v", self.gamma_c + self.gamma_v)
+        return self
+
+
+class AllocationConfig(ScoreConfig):
+    """How scores and geometry become roles and weights."""
 
     enabled: bool = Field(
         True,
@@ -121,50 +215,6 @@ class RvaConfig(Record):
         description="with coverage: suppressed frames are reactivated until this share of the registered "
         "frames is active; 0: the paper's",
     )
-    evaluator: str = Field(
-        "statistics",
-        json_schema_extra={"plugin": "evaluators"},
-        description="who judges appearance; statistics: image and video statistics, no network; "
-        "qwen3-vl: the paper's vision-language model; or one that another package brings",
-    )
-    qwen: QwenConfig = Field(QwenConfig(), description="how qwen3-vl is asked")
-    frames_per_bin: int = Field(
-        8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
-    )
-    stand_in_share: float = Field(
-        0.10,
-        gt=0.0,
-        le=1.0,
-        description="when no frame is reliable, this share of the registered frames (at least one), "
-        "best by R - B, stands in for the reliable set in the geometry",
-    )
-
-    w_R: tuple[Unit, Unit, Unit, Unit, Unit] = Field(
-        (0.30, 0.25, 0.20, 0.15, 0.10),
-        description="weights in R of sharpness, structure, texture, cleanness, exposure; they sum to 1",
-    )
-    w_B: tuple[Unit, Unit, Unit, Unit, Unit, Unit] = Field(
-        (0.25, 0.15, 0.20, 0.15, 0.15, 0.10),
-        description="weights in B of motion blur, defocus, ghosting, exposure failure, unreliable texture, "
-        "artifacts; they sum to 1",
-    )
-    tau_R: float = Field(
-        0.70, ge=0.0, le=1.0, description="a reliable (and strong) frame has at least this R"
-    )
-    tau_B: float = Field(0.60, ge=0.0, le=1.0, description="a reliable (and strong) frame has at most this B")
-
-    gamma_c: float = Field(
-        0.65, ge=0.0, le=1.0, description="share of the camera-centre distance in a pose distance"
-    )
-    gamma_v: float = Field(0.35, ge=0.0, le=1.0, description="share of the view angle in a pose distance")
-    alpha: float = Field(
-        0.45, ge=0.0, le=1.0, description="weight of the coverage gain C in the geometric utility G"
-    )
-    beta: float = Field(0.35, ge=0.0, le=1.0, description="weight of the pose diversity D in G")
-    eta: float = Field(
-        0.30, ge=0.0, le=1.0, description="weight of the visibility redundancy O, subtracted from G"
-    )
-
     lambda_G: float = Field(
         0.35, ge=0.0, le=1.0, description="weight of G when a frame to reactivate is chosen"
     )
@@ -178,7 +228,6 @@ class RvaConfig(Record):
         0.10, ge=0.0, le=1.0, description="weight of the centrality Z when a frame to reactivate is chosen"
     )
     reactivated_weight: float = Field(0.12, gt=0.0, le=1.0, description="weight of a reactivated frame")
-
     strong_base: float = Field(0.80, gt=0.0, le=1.0, description="weight of a strong frame: base + gain R")
     strong_gain: float = Field(0.20, ge=0.0, le=1.0, description="weight of a strong frame: base + gain R")
     geometric_G: float = Field(0.60, ge=0.0, le=1.0, description="a geometric frame has at least this G")
@@ -199,46 +248,23 @@ class RvaConfig(Record):
         0.30, ge=0.0, le=1.0, description="gain of the weight of geometric and auxiliary frames"
     )
 
-    @field_validator("evaluator")
-    @classmethod
-    def _evaluator_is_known(cls, name: str) -> str:
-        return require_known("evaluators", name, EVALUATORS)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _model_from_environment(cls, data: Any) -> Any:
-        """Resolve the name of the model here, so that ``run.toml`` and the stage's key hold it."""
-        if not isinstance(data, Mapping) or data.get("evaluator") != "qwen3-vl":
-            return data
-        qwen = data.get("qwen", {})
-        if not isinstance(qwen, Mapping) or qwen.get("model") or qwen.get("model_dir"):
-            return data
-        return {**data, "qwen": {**qwen, "model": os.environ.get(MODEL_VARIABLE, "").strip()}}
-
     @model_validator(mode="after")
-    def _model_is_known(self) -> RvaConfig:
-        if self.qwen.base_url:
-            check_base_url(self.qwen.base_url)
-        if self.evaluator == "qwen3-vl" and bool(self.qwen.model) == bool(self.qwen.model_dir):
-            raise ValueError(
-                "qwen3-vl needs either qwen.model (the name of a model at the server) or qwen.model_dir "
-                "(a model folder)"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _ranges_hold(self) -> RvaConfig:
-        """R, B, pose distances and frame weights stay in [0, 1] only if these sums do."""
-        for name in ("w_R", "w_B", "geometric_mix", "auxiliary_mix"):
-            total = sum(getattr(self, name))
-            if abs(total - 1.0) > _SUM_TOLERANCE:
-                raise ValueError(f"{name} must sum to 1, not {total:g}")
-        if abs(self.gamma_c + self.gamma_v - 1.0) > _SUM_TOLERANCE:
-            raise ValueError(f"gamma_c + gamma_v must be 1, not {self.gamma_c + self.gamma_v:g}")
+    def _weights_stay_in_range(self) -> AllocationConfig:
+        for name in ("geometric_mix", "auxiliary_mix"):
+            _require_sum_of_one(name, sum(getattr(self, name)))
         for base, gain in (("strong_base", "strong_gain"), ("attenuated_base", "attenuated_gain")):
             if getattr(self, base) + getattr(self, gain) > 1.0 + _SUM_TOLERANCE:
                 raise ValueError(f"{base} + {gain} must not exceed 1: it is the largest weight of a frame")
         return self
+
+
+class AssessmentConfig(AllocationConfig, GeometryConfig):
+    """All of RVA but the evaluator."""
+
+
+def _require_sum_of_one(name: str, total: float) -> None:
+    if abs(total - 1.0) > _SUM_TOLERANCE:
+        raise ValueError(f"{name} must sum to 1, not {total:g}")
 
 
 def check_base_url(url: str) -> None:

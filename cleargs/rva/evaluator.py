@@ -1,19 +1,25 @@
-"""Who judges the appearance of a frame: the protocol that all evaluators follow."""
+"""Who judges the appearance of a frame: the protocol that all evaluators follow, and what was found out about
+single frames, kept so that adding frames to a capture costs only those.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Protocol
 
-from cleargs.plugins import load_part
+import numpy as np
+import numpy.typing as npt
+
+from cleargs.errors import InputError, StoreError
+from cleargs.files import write_json
+from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
-from cleargs.rva.config import EVALUATORS, RvaConfig
-from cleargs.rva.scores import Floats
-
-if TYPE_CHECKING:
-    from cleargs.rva.vlm.picture_scorer import PictureScorer
+from cleargs.rva.arrays import Floats
+from cleargs.untrusted import read_json
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,18 @@ class View:
     image: Path
     mask: Path | None = None
     """8-bit image of the same size; pixels that are 0 in it are ignored."""
+
+
+def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
+    """The frame [H, W, 3] in sRGB and its mask [H, W]. Raises StoreError when one cannot be read."""
+    hint = "run again with --force ingest"
+    try:
+        rgb, mask = read_rgb(view.image), read_mask(view.mask) if view.mask else None
+    except InputError as error:
+        raise StoreError(str(error), hint=hint) from error
+    if mask is not None and mask.shape != rgb.shape[:2]:
+        raise StoreError(f"the mask {view.mask} differs in size from its image", hint=hint)
+    return rgb, mask
 
 
 class Evaluator(Protocol):
@@ -51,56 +69,32 @@ def label(evaluator: Evaluator) -> str:
     return f"{evaluator.name}-{evaluator.version}"
 
 
-def check_evaluator(config: RvaConfig) -> None:
-    """Raise InputError when the model of the evaluator that the settings name cannot be had: nobody answers
-    at the server's address, the server has no such model, or the folder holds none that can be loaded."""
-    if config.evaluator == "statistics":
-        return
-    if config.evaluator not in EVALUATORS:
-        load_part("evaluators", config.evaluator)
-        return
-    if config.qwen.model_dir:
-        from cleargs.rva.vlm.local import check_folder
+class ItemCache:
+    """Rows of numbers with named columns, a JSON file each, named by the digest of all that decides them."""
 
-        check_folder(Path(config.qwen.model_dir).expanduser().absolute())
-        return
-    from cleargs.rva.vlm.chat import ChatClient
+    def __init__(self, folder: Path, columns: Sequence[str]) -> None:
+        self._folder = folder
+        self._columns = columns
 
-    ChatClient(config.qwen).check_model()
+    def find(self, digest: str) -> Floats | None:
+        """The row; None where there is none, or where its file is damaged."""
+        try:
+            kept = read_json(self._folder / f"{digest}.json")
+            row = np.array([kept[column] for column in self._columns], dtype=np.float64)
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return row if bool(np.isfinite(row).all()) else None
+
+    def add(self, digest: str, row: Floats) -> None:
+        """Keep ``row``; the file appears whole."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_json(self._folder / f"{digest}.json", dict(zip(self._columns, row.tolist(), strict=True)))
 
 
-def make_evaluator(
-    config: RvaConfig,
-    *,
-    seed: int = 0,
-    device: Literal["cpu", "cuda"] = "cpu",
-    cache: Path | None = None,
-) -> Evaluator:
-    """The evaluator that the settings name: what another package brings is called with ``seed``, ``device``
-    and ``cache``.
+def view_digest(facts: Sequence[object], view: View) -> str:
+    """Names what is found out about the files of ``view`` in the light of ``facts`` (JSON values).
 
-    ``cache`` is a folder in which the evaluator keeps what it found out about single frames; ``qwen3-vl``
-    needs one.
-    Raises InputError when the evaluator cannot be had: a bad address or key of its server, say.
+    Raises OSError when a file cannot be read.
     """
-    if config.evaluator == "statistics":
-        from cleargs.rva.statistics import StatisticsEvaluator  # loads cv2: not before it is needed
-
-        return StatisticsEvaluator(cache)
-    if config.evaluator not in EVALUATORS:
-        maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
-        return maker(seed=seed, device=device, cache=cache)
-    from cleargs.rva.vlm.qwen_evaluator import QwenEvaluator
-
-    if cache is None:
-        raise ValueError("qwen3-vl needs a cache folder")
-    scorer: PictureScorer
-    if config.qwen.model_dir:
-        from cleargs.rva.vlm.local import LocalPictureScorer  # loads torch
-
-        scorer = LocalPictureScorer(config.qwen, device=device)
-    else:
-        from cleargs.rva.vlm.server import ServerPictureScorer
-
-        scorer = ServerPictureScorer(config.qwen, seed=seed)
-    return QwenEvaluator(scorer, image_size=config.qwen.image_size, cache=cache)
+    parts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (view.image, view.mask) if path]
+    return hashlib.sha256(json.dumps([*facts, *parts]).encode()).hexdigest()

@@ -1,18 +1,18 @@
 """Geometric evidence: coverage gain C, pose diversity D, redundancy O and utility G (paper, Geometric
-Evidence).
+Evidence); the trajectory cut into bins of equal camera motion, and how central a frame is in its bin.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.scores import Bools, Floats
-
-Ints = npt.NDArray[np.integer]
+from cleargs.rva.arrays import Bools, Floats, Ints
+from cleargs.rva.config import GeometryConfig
 
 _PAIRS_AT_ONCE = 1 << 20
 """Pairs of frames held in memory at a time (8 MB an array of float64)."""
@@ -52,7 +52,7 @@ def pose_diversity(
     centres: Floats,  # [N, 3]
     directions: Floats,  # [N, 3] unit vectors
     reference: Bools,  # [N] the reliable set (or its stand-in)
-    config: RvaConfig,
+    config: GeometryConfig,
 ) -> Floats:  # D [N] in [0, 1]
     """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
 
@@ -128,9 +128,54 @@ def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [
     return largest
 
 
-def geometric_utility(C: Floats, D: Floats, O: Floats, config: RvaConfig) -> Floats:
+def geometric_utility(C: Floats, D: Floats, O: Floats, config: GeometryConfig) -> Floats:
     """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Where each frame lies on the trajectory."""
+
+    index: npt.NDArray[np.int32]  # [N] bin of each frame
+    centrality: Floats  # [N] Z in [0, 1], 1 at the middle of the bin
+    edges: Floats  # [M + 1] cumulative motion at the bins' borders
+
+
+def cumulative_motion(
+    centres: Floats,  # [N, 3] in trajectory order
+    directions: Floats,  # [N, 3] unit vectors
+    config: GeometryConfig,
+) -> Floats:  # s [N], from 0
+    """Pose motion up to each frame: a step is gamma_c (normalised centre distance) + gamma_v (view angle /
+    pi).
+
+    Centre distances are divided by the largest pairwise one of the capture, as in the pose diversity.
+    """
+    if not len(centres):
+        return np.zeros(0)
+    distance = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    scale = largest_distance(centres)
+    if scale > 0.0:
+        distance = distance / scale
+    angle = view_angle(np.linalg.norm(np.diff(directions, axis=0), axis=1))
+    return np.concatenate([[0.0], np.cumsum(config.gamma_c * distance + config.gamma_v * angle)])
+
+
+def cut_into_bins(motion: Floats, frames_per_bin: int) -> Bins:  # [N] cumulative, in trajectory order
+    """M = max(1, round(N / frames_per_bin)) bins of equal motion.
+
+    With x = M s / S: bin = min(floor(x), M - 1) and Z = 1 - |2 (x - bin) - 1|. A camera that does not move
+    (S = 0) has one bin with Z = 1.
+    """
+    total = float(motion[-1]) if len(motion) else 0.0
+    if total == 0.0:
+        return Bins(np.zeros(len(motion), dtype=np.int32), np.ones(len(motion)), np.zeros(2))
+    count = max(1, round(len(motion) / frames_per_bin))
+    position = count * motion / total
+    index = np.minimum(np.floor(position), count - 1).astype(np.int32)
+    centrality = np.clip(1.0 - np.abs(2.0 * (position - index) - 1.0), 0.0, 1.0)  # rounding at the borders
+    return Bins(index, centrality, total * np.arange(count + 1) / count)
 
 
 def _row_blocks(n_rows: int, n_columns: int) -> list[npt.NDArray[np.intp]]:

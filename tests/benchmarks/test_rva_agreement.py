@@ -14,8 +14,8 @@ from vlm_server import FRAMES, Answer, Asked, truth, two_stages, vlm_server
 from benchmarks.commands import invoke
 from benchmarks.rva.agreement import EvaluatorCues, compare, spearman
 from cleargs.cli.main import invoke as cleargs
-from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.stages.rva import RvaConfig
 
 
 def test_spearman_by_hand() -> None:

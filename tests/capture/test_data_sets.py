@@ -12,10 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
+from cleargs.capture.capture import Capture
 from cleargs.capture.holdout import held_out
 from cleargs.capture.layouts.llff import read_llff, read_poses_bounds
 from cleargs.capture.model import write_model
-from cleargs.capture.sources import Capture, externals, open_capture
+from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.tables import load_frames
 from cleargs.digest import named_files
 from cleargs.errors import InputError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cleargs.capture.sfm import GIVEN_POSES, PLACED
+from cleargs.capture.sfm import OUTCOME
 from cleargs.digest import file_digest
 from cleargs.files import remove
 from cleargs.manifest import published_files
@@ -46,8 +46,8 @@ DAMAGES: dict[str, Callable[[Path, Path], object]] = {
     "a file for the working images": lambda work, out: a_file(work / "images"),
     "a file for the published images": lambda work, out: a_file(out / "images"),
     "a file for the model": lambda work, out: a_file(work / "model"),
-    "model without given poses": lambda work, out: (work / "model" / GIVEN_POSES).unlink(),
-    "empty given poses": lambda work, out: empty(work / "model" / GIVEN_POSES),
+    "model without its outcome": lambda work, out: (work / "model" / OUTCOME).unlink(),
+    "empty outcome": lambda work, out: empty(work / "model" / OUTCOME),
     **{f"empty {name}": lambda work, out, name=name: empty(work / "model" / name) for name in MODEL},
     **{f"garbage {name}": lambda work, out, name=name: garbage(work / "model" / name) for name in MODEL},
 }
@@ -90,7 +90,7 @@ def test_a_model_that_does_not_say_how_frames_were_placed_is_made_again(
 ) -> None:
     healthy = digests(ingest(images, **settings).out)
     for damage in (empty, garbage, Path.unlink):
-        damage(tmp_path / "out.work" / "model" / PLACED)
+        damage(tmp_path / "out.work" / "model" / OUTCOME)
         assert digests(ingest(images, **settings).out) == healthy
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from pathlib import Path
 
 import cv2
@@ -17,25 +18,19 @@ from OpenImageIO import ImageOutput, ImageSpec
 from pydantic import ValidationError
 
 from cleargs.capture.cameras import Camera, Pose, pinhole
+from cleargs.capture.capture import SourceFrame
+from cleargs.capture.folders import frame_key, masks_of, natural_key, spread
 from cleargs.capture.holdout import held_out, holdout_hash
 from cleargs.capture.layouts.transforms import read_transforms
+from cleargs.capture.layouts.video import choose_times
 from cleargs.capture.matching import exhaustive_pairs, loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
 from cleargs.capture.poses import normalise
 from cleargs.capture.prepare import WorkFrame, _stencil, _upright
-from cleargs.capture.sfm import _sfm_job
+from cleargs.capture.sfm import _job
 from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sharpest import sharpness
-from cleargs.capture.sources import (
-    SourceFrame,
-    choose_times,
-    externals,
-    frame_key,
-    masks_of,
-    natural_key,
-    open_capture,
-    spread,
-)
+from cleargs.capture.sources import externals, open_capture
 from cleargs.capture.undistort import undistorter
 from cleargs.errors import InputError, StoreError
 from cleargs.media.image import read_rgb
@@ -157,6 +152,20 @@ def test_models_agree_with_colmap(tmp_path: Path) -> None:
             assert np.array_equal(back.images[key].point_ids, image.point_ids)
             assert np.allclose(back.images[key].pose.rotation, image.pose.rotation)
             assert np.allclose(back.images[key].pose.translation, image.pose.translation)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset"), [("points3D", 0), ("points3D", 51), ("images", 0), ("cameras", 0)]
+)
+def test_a_count_that_no_file_holds(tmp_path: Path, name: str, offset: int) -> None:
+    """pycolmap alone would read on past the end of the file."""
+    write_model(tmp_path, small_model(), np.zeros((4, 3), np.uint8))
+    file = tmp_path / f"{name}.bin"
+    data = bytearray(file.read_bytes())
+    struct.pack_into("<Q", data, offset, 1 << 40)
+    file.write_bytes(data)
+    with pytest.raises(InputError, match="a file breaks off"):
+        read_model(tmp_path)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
@@ -363,9 +372,9 @@ def test_masks_lie_as_their_images_do(tmp_path: Path) -> None:
 def test_every_camera_has_the_exif_of_an_image_of_its_own(images: Path) -> None:
     sources = [SourceFrame(f"{k}.jpg", images / f"{k}.jpg") for k in range(3)]
     frames = [WorkFrame(source, f"{k:06d}.png", 60, 40, False, None) for k, source in enumerate(sources)]
-    apart = _sfm_job(frames, IngestConfig(shared_camera=False))
-    assert apart.exif_images == [str((images / f"{k}.jpg").resolve()) for k in range(3)]
-    assert _sfm_job(frames, IngestConfig()).exif_images == apart.exif_images[:1]
+    apart = _job(frames, None, IngestConfig(shared_camera=False))["exif_images"]
+    assert apart == [str((images / f"{k}.jpg").resolve()) for k in range(3)]
+    assert _job(frames, None, IngestConfig())["exif_images"] == apart[:1]
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])

@@ -8,8 +8,8 @@ import pytest
 
 from cleargs.cli.frame_reasons import COLUMNS, frame_rows, reason, short_name, worst_cue
 from cleargs.cli.manifest_words import in_words
-from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import B_CUES, R_CUES
+from cleargs.stages.rva import RvaConfig
 
 SETTINGS = RvaConfig().model_dump(mode="json")
 

@@ -20,10 +20,9 @@ from cleargs.report.allocation_picture import (
     place_labels,
     plot_allocation,
 )
-from cleargs.rva.assessment import Observations, assess
-from cleargs.rva.config import RvaConfig
+from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.rva.tabulate import bins_table, frames_table, poses_from
+from cleargs.stages.rva import RvaConfig
 
 COUNT = 12
 UNREGISTERED, HELD_OUT, UNSCORED = 3, 5, 7

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from rva_scenes import along_x, observations_of, poses_at, uniform_cues
 
-from cleargs.rva.assessment import Observations, assess
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.geometry import coverage_gain, redundancy, visibility
+from cleargs.rva.assessment import Observations, assess, frames_table, summary
+from cleargs.rva.geometry import coverage_gain, cut_into_bins, redundancy, visibility
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.tabulate import frames_table, summary
-from cleargs.rva.trajectory import cut_into_bins
+from cleargs.stages.rva import RvaConfig
 
 CONFIG = RvaConfig(active_share=0.0)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.rva.allocation import Role
 from cleargs.rva.assessment import Assessment, Observations, Poses, assess
-from cleargs.rva.config import RvaConfig
+from cleargs.stages.rva import RvaConfig
 
 PER_FRAME = [field.name for field in fields(Assessment) if field.name not in ("covered", "bin_edges")]
 

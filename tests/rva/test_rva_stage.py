@@ -15,8 +15,8 @@ from cleargs.capture import tables as ingest
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
-from cleargs.rva.config import RvaConfig
 from cleargs.rva.tables import BINS, FRAMES
+from cleargs.stages.rva import RvaConfig
 
 DESIGN_COLUMNS = [
     "frame_id",
@@ -134,7 +134,8 @@ def test_equal_bytes_for_any_number_of_threads(ingest_dir: Path, tmp_path: Path)
 
 def test_a_broken_image_is_named(ingest_dir: Path, tmp_path: Path) -> None:
     from cleargs.errors import StoreError
-    from cleargs.rva.evaluator import View, make_evaluator
+    from cleargs.rva.evaluator import View
+    from cleargs.rva.evaluators import make_evaluator
 
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no image")

@@ -11,15 +11,19 @@ import pytest
 
 from cleargs.progress import SilentReporter
 from cleargs.rva import statistics
-from cleargs.rva.blur import detail_ratios, extents_from_ratios
-from cleargs.rva.calibration import Calibration
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.degradations import blocking, noise_level
+from cleargs.rva.allocation import appearance_scores
 from cleargs.rva.evaluator import View
-from cleargs.rva.luminance import Luminance, reduce_luminance
-from cleargs.rva.scores import appearance_scores
-from cleargs.rva.statistics import StatisticsEvaluator, as_measures, cues_from_measures, measure
+from cleargs.rva.measures import (
+    Luminance,
+    blocking,
+    detail_ratios,
+    extents_from_ratios,
+    noise_level,
+    reduce_luminance,
+)
+from cleargs.rva.statistics import Calibration, StatisticsEvaluator, as_measures, cues_from_measures, measure
 from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.stages.rva import RvaConfig
 
 Linear = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -22,7 +23,7 @@ from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
 from cleargs.rivr.supervision import load_supervision
 from cleargs.rva import tables
-from cleargs.rva.config import RvaConfig
+from cleargs.stages.rva import RvaConfig
 
 MODEL = "Qwen/Qwen3-VL-8B-Instruct"
 
@@ -147,7 +148,7 @@ def test_the_server_says_how_long_to_wait(bench: Bench, monkeypatch: pytest.Monk
             pauses.append(seconds)
             return False
 
-    monkeypatch.setattr("cleargs.rva.vlm.chat.Event", Recorder)
+    monkeypatch.setattr("cleargs.rva.vlm.server.Event", Recorder)
     soon = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
     answers = ["7", soon, "next week", None]
 
@@ -317,6 +318,15 @@ def test_the_key_is_not_carried_to_another_host(bench: Bench) -> None:
         with vlm_server(lambda asked, before: moved) as log, pytest.raises(StageError, match="moved"):
             bench.run(log.url)
     assert other.asked == []
+
+
+def test_without_the_client(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("httpx2", "cleargs.rva.vlm.server"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "httpx2", None)
+    with pytest.raises(InputError, match="httpx2") as caught:
+        bench.run("http://127.0.0.1:9/v1")
+    assert "cleargs[server]" in caught.value.hint
 
 
 def test_no_key_no_header(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

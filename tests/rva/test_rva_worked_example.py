@@ -7,10 +7,9 @@ import pytest
 from rva_scenes import BACKWARD, FORWARD, along_x, observations_of, poses_at, uniform_cues
 
 from cleargs.rva.allocation import effective_sample_size, reactivation_gain
-from cleargs.rva.assessment import Assessment, assess
-from cleargs.rva.config import RvaConfig
+from cleargs.rva.assessment import Assessment, assess, bins_table, frames_table, summary
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.tabulate import bins_table, frames_table, summary
+from cleargs.stages.rva import RvaConfig
 
 FRAME_ID = np.arange(5, dtype=np.int32)
 

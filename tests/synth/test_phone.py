@@ -11,8 +11,8 @@ import pytest
 
 from cleargs.errors import InputError
 from cleargs.progress import SilentReporter
-from cleargs.rva.config import RvaConfig
-from cleargs.rva.trajectory import cumulative_motion, cut_into_bins
+from cleargs.rva.geometry import cumulative_motion, cut_into_bins
+from cleargs.stages.rva import RvaConfig
 from cleargs.synth.image_motion import follow
 from cleargs.synth.optics import Shutter
 from cleargs.synth.path import FPS, frame_times, make_path

@@ -12,7 +12,7 @@ from cleargs.errors import InputError
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `ShippedLayout.detect`."""
+    """See `Layout.detect`."""
     return poses and _find_model(source) is not None
 
 

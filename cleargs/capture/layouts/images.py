@@ -12,7 +12,7 @@ from cleargs.errors import InputError
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `ShippedLayout.detect`: any folder."""
+    """See `Layout.detect`: any folder."""
     return True
 
 

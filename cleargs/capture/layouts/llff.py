@@ -6,17 +6,17 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cleargs.capture.cameras import pinhole
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import chosen, image_files, image_folders, mask_externals
-from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
 from cleargs.untrusted import FAULTS, cause, open_regular
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, TokenError)
 """NumPy lets errors of Python's tokenizer through where the header is damaged."""
@@ -27,7 +27,7 @@ POSES_BOUNDS = "poses_bounds.npy"
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `ShippedLayout.detect`."""
+    """See `Layout.detect`."""
     return poses and (source / POSES_BOUNDS).is_file()
 
 
@@ -72,6 +72,8 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
 
     Raises InputError when there is no such array in the file.
     """
+    import numpy as np
+
     try:
         open_regular(path).close()
         # Mapped, so that a damaged header cannot ask for more memory than the file has bytes.
@@ -88,6 +90,11 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
 
 
 def _frame(row: NDArray[np.float64], path: Path) -> SourceFrame:
+    import numpy as np
+
+    from cleargs.capture.cameras import pinhole
+    from cleargs.capture.poses import rigid_pose
+
     hint = f"correct its row of {POSES_BOUNDS}, remove both row and image, or set ingest.poses=sfm"
     # Columns: the camera's down, right and back axes in the world, its centre, and (height, width, focal).
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T

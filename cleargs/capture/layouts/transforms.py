@@ -6,18 +6,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from cleargs.capture.cameras import Camera, Pose
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import chosen, frame_key, mask_externals, name_below_images
-from cleargs.capture.poses import rigid_pose
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.untrusted import FAULTS, cause, read_json
+
+if TYPE_CHECKING:
+    from cleargs.capture.cameras import Camera, Pose
 
 _FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
@@ -51,7 +50,7 @@ class _Listing:
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `ShippedLayout.detect`: it lists images, with or without poses."""
+    """See `Layout.detect`: it lists images, with or without poses."""
     return (source / "transforms.json").is_file()
 
 
@@ -105,6 +104,8 @@ def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
 
 def _camera(values: Mapping[str, Any], image: Path) -> Camera:
     """The camera of a frame: its own entries over those of the whole file."""
+    from cleargs.capture.cameras import Camera
+
     try:
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
@@ -153,6 +154,10 @@ def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:
 
 
 def _pose(entry: Mapping[str, Any], name: str) -> Pose:
+    import numpy as np
+
+    from cleargs.capture.poses import rigid_pose
+
     hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find the poses anew"
     if "transform_matrix" not in entry:
         raise InputError(f"{name} has no pose (transform_matrix)", hint=hint)

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from cleargs.media.video import Timeline
 
 MIN_FRAMES = 3
@@ -21,7 +21,7 @@ MIN_FRAMES = 3
 
 
 def detect(source: Path, *, poses: bool) -> bool:
-    """See `ShippedLayout.detect`: whatever is no folder."""
+    """See `Layout.detect`: whatever is no folder."""
     return not source.is_dir()
 
 
@@ -54,6 +54,8 @@ def video_frame(source: Path, timeline: Timeline, index: int) -> SourceFrame:
 def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:
     """Frame numbers evenly in time (not in number: the frame rate may vary): every 1 / fps seconds if given,
     and at most so many from first to last."""
+    import numpy as np
+
     times = np.array([timeline.seconds(index) for index in range(len(timeline.pts))])
     span = float(times[-1])
     chosen = (
@@ -66,6 +68,8 @@ def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[in
 
 def _nearest(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> list[int]:
     """Numbers of the frames nearest to the wanted times, each once; ``times`` start at 0 and ascend."""
+    import numpy as np
+
     after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(wanted - times[before] <= times[after] - wanted, before, after)

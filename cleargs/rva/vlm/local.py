@@ -16,12 +16,10 @@ import numpy as np
 import torch
 
 from cleargs.errors import InputError
+from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.scores import Floats
-from cleargs.rva.vlm.picture import Picture
-from cleargs.rva.vlm.picture_scorer import UnscoredError
-from cleargs.rva.vlm.prompt import prompt_text, reply_schema
-from cleargs.rva.vlm.reply import ReplyError, parse_reply
+from cleargs.rva.vlm.evaluator import Picture, UnscoredError
+from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 _IMAGE = "<|image_pad|>"
 _ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
