@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ToyBatch
+from toy_batch import ToyBatch
 
 from cleargs.batch.sheet import Scene, SheetError, read_scenes
 from cleargs.cli.main import invoke
@@ -101,8 +101,8 @@ def test_no_csv_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
     [
         ("nowhere.mp4,,", "there is no"),
         ("hall.mp4,0,", "g0.steps = 0 cannot be used"),
-        ("hall.mp4,,nonesuch", "no restoration expert 'nonesuch'"),
-        ("hall.mp4,,maxim-gopro", "maxim-gopro is not installed"),
+        ("hall.mp4,,nonesuch", "there is no expert 'nonesuch'"),
+        ("hall.mp4,,nafnet-gopro", "nafnet-gopro is not installed"),
         ("hall.mp4,,,surplus", "more cells than columns"),
     ],
 )

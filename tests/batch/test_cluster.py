@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import ToyBatch
 from slurm import DAEMONS, Slurm, program, running_slurm
+from toy_batch import ToyBatch
 
 ROOT = Path(__file__).parents[2]
 WORKFLOWS = ROOT / "workflows"
