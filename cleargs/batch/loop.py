@@ -23,8 +23,8 @@ from typing import Literal
 from cleargs.batch.sheet import Scene, SheetError
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
+from cleargs.manifest import Manifest, linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import Manifest, linked_manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Device, Run
 from cleargs.pipeline.runner import check_same_input
@@ -178,7 +178,7 @@ class Batch:
             plans = self.plan(scene)
         except CleargsError as error:
             return "failed", str(error)
-        unfinished = next((plan for plan in plans if plan.state != "hit"), None)
+        unfinished = next((plan for plan in plans if plan.state != "done"), None)
         if unfinished is None:
             last = plans[-1].manifest
             missing = last.inherited if last is not None else ()

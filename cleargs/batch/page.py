@@ -12,8 +12,8 @@ from cleargs.batch.loop import Batch, Result, State
 from cleargs.batch.sheet import Scene
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
+from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
-from cleargs.pipeline.manifest import Manifest
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
 from cleargs.report.html import new_report, write_page
 from cleargs.report.report_json import FOLDER, is_current, page_of

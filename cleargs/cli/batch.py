@@ -153,7 +153,7 @@ def _print_plans(batch: Batch, as_json: bool) -> None:
 def _plan_json(batch: Batch, scene: Scene) -> dict[str, Any]:
     try:
         plans = batch.plan(scene)
-        to_do = [plan.stage for plan in plans if plan.state != "hit"]
+        to_do = [plan.stage for plan in plans if plan.state != "done"]
         note = f"to do: {', '.join(to_do)}" if to_do else "done"
     except CleargsError as error:
         plans, to_do, note = [], list(batch.dag.until(batch.until)), f"cannot be planned: {error}"

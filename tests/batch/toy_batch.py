@@ -15,8 +15,8 @@ import toy
 from toy import toy_dag
 
 from cleargs.cli.main import invoke
+from cleargs.manifest import read_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import read_manifest
 
 SCENES = ("attic", "barn", "cellar")
 

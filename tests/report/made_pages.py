@@ -10,7 +10,7 @@ from report_run import FinishedRun
 from cleargs.batch.loop import Batch
 from cleargs.batch.page import write_batch
 from cleargs.batch.sheet import Scene
-from cleargs.pipeline.digest import DigestMemo
+from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
 
