@@ -13,7 +13,7 @@
 # make test-convert  the tests of those conversions
 # make browser       what the tests of the report in a browser need beside Debian's chromium
 # make oracles       .oracles, npm's programs that read exported scenes in the tests
-# make cluster       .venv-cluster, the Snakemake that `cleargs batch` uses
+# make cluster       .venv-cluster, the Snakemake that runs a sheet on a cluster
 # TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
 
 PYTHON ?= python3

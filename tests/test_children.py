@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
 import cleargs
-from cleargs.batch.preparation import WATCHER
 from cleargs.capture.child import run_child
 from cleargs.errors import StageError
 from cleargs.progress import SilentReporter
@@ -33,7 +31,6 @@ def test_children_import_nothing_from_the_working_folder(trap: Path, tmp_path: P
     with pytest.raises(StageError):  # there is no such job, which the child only finds out when it runs
         run_child("cleargs.capture.sfm_worker", tmp_path / "no.json", tmp_path / "log", SilentReporter())
     assert "no.json" in (tmp_path / "log").read_text()
-    subprocess.run(WATCHER, stderr=subprocess.DEVNULL, check=False)
     assert not trap.exists()
 
 

@@ -22,7 +22,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cleargs.batch.scenes import read_scenes
+from cleargs.batch.sheet import read_scenes
 from cleargs.capture.cameras import Pose, pinhole
 from cleargs.capture.layouts.llff import read_poses_bounds
 from cleargs.capture.layouts.transforms import read_transforms
@@ -39,7 +39,6 @@ from cleargs.media.image import read_rgb
 from cleargs.media.video import read_timeline
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.config import read_toml
-from cleargs.pipeline.dag import installed
 from cleargs.progress import SilentReporter
 from cleargs.render.pose_files import read_poses
 from cleargs.splat.camera import Camera
@@ -242,7 +241,7 @@ READERS: dict[str, tuple[Callable[[Path], None], Callable[[Path], object]]] = {
     "PLY": (ply, lambda folder: read_ply(folder / "a.ply")),
     "EXR": (exr, lambda folder: read_exr(folder / "a.exr", "cleargs:")),
     "images": (pictures, all_of(read_rgb, "a.*")),
-    "sheets": (sheets, all_of(lambda file: read_scenes(file, installed()), "s.*")),
+    "sheets": (sheets, all_of(read_scenes, "s.*")),
     "manifest": (manifests, read_manifest_or_none),
     "poses": (poses, all_of(lambda file: read_poses(file, LENS, SAME), "*.json")),
     "tables, checkpoints": (tables, all_of(read_stored, "t.*")),

@@ -1,177 +1,143 @@
-"""A sheet of scenes as it lies in a TOML or CSV file, with the line of everything in it."""
+"""A sheet of scenes, TOML or CSV: each scene is a call of ``cleargs run``."""
 
 from __future__ import annotations
 
 import csv
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from cleargs.errors import ConfigError, InputError
-from cleargs.pipeline.config import merge, parse_override, parse_toml
+from pydantic import Field, StringConstraints, ValidationError
+
+from cleargs.errors import InputError
+from cleargs.pipeline.config import merge, parse_toml
+from cleargs.pipeline.keys import settings
+from cleargs.record import Record
 from cleargs.untrusted import FAULTS, cause, read_text
 
-SCENE_HEADER = re.compile(r"\s*\[\[\s*scene\s*\]\]")
-ASSIGNMENT = re.compile(r"\s*([^=#\[\]]+?)\s*=")
-TABLE = re.compile(r"\s*\[([^\[\]]+)\]")
+NAMES = "letters, digits, and _ . - after the first, at most 100"
 PLAIN = ("name", "input", "recipe")
-"""Columns of a CSV sheet that are taken as they are."""
-NEEDED = ("name", "input")
-FIRST_LINE = "the first line names the columns, with commas between them"
-
-
-@dataclass(frozen=True, order=True)
-class Problem:
-    """One thing that is wrong with a sheet."""
-
-    line: int
-    text: str
+"""Columns of a CSV sheet that are no settings."""
 
 
 class SheetError(InputError):
-    """A sheet with mistakes: all of them, each with its line."""
+    """A sheet with mistakes, one line each, which names the line or the scene."""
 
-    def __init__(self, path: Path, problems: list[Problem]) -> None:
-        count = len(problems)
-        super().__init__(
-            f"{path.name} has {count} mistake{'s' if count > 1 else ''}",
-            hint="correct the lines named above; nothing was started",
-        )
-        self.path = path
-        self.problems = sorted(problems)
+    def __init__(self, path: Path, problems: list[str]) -> None:
+        mistakes = "1 mistake" if len(problems) == 1 else f"{len(problems)} mistakes"
+        super().__init__(f"{path.name} has {mistakes}", hint="correct the scenes above; no scene was started")
+        self.problems = problems
+
+
+class Row(Record):
+    """One scene as the sheet gives it, the sheet's own defaults filled in."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")] = Field(
+        description=NAMES
+    )
+    input: Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+    recipe: str = "default"
+    set: dict[str, str] = Field({})
+    """Setting -> its value in TOML."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One scene of a sheet, the sheet's own defaults filled in, nothing checked yet."""
+class Scene:
+    """One scene to bring through the stages."""
 
-    line: int
-    values: Mapping[str, Any]
-    """``name``, ``input``, ``recipe``, ``set`` (settings) and ``resources``, as far as they are given."""
-    lines: Mapping[str, int] = field(default_factory=dict)
-    """Dotted name (``set.g0.steps``) -> the line where it is given."""
-
-    def line_of(self, name: str) -> int:
-        """The line of ``name`` (dotted), or of the nearest table around it; else that of the scene."""
-        while name and name not in self.lines:
-            name = name.rpartition(".")[0]
-        return self.lines.get(name, self.line)
+    name: str
+    source: Path
+    """Absolute."""
+    recipe: str
+    """A name, or the absolute path of a TOML file."""
+    overrides: tuple[str, ...]
+    """Settings as ``--set`` takes them."""
+    where: str
+    """The place in the sheet."""
 
 
-def read_rows(path: Path) -> tuple[list[Row], list[Problem]]:
-    """The scenes that the sheet ``path`` lists, and what is wrong with single cells: CSV where its name ends
-    so, TOML otherwise.
+def read_scenes(path: Path) -> list[Scene]:
+    """Return the scenes of the sheet ``path``: a CSV where its name ends so, TOML otherwise.
 
-    Raises InputError when the file cannot be read or is no such file, SheetError where nothing can be made of
-    a CSV.
+    Settings and inputs are not checked. Raises SheetError with all mistakes of form, InputError for no sheet.
     """
     try:
         text = read_text(path)
     except FAULTS as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint="give a sheet, TOML or CSV") from error
-    is_csv = path.suffix.lower() == ".csv"
-    rows, problems = _csv_rows(path, text) if is_csv else (_toml_rows(path, text), [])
-    if not rows and not problems:
+    scenes: dict[str, Scene] = {}
+    problems = []
+    rows = _csv_rows(path, text) if path.suffix.lower() == ".csv" else _toml_rows(path, text)
+    for where, values in rows:
+        try:
+            scene = _scene(path.absolute().parent, where, Row.model_validate(values))
+        except ValidationError as error:
+            problems += [f"{where}: {_said(found)}" for found in error.errors(include_url=False)]
+            continue
+        if scene.name in scenes:
+            problems.append(f"{where}: the name {scene.name!r} is taken by {scenes[scene.name].where}")
+        scenes[scene.name] = scene
+    if problems:
+        raise SheetError(path, problems)
+    if not scenes:
         raise InputError(f"{path} lists no scene", hint='write [[scene]], name = "room", input = "room.mp4"')
-    return rows, problems
+    return list(scenes.values())
 
 
-# -- TOML --------------------------------------------------------------------------------------------------
+def _scene(folder: Path, where: str, row: Row) -> Scene:
+    recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
+    overrides = tuple(f"{name}={value}" for name, value in row.set.items())
+    return Scene(row.name, folder / row.input, recipe, overrides, where)
 
 
-def _toml_rows(path: Path, text: str) -> list[Row]:
-    """``[[scene]]`` tables; ``recipe``, ``[set]`` and ``[resources]`` above them hold for all scenes."""
+def _said(found: Any) -> str:
+    """Return one complaint of pydantic in a line."""
+    name = ".".join(map(str, found["loc"]))
+    match found["type"]:
+        case "missing":
+            return f"the scene has no {name}"
+        case "extra_forbidden":
+            return f"a scene has no field {name!r}; known: {', '.join(Row.model_fields)}"
+        case "string_pattern_mismatch":
+            return f"the name {found['input']!r} cannot be used; allowed: {NAMES}"
+        case _:
+            return f"{name}: {found['msg']}"
+
+
+def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the ``[[scene]]`` tables; ``recipe`` and ``[set]`` above them hold for all scenes."""
     document = parse_toml(text, path.name)
     scenes = document.pop("scene", [])
     if not isinstance(scenes, list) or not all(isinstance(scene, dict) for scene in scenes):
         raise InputError(f"{path.name}: scene is no list of tables", hint="write each scene as [[scene]]")
-    head, blocks = _blocks(text)
-    common = _assignments(head)
-    return [
-        Row(block[0][0] if block else 1, merge(document, scene), {**common, **_assignments(block)})
-        for scene, block in zip(scenes, blocks + [[]] * (len(scenes) - len(blocks)), strict=False)
-    ]
+    for number, scene in enumerate(scenes, 1):
+        values = merge(document, scene)
+        if isinstance(given := values.get("set"), dict):  # JSON's spelling of a value is TOML's too
+            values["set"] = {
+                name: json.dumps(value, ensure_ascii=False, default=str) for name, value in settings(given)
+            }
+        yield f"{path.name}, scene {scene.get('name', number)}", values
 
 
-Block = list[tuple[int, str]]
-"""Numbered lines."""
-
-
-def _blocks(text: str) -> tuple[Block, list[Block]]:
-    """The numbered lines above the first ``[[scene]]``, and those of each scene."""
-    head: Block = []
-    blocks: list[Block] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if SCENE_HEADER.match(line):
-            blocks.append([])
-        (blocks[-1] if blocks else head).append((number, line))
-    return head, blocks
-
-
-def _assignments(block: Block) -> dict[str, int]:
-    """Dotted name of each table and each value in ``block``, as seen from the scene -> its line."""
-    lines: dict[str, int] = {}
-    table = ""
-    for number, line in block:
-        if header := TABLE.match(line):
-            table = _plain(header[1]).removeprefix("scene.") + "."
-            lines[table.rstrip(".")] = number
-        elif found := ASSIGNMENT.match(line):
-            lines[table + _plain(found[1])] = number
-    return lines
-
-
-def _plain(name: str) -> str:
-    """A dotted name without quotes and spaces."""
-    return re.sub(r"[\s\"']", "", name)
-
-
-# -- CSV ---------------------------------------------------------------------------------------------------
-
-
-def _csv_rows(path: Path, text: str) -> tuple[list[Row], list[Problem]]:
-    """Columns ``name``, ``input``, ``recipe``; any other is a setting (``g0.steps``) or a resource
-    (``resources.g0.minutes``). An empty cell says nothing."""
-    (_, header), *rows = _table(path, text)
-    missing = [name for name in NEEDED if name not in header]
-    if missing:
-        raise SheetError(path, [Problem(1, f"there is no column {name}; {FIRST_LINE}") for name in missing])
-    problems = [Problem(1, f"column {name!r} is given twice") for name in _repeated(header)]
-    found = []
-    for line, cells in rows:
-        if len(cells) > len(header):
-            problems.append(Problem(line, f"{len(cells)} cells, but the header names {len(header)}"))
-        values: dict[str, Any] = {}
-        for column, cell in zip(header, cells, strict=False):
-            if cell:
-                try:
-                    values = merge(values, _cell(column, cell))
-                except ConfigError:
-                    text = f"{cell!r} stands below {column!r}, which names no setting"
-                    problems.append(Problem(line, text))
-        if any(cells):
-            found.append(Row(line, values))
-    return found, problems
-
-
-def _table(path: Path, text: str) -> list[tuple[int, list[str]]]:
-    """All rows, numbered, the header first."""
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+def _csv_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the rows. A column that is not in `PLAIN` is a setting; an empty cell says nothing."""
+    reader = csv.DictReader(text.splitlines(keepends=True), restkey="more cells than columns", strict=True)
     try:
-        table = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        columns = [column.strip() for column in reader.fieldnames or ()]
+        named = [column for column in columns if column]
+        if not {"name", "input"} <= set(named) or len(set(named)) < len(named):
+            raise InputError(
+                f"{path.name}: the first line has to name each column once, with name and input among them",
+                hint="write name,input with a comma between them",
+            )
+        reader.fieldnames = columns
+        for row in reader:
+            given = {name: str(cell).strip() for name, cell in row.items() if cell and str(cell).strip()}
+            if given:
+                values: dict[str, Any] = {name: given.pop(name) for name in PLAIN if name in given}
+                yield f"{path.name}, line {reader.line_num}", {**values, "set": given}
     except csv.Error as error:
-        raise SheetError(path, [Problem(reader.line_num, f"no CSV: {error}")]) from error
-    return table or [(1, [])]
-
-
-def _cell(column: str, cell: str) -> dict[str, Any]:
-    if column in PLAIN:
-        return {column: cell}
-    document = parse_override(f"{column}={cell}")
-    return document if column.startswith("resources.") else {"set": document}
-
-
-def _repeated(names: list[str]) -> Iterator[str]:
-    yield from sorted({name for name in names if name and names.count(name) > 1})
+        where = f"{path.name}, line {reader.reader.line_num}"
+        raise SheetError(path, [f"{where}: this is no CSV: {error}"]) from error

@@ -1,73 +1,60 @@
-"""``cleargs batch``: all scenes of a sheet, here or on a cluster."""
+"""``cleargs batch``: all scenes of a sheet on this machine."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
-from cleargs.batch.folder import BatchFolder, Plan
-from cleargs.batch.preparation import Preparation
-from cleargs.batch.scenes import Scene, read_scenes
-from cleargs.batch.sheet import SheetError
-from cleargs.batch.snakemake import engine_command, is_local, only_batch, profile_folder, run_engine
-from cleargs.batch.status import SceneState, scene_states
+from cleargs.batch.loop import Batch, Result, write_summary
+from cleargs.batch.sheet import Scene, SheetError, read_scenes
 from cleargs.cli.common import (
     json_option,
     output_option,
+    partial_option,
     print_json,
     quality_option,
     quiet_option,
     report_option,
+    threads_or_all,
+    work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.errors import CleargsError, InputError, StageError
-from cleargs.pipeline.config import override
+from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import Device
-from cleargs.pipeline.session import DeviceChoice, resolve_device, usable_cores
-from cleargs.progress import Reporter, Task
-from cleargs.report.report_json import page_of
-
-sheet_argument = click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
-folder_option = output_option(
-    "The folder of the batch, on a disk that all nodes share.  [default: SHEET with the ending .batch]",
-    "folder",
-    metavar="BATCH",
-    required=False,
-)
+from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.progress import Reporter
 
 
 @click.command(
     epilog="""\b
 Examples:
-  cleargs batch captures.toml --dry-run          check the sheet, count the jobs
-  cleargs batch captures.toml                    on this machine
-  cleargs batch captures.csv --profile slurm     on a Slurm cluster
-  cleargs batch-status captures.csv              from any terminal, meanwhile
+  cleargs batch captures.toml --dry-run          check the sheet; hours, memory and disk
+  cleargs batch captures.toml                    run what is missing, scene by scene
+  cleargs batch captures.csv --quality draft
+A cluster runs the scenes of a sheet at the same time: see docs/cluster.md.
 """
 )
-@sheet_argument
-@folder_option
-@click.option(
-    "--profile", default="local", show_default=True, metavar="local|slurm|FOLDER", help="Where to run."
+@click.argument("sheet", type=click.Path(dir_okay=False, path_type=Path))
+@output_option(
+    "The folder of the batch.  [default: SHEET with the ending .batch]",
+    "folder",
+    metavar="BATCH",
+    required=False,
 )
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
 @quality_option
-@click.option("--dry-run", is_flag=True, help="Only check the sheet and say how many jobs there are.")
-@click.option("--allow-partial", is_flag=True, help="Continue after a stage that is done only in part.")
 @click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="Where to compute. Today auto is the CPU.",
+    "--dry-run", is_flag=True, help="Only check the sheet, and say what is to do and what it costs."
 )
-@report_option("Write a report of every scene, and BATCH/report/index.html, which leads to them.")
-@click.option("--cores", type=click.IntRange(min=1), help="Cores for local jobs.  [default: all]")
+@click.option("--summary", is_flag=True, help="Run nothing; write the summary and the page of what is there.")
+@report_option("Write a report of each scene, and BATCH/report/index.html, which leads to them.")
+@partial_option
+@work_options
 @json_option
 @quiet_option
 @click.pass_obj
@@ -75,175 +62,108 @@ def batch(
     dag: Dag,
     sheet: Path,
     folder: Path | None,
-    profile: str,
     until: str | None,
     quality: tuple[str, ...],
     dry_run: bool,
+    summary: bool,
+    wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
-    wants_report: bool,
-    cores: int | None,
+    threads: int | None,
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Bring every scene of SHEET (TOML or CSV) through the stages.
+    """Bring each scene of SHEET (TOML or CSV) through the stages, one after the other.
 
     A scene that fails does not stop the others. The same command again does only what is missing.
+    BATCH/summary.csv has one row per scene.
     """
     dag.until(until)
-    place = profile_folder(profile)
-    root = batch_folder(sheet, folder)
-    command = _engine(root, place, cores or usable_cores(), dry_run=dry_run)
     reporter = make_reporter(quiet)
-    elsewhere = device == "cuda" and not is_local(place)
-    resolved: Device = "cuda" if elsewhere else resolve_device(device, reporter.info)
-    options = ("--allow-partial",) if allow_partial else ()
-    preparation = Preparation(dag, root, resolved, until, options, report=wants_report)
-    scenes = checked_scenes(sheet, preparation, quality)
-    return run_batch(preparation, scenes, command, reporter, dry_run=dry_run, as_json=as_json)
-
-
-def _engine(root: BatchFolder, place: Path, cores: int, *, dry_run: bool) -> list[str]:
-    """The call of Snakemake; empty where it is not installed and nothing is to be run."""
+    looks_only = dry_run or summary  # at the results of a cluster, from a machine without its device
+    options = (
+        *([] if looks_only else ["--threads", str(threads_or_all(threads))]),
+        *(["--allow-partial"] if allow_partial else []),
+        *([] if wants_report else ["--no-report"]),
+    )
+    resolved = "cuda" if looks_only and device == "cuda" else resolve_device(device, reporter.info)
+    root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        return engine_command(root, place, cores=cores, dry_run=dry_run)
-    except InputError as error:
-        if not dry_run:
-            raise
-        click.echo(f"note: {error}; {error.hint}", err=True)
-        return []
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options)
+        scenes.check(sheet)
+    except SheetError as error:
+        for problem in error.problems:
+            click.echo(problem, err=True)
+        raise
+    if dry_run:
+        _print_plans(scenes, as_json)
+        return 0
+    results = []
+    with reporter.task("scenes", len(scenes.scenes)) as task:
+        for scene in scenes.scenes:
+            if not summary:
+                scenes.run(scene, reporter)
+            results.append(result := scenes.result(scene))
+            write_summary(root / "summary.csv", results)
+            reporter.info(_line(result))
+            task.advance()
+    page = _page(scenes, results, reporter) if wants_report else None
+    states = Counter(result.state for result in results)
+    if as_json:
+        print_json([asdict(result) for result in results])
+    else:
+        click.echo("\n".join(_line(result) for result in results))
+        click.echo(", ".join(f"{count} {state}" for state, count in states.items()))
+        click.echo(f"summary: {root / 'summary.csv'}" + (f"\nreport: {page}" if page else ""))
+    return 1 if states["failed"] or states["waiting"] else 3 if states["partial"] else 0
 
 
-def run_batch(
-    preparation: Preparation,
-    scenes: Sequence[Scene],
-    command: Sequence[str],
-    reporter: Reporter,
-    *,
-    dry_run: bool = False,
-    as_json: bool = False,
-) -> int:
-    """Make the scenes ready, run the engine, print what became of them; returns the exit code."""
-    folder = preparation.folder
-    with only_batch(folder) as lock:
-        plan = preparation.prepare(scenes, reporter, dry_run=dry_run)
-        if dry_run:
-            if command and run_engine(command, folder, lock, lambda: None):
-                raise StageError(
-                    "Snakemake cannot plan the batch", hint=f"see the end of {folder.engine_log}"
-                )
-            _print_jobs(folder, plan, as_json)
-            return 0
-        with reporter.task("stages", len(plan.scenes) * len(plan.wanted)) as task:
-            code = run_engine(command, folder, lock, _teller(folder, plan, reporter, task))
-    states = scene_states(folder, plan, ended=True)
-    print_states(states, plan, as_json)
-    page = _page(folder, plan, states, reporter) if plan.report else None
-    if not plan.report and (older := page_of(folder.root)).is_file():
-        reporter.info(f"note: {older} shows an earlier batch; without --no-report it is made anew")
-    if page is not None and not as_json:
-        click.echo(f"report: {page}")
-    kinds = {state.state for state in states}
-    if "failed" in kinds or (code and "partial" not in kinds):
-        click.echo(f"what Snakemake said: {folder.engine_log}", err=True)
-        return 1
-    return 3 if "partial" in kinds else 0
-
-
-def _page(folder: BatchFolder, plan: Plan, states: Sequence[SceneState], reporter: Reporter) -> Path | None:
-    """The report of the batch; None where it could not be written, which is no failure of the batch."""
-    from cleargs.report.batch_page import write_batch
+def _page(batch: Batch, results: Sequence[Result], reporter: Reporter) -> Path | None:
+    """Write the page; return None where that fails, which is no failure of the batch."""
+    from cleargs.batch.page import write_batch
 
     try:
-        return write_batch(folder, plan, states)
+        return write_batch(batch, results)
     except CleargsError as error:
         reporter.warn(f"there is no report: {error}; {error.hint}")
         return None
 
 
-def checked_scenes(sheet: Path, preparation: Preparation, overrides: Sequence[str] = ()) -> list[Scene]:
-    """The scenes of ``sheet``, with settings for all of them on top.
+def _line(result: Result) -> str:
+    figures = [f"{value} {meaning}" for value, meaning in result.figures()]
+    return f"{result.scene}: {', '.join([result.state, *figures, *filter(None, [result.cause])])}"
 
-    The mistakes of the sheet go to stderr, one line each, before SheetError is raised.
-    """
+
+def _print_plans(batch: Batch, as_json: bool) -> None:
+    """Print hours, memory and disk of what is to do, per scene and in all."""
+    plans = [_plan_json(batch, scene) for scene in batch.scenes]
+    total = {
+        "hours": sum(plan["hours"] for plan in plans),
+        "memory_gb": max(plan["memory_gb"] for plan in plans),
+        "disk_gb": sum(plan["disk_gb"] for plan in plans),
+    }
+    if as_json:
+        print_json({"folder": str(batch.folder), "device": batch.device, **total, "scenes": plans})
+        return
+    for plan in [*plans, {"scene": "in all", **total, "note": f"{len(plans)} scenes"}]:
+        cost = f"{plan['hours']:.2f} h, {plan['memory_gb']:.1f} GB memory, {plan['disk_gb']:.2f} GB disk"
+        click.echo(f"{plan['scene']}: {cost}; {plan['note']}")
+
+
+def _plan_json(batch: Batch, scene: Scene) -> dict[str, Any]:
     try:
-        dag = preparation.dag
-        scenes = [
-            replace(scene, config=override(dag, scene.config, overrides)) for scene in read_scenes(sheet, dag)
-        ]
-        conflicts = preparation.conflicts(scenes)
-        if conflicts:
-            raise SheetError(sheet, conflicts)
-        return scenes
-    except SheetError as error:
-        for problem in error.problems:
-            click.echo(f"{sheet}:{problem.line}: {problem.text}", err=True)
-        raise
-
-
-def batch_folder(sheet: Path, folder: Path | None) -> BatchFolder:
-    """The folder of the batch of ``sheet``."""
-    return BatchFolder((folder or sheet.with_suffix(".batch")).absolute())
-
-
-def print_states(states: Sequence[SceneState], plan: Plan, as_json: bool) -> None:
-    """A line a scene, then how many there are of each kind."""
-    if as_json:
-        print_json([_state_json(state) for state in states])
-        return
-    wide = max(len(state.scene) for state in states)
-    for state in states:
-        line = (
-            f"{state.scene:<{wide}}  {state.state:<8} {state.finished}/{len(plan.wanted)}  {state.stage:<12}"
-        )
-        click.echo(" ".join([line, *filter(None, (state.where, state.cause))]).rstrip())
-        if state.state in ("failed", "partial") and state.log is not None:
-            click.echo(f"{'':<{wide}}  log: {state.log}")
-    counts = Counter(state.state for state in states)
-    click.echo(", ".join(f"{count} {kind}" for kind, count in counts.items()))
-
-
-def _print_jobs(folder: BatchFolder, plan: Plan, as_json: bool) -> None:
-    """How many jobs there would be."""
-    jobs = {
-        stage: sum(folder.read_handle(scene, stage) is None for scene in plan.scenes) for stage in plan.wanted
-    }
-    if as_json:
-        print_json({"scenes": len(plan.scenes), "jobs": jobs})
-        return
-    each = ", ".join(f"{stage} {count}" for stage, count in jobs.items())
-    click.echo(f"{len(plan.scenes)} scenes, {sum(jobs.values())} stages to do: {each}")
-
-
-def _state_json(state: SceneState) -> dict[str, object]:
+        plans = batch.plan(scene)
+        to_do = [plan.stage for plan in plans if plan.state != "done"]
+        note = f"to do: {', '.join(to_do)}" if to_do else "done"
+    except CleargsError as error:
+        plans, to_do, note = [], list(batch.dag.until(batch.until)), f"cannot be planned: {error}"
+    costs = [plan.estimate for plan in plans if plan.estimate is not None]
     return {
-        "scene": state.scene,
-        "state": state.state,
-        "stage": state.stage,
-        "finished": state.finished,
-        "where": state.where,
-        "cause": state.cause,
-        "log": None if state.log is None else str(state.log),
+        "scene": scene.name,
+        "hours": round(sum(cost.minutes for cost in costs) / 60, 3),
+        "memory_gb": round(max((cost.memory_gb for cost in costs), default=0.0), 2),
+        "disk_gb": round(sum(cost.disk_gb for cost in costs), 3),
+        "to_do": to_do,
+        "note": note,
+        "command": batch.arguments(scene),
     }
-
-
-def _teller(folder: BatchFolder, plan: Plan, reporter: Reporter, task: Task) -> Callable[[], None]:
-    """What tells the user of every change, scene by scene."""
-    known = {state.scene: state for state in scene_states(folder, plan)}
-
-    def look() -> None:
-        states = scene_states(folder, plan)
-        for state in states:
-            before = known[state.scene]
-            if (before.state, before.stage) != (state.state, state.stage) and state.state != "waiting":
-                reporter.info(
-                    " ".join(filter(None, (f"{state.scene} {state.stage}: {state.state}", state.where)))
-                )
-            known[state.scene] = state
-        counts = Counter(state.state for state in states)
-        note = ", ".join(
-            f"{counts[kind]} {kind}" for kind in ("running", "failed", "partial") if counts[kind]
-        )
-        task.update(done=sum(state.finished for state in states), note=note)
-
-    return look

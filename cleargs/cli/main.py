@@ -24,8 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "status": ("cleargs.cli.status", "Say for each stage whether it is done, and what changed if not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
     "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
-    "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages, here or on a cluster."),
-    "batch-status": ("cleargs.cli.batch_status", "Say how far each scene of a sheet is."),
+    "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages."),
     "report": (
         "cleargs.cli.report",
         "Write a page that shows a run: the scene in 3D, and every frame.",

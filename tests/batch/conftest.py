@@ -1,32 +1,27 @@
-"""Batches of toy scenes: the stages of ``tests/pipeline/toy.py``, run by the real engine."""
+"""Batches of toy scenes."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))  # toy.py
 
-from toy_batch import ToyBatch, make_toy_batch
+from toy_batch import SCENES, ToyBatch
 
-from cleargs.batch.snakemake import find_snakemake
-from cleargs.errors import InputError
-
-
-@pytest.fixture
-def engine() -> None:
-    """Skips the test where Snakemake is not installed."""
-    try:
-        find_snakemake()
-    except InputError as error:
-        pytest.skip(f"{error}: {error.hint}")
+from cleargs.batch import loop
 
 
 @pytest.fixture
-def toy(tmp_path: Path) -> Iterator[ToyBatch]:
-    batch = make_toy_batch(tmp_path)
-    yield batch
-    batch.end_engine()
+def toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ToyBatch:
+    for tens, scene in enumerate(SCENES):
+        (tmp_path / scene).mkdir()
+        for number in range(10 * tens, 10 * tens + 6):
+            (tmp_path / scene / f"{number}.txt").write_text(str(number))
+    (tmp_path / "empty.toml").touch()
+    batch = ToyBatch(tmp_path)
+    batch.write_sheet()
+    monkeypatch.setattr(loop, "program", lambda: batch.program)
+    return batch

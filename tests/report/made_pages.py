@@ -2,47 +2,36 @@
 
 from __future__ import annotations
 
-import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from report_run import FinishedRun
 
-from cleargs.batch.folder import BatchFolder, Plan
-from cleargs.batch.resources import Wanted, resources
-from cleargs.batch.status import SceneState
+from cleargs.batch.loop import Batch
+from cleargs.batch.page import write_batch
+from cleargs.batch.sheet import Scene
 from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
-from cleargs.report.batch_page import write_batch
 from cleargs.report.page import write_report
 
 CAUSE = "<script>window.hacked = 1</script> cannot be read"
 
 
 def batch_page(root: Path) -> Path:
-    """The page of three scenes: done with a report, at work without one, failed."""
-    folder = BatchFolder(root / "captures & more.batch")
-    run = FinishedRun(folder.root / "scenes", "attic")
+    """The page of three scenes: done with a report, to do without one, failed."""
+    folder = root / "captures & more.batch"
+    attic = FinishedRun(folder / "scenes", "attic")
     with DigestMemo(root / "digests.sqlite") as memo:
-        write_report(run.planner(Store(root, memo)))
-    barn = shutil.copytree(run.folder, folder.run("barn"), ignore=shutil.ignore_patterns("report"))
-    shutil.rmtree(barn / "consolidate")
-    log = folder.log("cellar", "ingest")
-    log.parent.mkdir(parents=True)
-    log.touch()
-    stages = {stage: tuple(run.dag.load(stage).INPUTS) for stage in run.dag.names}
-    asked = {stage: resources(stage, None, Wanted(), "cpu") for stage in stages}
-    plan = Plan(
-        watcher=(),
-        program=(),
-        options=(),
-        stages=stages,
-        until="consolidate",
-        report=True,
-        scenes=dict.fromkeys(("attic", "barn", "cellar"), asked),
-    )
-    states = [
-        SceneState("attic", "done", "consolidate", 5),
-        SceneState("barn", "running", "consolidate", 4, where="node7, job 12"),
-        SceneState("cellar", "failed", "ingest", 0, CAUSE, log=log),
+        write_report(attic.planner(Store(root, memo)))
+    FinishedRun(folder / "scenes", "barn")
+    (folder / "logs").mkdir()
+    (folder / "logs" / "cellar.log").touch()
+    scenes = [Scene(name, root / name, "smoke", (), name) for name in ("attic", "barn", "cellar")]
+    batch = Batch(attic.dag, folder, scenes, "cpu")
+    done, waiting, failed = (batch.result(scene) for scene in scenes)
+    results = [
+        replace(done, state="done", cause=""),
+        replace(waiting, state="waiting", cause=""),
+        replace(failed, state="failed", cause=CAUSE),
     ]
-    return write_batch(folder, plan, states)
+    return write_batch(batch, results)

@@ -1,0 +1,90 @@
+"""``BATCH/report/index.html``: all scenes of a batch as a grid that leads to their own reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+from urllib.parse import quote
+
+from cleargs.batch.loop import Batch, Result, State
+from cleargs.batch.sheet import Scene
+from cleargs.capture.tables import load_frames
+from cleargs.errors import CleargsError
+from cleargs.manifest import Manifest
+from cleargs.media.image import read_rgb
+from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
+from cleargs.report.html import new_report, write_page
+from cleargs.report.report_json import FOLDER, is_current, page_of
+from cleargs.report.words import count, duration, size
+
+BYTES = 15_000_000
+"""About how much all thumbnails together may take."""
+
+MAX_SIDE, MIN_SIDE = 480, 96
+"""Of a thumbnail, px."""
+
+ASPECT = 9 / 16
+"""Of most captures."""
+
+
+def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
+    """Write the page, in place of an older one; return its path. Raises StoreError."""
+    kinds: Counter[str] = Counter(result.state for result in results)
+    order = get_args(State)
+    pairs = sorted(zip(batch.scenes, results, strict=True), key=lambda pair: order.index(pair[1].state))
+    side = min(MAX_SIDE, side_of(len(results), ASPECT, BYTES, MIN_SIDE))
+    with new_report(batch.folder) as report:
+        (report / "scenes").mkdir()
+        write_page(
+            report,
+            "batch.html.jinja",
+            name=batch.folder.name,
+            aspect=None,
+            tone="poor" if kinds["failed"] else "good" if kinds["done"] == len(results) else "fair",
+            scenes=count(len(results), "scene"),
+            kinds=[(kind, kinds[kind]) for kind in order if kinds[kind]],
+            done=kinds["done"],
+            total=duration(60 * sum(result.minutes for result in results)),
+            bytes=size(round(1e9 * sum(result.disk_gb for result in results))),
+            stages=batch.dag.until(batch.until),
+            cards=[_card(batch, scene, result, report, side) for scene, result in pairs],
+        )
+    return page_of(batch.folder)
+
+
+def _card(batch: Batch, scene: Scene, result: Result, report: Path, side: int) -> dict[str, Any]:
+    """Return what the page says of one scene; an address is "" where there is no such file."""
+    made, run = batch.made(scene), batch.run_folder(scene)
+    picture, shows = _picture(run, made, report, f"scenes/{scene.name}.jpg", side)
+    return {
+        "result": result,
+        "done": list(made),
+        "picture": picture,
+        "shows": shows,
+        "figures": result.figures(),
+        "report": _address(batch, page_of(run)),
+        "is_current": is_current(run, made),
+        "log": _address(batch, batch.log(scene)),
+    }
+
+
+def _picture(
+    run: Path, made: Mapping[str, Manifest], report: Path, name: str, side: int
+) -> tuple[Picture | None, str]:
+    """Return the still of the scene's report, else its first frame; and the subject of the picture."""
+    still = run / FOLDER / "after.jpg"
+    try:
+        if still.is_file():
+            return write_jpeg(report, name, read_rgb(still), side), "the scene"
+        if "ingest" in made:
+            first = load_frames(run / "ingest")[0].image
+            return write_jpeg(report, name, read_rgb(run / "ingest" / first), side), "the first frame"
+    except CleargsError:  # a damaged picture is no reason to leave out the scene
+        pass
+    return None, ""
+
+
+def _address(batch: Batch, path: Path) -> str:
+    return f"../{quote(path.relative_to(batch.folder).as_posix())}" if path.is_file() else ""

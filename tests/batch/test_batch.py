@@ -1,0 +1,221 @@
+"""`cleargs batch`: sheets, the loop over their scenes, summary and page."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from toy_batch import ToyBatch
+
+from cleargs.batch.sheet import Scene, SheetError, read_scenes
+from cleargs.cli.main import invoke
+from cleargs.errors import InputError
+
+
+def read(folder: Path, name: str, text: str) -> list[Scene]:
+    (folder / name).write_text(text)
+    return read_scenes(folder / name)
+
+
+TOML = """\
+recipe = "mine.toml"
+[set]
+count.limit = 5
+
+[[scene]]
+name = "attic"
+input = "attic.mp4"
+
+[[scene]]
+name = "barn"
+input = "/barn"
+recipe = "smoke"
+set.count.mode = "padded"
+set.count.list = [1, 2]
+"""
+
+CSV = """\
+\ufeffname,input,recipe,count.limit,count.mode,count.list,\r
+attic,attic.mp4,mine.toml,5,,,\r
+,,,,,,\r
+barn,/barn,smoke,5,"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("s.toml", TOML), ("s.csv", CSV + 'padded,"[1, 2]",\r\n')])
+def test_both_kinds_of_sheet_say_the_same(tmp_path: Path, name: str, text: str) -> None:
+    attic, barn = read(tmp_path, name, text)
+    assert (attic.name, attic.source) == ("attic", tmp_path / "attic.mp4")
+    assert (attic.recipe, attic.overrides) == (str(tmp_path / "mine.toml"), ("count.limit=5",))
+    assert (barn.source, barn.recipe) == (Path("/barn"), "smoke")
+    assert [text.replace('"', "") for text in barn.overrides] == [
+        "count.limit=5",
+        "count.mode=padded",
+        "count.list=[1, 2]",
+    ]
+
+
+MISTAKES = {
+    "s.csv": [
+        ("name,input\na b,x\n,x\n", ["line 2: the name 'a b'", "line 3: the scene has no name"]),
+        ("name,input\na,x\na,y\nb,\n", ["line 3: the name 'a' is taken by s.csv, line 2", "line 4"]),
+        ('name,input\n"a,x\nb,y\n', ["line 3: this is no CSV"]),
+    ],
+    "s.toml": [
+        ('[[scene]]\nname="a"\nimput="x"', ["scene a: the scene has no input", "no field 'imput'"]),
+        (f'[[scene]]\ninput="x"\n[[scene]]\nname="{"n" * 101}"\ninput=" "', ["scene 1", "100", "input"]),
+        ('[[scene]]\nname="a"\ninput="x"\nset=3', ["scene a: set"]),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problems"), [(name, *case) for name, cases in MISTAKES.items() for case in cases]
+)
+def test_mistakes_are_named_with_their_place(
+    tmp_path: Path, name: str, text: str, problems: list[str]
+) -> None:
+    with pytest.raises(SheetError) as caught:
+        read(tmp_path, name, text)
+    assert len(caught.value.problems) == len(problems)
+    assert all(said in problem for said, problem in zip(problems, caught.value.problems, strict=True))
+
+
+@pytest.mark.parametrize("text", ["", "[[scene", "scene = 3"])
+def test_no_toml_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        read(tmp_path, "s.toml", text)
+
+
+@pytest.mark.parametrize("text", ["name;input\na;x\n", "name,input,input\na,x,y\n", "\n"])
+def test_no_csv_sheet_is_one_plain_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        read(tmp_path, "s.csv", text)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("nowhere.mp4,,", "there is no"),
+        ("hall.mp4,0,", "g0.steps = 0 cannot be used"),
+        ("hall.mp4,,nonesuch", "there is no expert 'nonesuch'"),
+        ("hall.mp4,,nafnet-gopro", "nafnet-gopro is not installed"),
+        ("hall.mp4,,,surplus", "more cells than columns"),
+    ],
+)
+def test_a_wrong_scene_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, row: str, said: str
+) -> None:
+    monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path / "models"))
+    (tmp_path / "hall.mp4").touch()
+    sheet = tmp_path / "sheet.csv"
+    sheet.write_text(f"name,input,g0.steps,rivr.expert\nhall,{row}\n")
+    assert invoke(["batch", str(sheet)]) == 2
+    assert said in capsys.readouterr().err.splitlines()[0]
+    assert not (tmp_path / "sheet.batch").exists()
+
+
+def test_a_folder_of_another_input_is_refused(toys: ToyBatch, capsys: pytest.CaptureFixture[str]) -> None:
+    run = toys.folder / "scenes" / "barn"
+    run.mkdir(parents=True)
+    (run / "run.toml").write_text('input = "/elsewhere/hall.mp4"\n')
+    assert toys.run() == 2
+    assert "scene barn: " in (said := capsys.readouterr().err) and "is a run of /elsewhere/hall.mp4" in said
+    assert toys.work_done() == []
+
+
+def test_a_bad_scene_stops_no_other_and_the_next_batch_does_what_is_missing(
+    toys: ToyBatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (toys.root / "barn" / "11.txt").write_text("no number")  # square cannot take it
+    (toys.root / "cellar" / "20.txt").write_text("")  # count leaves it out
+    assert toys.run("--json") == 1
+    streams = capsys.readouterr()
+    results = {result["scene"]: result for result in json.loads(streams.out)}
+    assert {name: result["state"] for name, result in results.items()} == {
+        "attic": "done",
+        "barn": "failed",
+        "cellar": "partial",
+    }
+    assert "no number" in results["barn"]["cause"] and "20.txt is empty" in results["cellar"]["cause"]
+    assert {name: row["cause"] for name, row in toys.summary().items()} == {
+        name: result["cause"] for name, result in results.items()
+    }
+    assert "attic: square: starts" in streams.err
+    assert "no number" in (toys.folder / "logs" / "barn.log").read_text()
+    page = (toys.folder / "report" / "index.html").read_text()
+    assert page.index("barn") < page.index("cellar") < page.index("attic"), "what needs a look comes first"
+    assert toys.digests("attic") == toys.undisturbed("attic")
+    toys.work_done()
+
+    (toys.root / "barn" / "11.txt").write_text("11")
+    assert toys.run() == 3
+    stages = [line for line in toys.work_done() if line in toys.dag.names]
+    assert sorted(stages) == ["count", "count", "square", "total"], "barn, and cellar's count once more"
+    assert toys.digests("barn") == toys.undisturbed("barn")
+    assert toys.run("--allow-partial") == 3
+    assert toys.summary()["cellar"]["state"] == "partial" and toys.digests("cellar")
+
+
+def test_a_changed_setting_touches_its_scene_and_later_stages_only(toys: ToyBatch) -> None:
+    toys.write_sheet({"attic": "", "barn": ""})
+    assert toys.run() == 0
+    toys.work_done()
+    toys.write_sheet({"attic": "", "barn": "set.square.power = 3"})
+    assert toys.run("--no-report") == 0
+    assert [line for line in toys.work_done() if line in toys.dag.names] == ["square", "total"]
+    toys.write_sheet({"attic": "", "barn": ""})  # going back is a hit
+    assert toys.run() == 0
+    assert toys.work_done() == []
+
+
+def test_a_dry_run_tells_the_cost_and_a_summary_what_is_there(
+    toys: ToyBatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toys.write_sheet({"attic": "", "barn": ""})
+    assert toys.run("--dry-run", "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["hours"] == pytest.approx(2 * (0.1 + 6.0 + 0.3) / 60, abs=0.002)
+    assert (plan["memory_gb"], plan["disk_gb"]) == (0.1, pytest.approx(0.006))
+    assert [scene["to_do"] for scene in plan["scenes"]] == [list(toys.dag.names)] * 2
+    assert not toys.folder.exists()
+
+    assert invoke(plan["scenes"][0]["command"], toys.dag) == 0
+    assert toys.run("--summary") == 1
+    assert {name: row["state"] for name, row in toys.summary().items()} == {
+        "attic": "done",
+        "barn": "waiting",
+    }
+    assert toys.run("--until", "count", "--dry-run") == 0
+    assert "attic: 0.00 h, 0.0 GB memory, 0.00 GB disk; done" in capsys.readouterr().out
+
+
+def test_a_killed_batch_goes_on_from_its_checkpoint(toys: ToyBatch) -> None:
+    sheet = toys.write_sheet({"attic": ""}, held=True)
+    code = f"""
+import runpy, sys
+from cleargs.batch import loop
+loop.program = lambda: {toys.program}
+sys.argv[1:] = {[toys.program[2], "batch", str(sheet), "--device", "cpu"]}
+runpy.run_path({toys.program[1]!r}, run_name="__main__")
+"""
+    batch = subprocess.Popen([sys.executable, "-c", code])
+    toys.wait_until(lambda: "held" in toys.lines(), "held")
+    batch.send_signal(signal.SIGTERM)
+    assert batch.wait(timeout=60) == 130
+    toys.hold.unlink()
+    assert toys.run() == 0
+    assert toys.lines().count("square 0.txt") == 1, "the checkpoint was used"
+    assert toys.digests("attic") == toys.undisturbed("attic")
+
+
+def test_a_child_that_is_killed_is_a_failure_that_says_so(
+    toys: ToyBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cleargs.batch.loop.program", lambda: ["/bin/sh", "-c", "kill -9 $$"])
+    toys.write_sheet({"attic": ""})
+    assert toys.run() == 1
+    assert toys.summary()["attic"]["cause"] == "ended by signal 9"
