@@ -12,7 +12,7 @@ _HOMES = {
     **dict.fromkeys(("score_frames", "score", "restore", "deblur", "evaluate_scene"), "api"),
     "Camera": "splat.camera",
     "CleargsError": "errors",
-    "G0Config": "splat.config",
+    "G0Config": "stages.g0",
     "Gaussians": "splat.gaussians",
     "Scene": "splat.scene",
     "TrainConfig": "splat.config",

@@ -16,11 +16,11 @@ from cleargs.run_results import StageResults as StageResults
 from cleargs.run_results import open_prepared as open_prepared
 from cleargs.run_results import open_run as open_run
 from cleargs.splat.camera import Camera as Camera
-from cleargs.splat.config import G0Config as G0Config
 from cleargs.splat.config import TrainConfig as TrainConfig
 from cleargs.splat.gaussians import Gaussians as Gaussians
 from cleargs.splat.scene import Scene as Scene
 from cleargs.splat.views import View as View
+from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
 
 __all__: list[str]
 __version__: str

@@ -24,18 +24,20 @@ from cleargs.pipeline.session import (
 )
 from cleargs.progress import LogReporter, Reporter, SilentReporter, SilentTask, Task
 from cleargs.run_results import Prepared, Run, open_prepared
-from cleargs.splat.effort import Quality, decided, quality_settings
+from cleargs.splat.budget import Quality
+from cleargs.splat.effort import decided
 
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from cleargs import G0Config
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.eval_report import Evaluation
     from cleargs.rivr.restoring import Deblurred
     from cleargs.splat.camera import Camera
-    from cleargs.splat.config import G0Config, TrainConfig
+    from cleargs.splat.config import TrainConfig
     from cleargs.splat.formation import Formation
     from cleargs.splat.scene import Scene
     from cleargs.splat.trainer import Trained
@@ -82,7 +84,7 @@ def run(
         Path(folder),
         workflow=workflow,
         overrides=[
-            *(quality_settings(quality) if quality else ()),
+            *([f"g0.quality={quality}"] if quality else []),
             *(f"{name}={_toml(value)}" for name, value in (set or {}).items()),
         ],
         seed=seed,
@@ -106,10 +108,10 @@ def initialise(
     """The scene that a training starts from: one Gaussian a sparse point, and more between them.
 
     ``views`` (default: all of ``capture``) give the colours of those in between; of ``config`` count
-    ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``init_*``, ``antialias`` and ``background``.
+    ``sh_degree``, ``min_points``, ``budget``, ``quality``, ``antialias`` and ``background``.
     """
+    from cleargs import G0Config
     from cleargs.capture.tables import load_observations
-    from cleargs.splat.config import G0Config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.scene import Scene
 
@@ -118,7 +120,14 @@ def initialise(
     points, observations = capture.points, load_observations(capture.folder)
     frame_ids = [view.frame_id for view in views]
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
-    gaussians = starting_gaussians(sparse, views, config, seed=seed)
+    gaussians = starting_gaussians(
+        sparse,
+        views,
+        at_least=config.min_points,
+        at_most=config.budget,
+        sh_degree=config.sh_degree,
+        seed=seed,
+    )
     return Scene(gaussians, config.antialias, config.background)
 
 

@@ -2,57 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, ClassVar
 
-from cleargs.errors import InputError
-from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
-from cleargs.plugins import installed_version
+from pydantic import Field
+
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.rivr.config import MAX_ROUNDS, ConsolidateConfig
+from cleargs.record import Inherited, Settings
+
+from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
+from .config import other_libraries as other_libraries
+
+
+class FinalDistilConfig(DistilConfig):
+    """The final distillation."""
+
+    begin: float = Field(
+        ROUNDS_END, ge=0, lt=1, description="share of the schedule that lies behind when this training begins"
+    )
+
+
+class ConsolidateConfig(Settings):
+    """Full-Trajectory Repair Consolidation. When its scene is rejected, [rivr.harm] says."""
+
+    RETIRED: ClassVar[Mapping[str, Any]] = {"harm": Inherited("rivr")}
+
+    scorer: str = Field(
+        "clarity-net",
+        description="measures harm: the name of a scorer, or the path of an ONNX file",
+        json_schema_extra={"key": False, "plugin": "scorers"},  # its content is in the key
+    )
+    distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
+
 
 VERSION = 24
 CONFIG = ConsolidateConfig
+SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
-    "g0": ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors"),
+    "g0": TRAINED,
     "rivr": (
-        "scene.ply",
-        "exposure.parquet",
-        "formation.parquet",
-        "state.safetensors",
+        *TRAINED,
         "selection.parquet",
         *(f"round_{number:02d}" for number in range(1, MAX_ROUNDS + 1)),
     ),
 }
-OUTPUTS = (
-    "scene.ply",
-    "repairs.parquet",
-    "train.parquet",
-    "exposure.parquet",
-    "formation.parquet",
-    "state.safetensors",
-    "before_after.png",
-)
+OUTPUTS = (*TRAINED, "train.parquet", "repairs.parquet", "before_after.png")
 LEFTOVERS: tuple[str, ...] = ()
-LIBRARIES = (
-    "torch",
-    "numba",
-    "numpy",
-    "OpenImageIO",
-    "opencv-contrib-python-headless",
-    "pyarrow",
-    "safetensors",
-)
-
-
-def other_libraries(device: Device) -> Mapping[str, str]:
-    """What else computes on ``device``."""
-    from cleargs.models.onnx import runtime_version
-
-    kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
-    return {"onnxruntime": runtime_version(device), **kernels}
+LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
@@ -76,10 +76,12 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
     from .cost import capture_size, pace
 
-    seconds, memory = training_cost(context.config.distil, *capture_size(context))
+    g0, (frames, megapixels) = context.settings["g0"], capture_size(context)
+    training = context.config.distil.applied_to(g0, frames)
+    seconds, memory = training_cost(training, frames, megapixels)
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
-        memory_gb=1.0 + memory + context.config.distil.cache_mb / 1024.0,
+        memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
         disk_gb=0.7 * memory,  # scene and state: 1 kB a Gaussian
     )
 
@@ -104,12 +106,11 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
-    rivr = context.inputs["rivr"]
+    rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm
     set_threads(threads)
-    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
+    supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = read_selection(rivr / "selection.parquet")
-    _require_untouched(supervision.held_back, {row.frame_id for row in rows})
     repairs, kept = latest_accepted(rows), kept_raw(rows)
     write_repairs(context.out / "repairs.parquet", repairs)
 
@@ -120,11 +121,13 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
         consolidated = start.trained(
             [*supervision.real, *pseudo],
-            config.distil,
+            config.distil.applied_to(context.settings["g0"], len(supervision.real)),
             context.checkpoints / "consolidation",
             seed=(context.seed, Stream.CONSOLIDATION),
             label="consolidating",
             round=0,
+            pseudo_share=config.distil.pseudo_share,
+            pseudo_weight=config.distil.pseudo_weight,
             repaired=repaired_share(rows),
             reporter=reporter,
         )
@@ -134,8 +137,8 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         supervision.held_back,
         g0.fidelity(supervision.judges, scorer, threads),
         consolidated.fidelity(supervision.judges, scorer, threads),
-        psnr_margin=config.harm.psnr_margin,
-        score_margin=config.harm.score_margin,
+        psnr_margin=harm.psnr_margin,
+        score_margin=harm.score_margin,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)
     if rejected is not None:
@@ -155,12 +158,3 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     )
     figures = consolidation_summary(repairs, len(kept), scorer.name, verdict)
     return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})
-
-
-def _require_untouched(held_back: Collection[int], repaired: Collection[int]) -> None:
-    """Raise InputError where frames that are to judge the scene were repaired."""
-    if both := set(held_back) & set(repaired):
-        raise InputError(
-            f"{len(both)} of the frames that consolidate.harm.held_back keeps from repair have been repaired",
-            hint="set rivr.harm.held_back and consolidate.harm.held_back alike",
-        )

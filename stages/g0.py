@@ -5,24 +5,69 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
 
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
-from cleargs.splat.config import G0Config
+from cleargs.record import Unit
+from cleargs.splat.budget import INIT_OPACITY, INIT_SCALE
+from cleargs.splat.config import TrainConfig
+
+from .config import G0_END, TRAINED
 
 if TYPE_CHECKING:
     from cleargs.formation.exposure import Exposure
     from cleargs.splat.initialise import SparsePoints
     from cleargs.splat.views import View
 
+
+class G0Config(TrainConfig):
+    """The first scene, from the sparse points and the frames that RVA keeps."""
+
+    RETIRED: ClassVar[Mapping[str, Any]] = {
+        **TrainConfig.RETIRED,
+        "init_scale": INIT_SCALE,
+        "init_opacity": INIT_OPACITY,
+    }
+
+    end: float = Field(
+        G0_END,
+        gt=0,
+        le=1,
+        description="share of the schedule that lies behind when this training ends; RIVR and the "
+        "consolidation go on from there. 1: for a scene that nothing follows",
+    )
+    sh_degree: int | None = Field(
+        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
+    )
+    exposure: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="one colour affine a frame; auto = on where the frames' gains on the points differ by "
+        "more than 5 %",
+    )
+    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
+    background: tuple[Unit, Unit, Unit] = Field((0.0, 0.0, 0.0), description="sRGB behind the scene")
+    min_points: int = Field(
+        10_000,
+        ge=1,
+        le=5_000_000,
+        description="fewest Gaussians to start from, within the budget; points are added to reach it",
+    )
+
+    exposure_threshold: ClassVar[float] = 0.05
+    """Spread of the frames' gains from which ``auto`` is on: with a fixed exposure it stays below."""
+
+
 VERSION = 24
 CONFIG = G0Config
+SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "points.parquet", "observations.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
 }
-OUTPUTS = ("scene.ply", "train.parquet", "exposure.parquet", "formation.parquet", "state.safetensors")
+OUTPUTS = (*TRAINED, "train.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless")
 
@@ -90,7 +135,15 @@ def run(context: StageContext[G0Config]) -> StageResult:
         context.reporter.info(f"G0: {remark}")
 
     config = decided(config, views)
-    gaussians = starting_gaussians(sparse, views, config, seed=context.seed, say=say)
+    gaussians = starting_gaussians(
+        sparse,
+        views,
+        at_least=config.min_points,
+        at_most=config.budget,
+        sh_degree=config.sh_degree,
+        seed=context.seed,
+        say=say,
+    )
     exposure, spread = _exposure(config, views, sparse)
     formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
     trained = train(

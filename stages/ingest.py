@@ -54,6 +54,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
 
 VERSION = 8
 CONFIG = IngestConfig
+SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
 OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images", "colmap")
 LEFTOVERS = ("images/*.png",)

@@ -6,13 +6,21 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
 
 from cleargs.errors import StoreError
-from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
-from cleargs.plugins import installed_version
+from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.rivr.config import RivrConfig
+from cleargs.record import Settings
+from cleargs.rivr.gates import GateConfig
+from cleargs.rivr.harm import HarmConfig
+from cleargs.splat.budget import Quality
+from cleargs.splat.config import TrainConfig
+
+from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
+from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot
@@ -22,40 +30,107 @@ if TYPE_CHECKING:
     from cleargs.rivr.tables import Selection
     from cleargs.splat.views import View
 
+
+class RoundsConfig(DistilConfig):
+    """The distillations of RIVR's rounds, which follow each other in one part of the schedule."""
+
+    begin: float = Field(
+        G0_END, ge=0, lt=1, description="share of the schedule that lies behind when the first round begins"
+    )
+    end: float = Field(
+        ROUNDS_END, gt=0, le=1, description="share of the schedule that lies behind when the last round ends"
+    )
+
+
+class RivrConfig(Settings):
+    """Render-Guided In-Video Restoration."""
+
+    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="times that every target frame is repaired")
+    targets: Literal["auto", "all", "degraded"] = Field(
+        "auto",
+        description="frames to repair: all registered training frames, or those that are not strong; auto = "
+        "all, but degraded in a draft",
+    )
+    expert: str = Field(
+        "embedded",
+        description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
+        "that another package brings",
+        json_schema_extra={"key": False, "plugin": "experts"},  # its content is in the key
+    )
+    primary_scorer: str = Field(
+        "clarity-net",
+        description="decides between candidates: the name of a scorer, or an ONNX file",
+        json_schema_extra={"key": False, "plugin": "scorers"},  # as for the expert
+    )
+    tiebreak_scorer: str = Field(
+        "naturalness-stats",
+        description="decides near-ties: the name of a scorer, or an ONNX file",
+        json_schema_extra={"key": False, "plugin": "scorers"},
+    )
+    group: int | None = Field(
+        None,
+        ge=1,
+        description="most target frames that are repaired from one scene: a round goes along the trajectory "
+        "in groups, and what is accepted in one is distilled before the next is rendered (the paper's way); "
+        "unset = the whole round at once. The groups share the round's distil.steps",
+    )
+    margin: float = Field(
+        1.0, ge=0.0, le=100.0, description="primary scores this close to the best go to the tie-break scorer"
+    )
+    keep_raw: bool = Field(
+        True,
+        description="a raw frame that needs no repair gets none and keeps supervising by itself; false: "
+        "the paper's, where every target gets a pseudo observation",
+    )
+    fuse_sigma: float = Field(
+        2.0, gt=0.0, le=100.0, description="Gaussian that splits detail from base in the fusion, px"
+    )
+    use_observation: bool = Field(
+        True, description="false: the ablation whose expert restores the render instead of the raw frame"
+    )
+    undo_motion: bool = Field(
+        True,
+        description="with use_observation: the raw frame loses the blur and the skew of the camera's motion, "
+        "found by comparing it with the render, before the expert restores it; false: the paper's",
+    )
+    use_fused: bool = Field(
+        False,
+        description="a third candidate, the render with the detail of what was restored; true: the paper's. "
+        "With undo_motion the restored frame has the render's detail already, and would have it twice",
+    )
+    gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
+    distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
+    harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
+
+    def which_targets(self, quality: Quality) -> Literal["all", "degraded"]:
+        """``targets``, decided: a draft is a look within minutes, and repairs take most of RIVR's time."""
+        if self.targets == "auto":
+            return "degraded" if quality == "draft" else "all"
+        return self.targets
+
+    def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
+        """A training of ``steps`` steps in round ``round`` (from 1), ``done`` of whose steps lie behind, with
+        its part of the schedule.
+
+        frames: active ones, on which the steps of a round rest where they are unset.
+        """
+        whole = self.distil.applied_to(g0, frames)
+        step = (whole.end - whole.begin) / (self.rounds * whole.length)
+        begin = whole.begin + step * ((round - 1) * whole.length + done)
+        return whole.model_copy(update={"steps": steps, "begin": begin, "end": begin + step * steps})
+
+
 VERSION = 26
 CONFIG = RivrConfig
+SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "images", "masks"),
     "rva": ("frames.parquet",),
-    "g0": ("scene.ply", "exposure.parquet", "formation.parquet", "state.safetensors"),
+    "g0": TRAINED,
 }
-OUTPUTS = (
-    "selection.parquet",
-    "scene.ply",
-    "train.parquet",
-    "exposure.parquet",
-    "formation.parquet",
-    "state.safetensors",
-    "candidates.png",
-)
+OUTPUTS = (*TRAINED, "train.parquet", "selection.parquet", "candidates.png")
 LEFTOVERS = ("round_*/*.exr",)
-LIBRARIES = (
-    "torch",
-    "numba",
-    "numpy",
-    "OpenImageIO",
-    "opencv-contrib-python-headless",
-    "pyarrow",
-    "safetensors",
-)
-
-
-def other_libraries(device: Device) -> Mapping[str, str]:
-    """What else computes on ``device``."""
-    from cleargs.models.onnx import runtime_version
-
-    kernels = {"triton": installed_version("triton")} if device == "cuda" else {}
-    return {"onnxruntime": runtime_version(device), **kernels}
+LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
@@ -89,21 +164,21 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     from .cost import capture_size, pace
 
-    config = context.config
+    config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
-    targets = frames if config.which_targets == "all" else _degraded(context, frames)
+    targets = frames if config.which_targets(g0.quality) == "all" else _degraded(context, frames)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
     seconds = megapixels * targets * (restoring * restorings + (5.0 if deblurs else 2.0) * config.rounds)
-    distilling, memory = training_cost(config.distil, frames, megapixels)
+    distilling, memory = training_cost(config.distil.applied_to(g0, frames), frames, megapixels)
     seconds += config.rounds * distilling
     scene = context.inputs.get("g0", Path()) / "scene.ply"
     groups = 1 if config.group is None else -(-targets // config.group)
     scenes = config.rounds * groups * scene.stat().st_size / 1e9 if scene.is_file() else 0.0
     return Estimate(
         minutes=seconds * pace(context.threads) / 60.0,
-        memory_gb=1.0 + memory + config.distil.cache_mb / 1024.0,
+        memory_gb=1.0 + memory + g0.cache_mb / 1024.0,
         disk_gb=0.02 * megapixels * targets * (config.rounds + 1) + scenes,
     )
 
@@ -140,7 +215,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
-    targets = supervision.targets(config.which_targets)
+    targets = supervision.targets(config.which_targets(context.settings["g0"].quality))
     forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
@@ -207,8 +282,9 @@ def _repair_and_distil(
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share
 
-    config, reporter = context.config, context.reporter
-    groups = trajectory_groups(targets, config.group, config.distil.steps_for(len(supervision.real)))
+    config, reporter, g0_config = context.config, context.reporter, context.settings["g0"]
+    frames = len(supervision.real)
+    groups = trajectory_groups(targets, config.group, config.distil.applied_to(g0_config, frames).length)
     rows: list[Selection] = []
     trainings: list[Path] = []
     current = g0
@@ -240,11 +316,13 @@ def _repair_and_distil(
                 continue
             current = current.trained(
                 [*supervision.real, *repairs],
-                config.distillation(number, done, steps, len(supervision.real)),
+                config.distillation(g0_config, number, done, steps, frames),
                 context.checkpoints / f"round_{number:02d}" / f"group_{place + 1:03d}",
                 seed=(context.seed, Stream.RIVR, number, *([place] if place else [])),
                 label=f"{label}: distilling",
                 round=number,
+                pseudo_share=config.distil.pseudo_share,
+                pseudo_weight=config.distil.pseudo_weight,
                 repaired=repaired_share(rows),
                 reporter=reporter,
             )

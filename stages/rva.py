@@ -15,6 +15,7 @@ class RvaConfig(AssessmentConfig, EvaluatorConfig):
 
 VERSION = 4
 CONFIG = RvaConfig
+SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("frames.parquet", "observations.parquet", "images", "masks")
 }

@@ -31,9 +31,7 @@ SETTINGS = {
     "g0.checkpoint_interval": 10,
     "rivr.rounds": 2,
     "rivr.distil.steps": 20,
-    "rivr.distil.checkpoint_interval": 5,
     "consolidate.distil.steps": 20,
-    "consolidate.distil.checkpoint_interval": 5,
 }
 HEAVY = ("torch", "numba", "pyarrow.parquet", "cv2", "OpenImageIO", "onnxruntime", "scipy.ndimage")
 MAX_SECONDS = 3600.0

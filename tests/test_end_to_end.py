@@ -30,9 +30,7 @@ SETTINGS = {
     "g0.checkpoint_interval": "10",
     "rivr.rounds": "2",
     "rivr.distil.steps": "20",
-    "rivr.distil.checkpoint_interval": "5",
     "consolidate.distil.steps": "20",
-    "consolidate.distil.checkpoint_interval": "5",
 }
 KILLS_A_STAGE = 2
 

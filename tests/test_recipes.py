@@ -33,14 +33,11 @@ METHOD: dict[str, Any] = {
     "rivr.use_observation": True,
     "rivr.undo_motion": False,
     "g0.formation.enabled": False,
-    "rivr.distil.formation.enabled": False,
-    "consolidate.distil.formation.enabled": False,
     "rivr.keep_raw": False,
     "rivr.use_fused": True,
     "rivr.gate.max_share": 1.0,  # no gate
     "rivr.distil.pseudo_share": "even",
     "rivr.distil.pseudo_weight": 1.0,
-    "consolidate.harm.held_back": 0.0,
     "consolidate.distil.pseudo_share": "even",
     "consolidate.distil.pseudo_weight": 1.0,
 }
@@ -112,10 +109,7 @@ def test_the_open_row_trains_as_the_default_does() -> None:
     assert value(row, "rivr.rounds") == value(default, "rivr.rounds")
     same = {"pseudo_share": 0.0, "pseudo_weight": 0.0}
     for stage in ("rivr", "consolidate"):
-        trainings = [
-            value(config, f"{stage}.distil").model_copy(update=same | off) for config in (row, default)
-        ]
-        assert not value(row, f"{stage}.distil").formation.enabled
+        trainings = [value(config, f"{stage}.distil").model_copy(update=same) for config in (row, default)]
         assert trainings[0] == trainings[1]
 
 

@@ -52,9 +52,9 @@ def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
     rivr, consolidate = stage != "g0", stage == "consolidate"
     return Steps(
         g0=whole["g0"].steps_for(frames),
-        round=whole["rivr"].distil.steps_for(frames) if rivr else 0,
+        round=whole["rivr"].distil.applied_to(whole["g0"], frames).length if rivr else 0,
         rounds=whole["rivr"].rounds if rivr else 0,
-        consolidate=whole["consolidate"].distil.steps_for(frames) if consolidate else 0,
+        consolidate=whole["consolidate"].distil.applied_to(whole["g0"], frames).length if consolidate else 0,
     )
 
 
@@ -65,7 +65,7 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
     leaves open are decided as they would be with every registered training frame active.
     """
     from cleargs.capture.tables import load_frames
-    from cleargs.splat.effort import budget_from_pixels
+    from cleargs.splat.budget import budget_from_pixels
     from cleargs.splat.initialise import sh_degree_from_views
 
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "train"]
@@ -130,14 +130,13 @@ def _settings(plain: Config, variant: Variant, work: Work) -> list[str]:
     """What equal work changes; schedules run by share of the steps."""
     own = steps_of(plain, work.frames)
     spent = split(own, variant.stage, work.steps)
-    lines = [f"g0.sh_degree={work.sh_degree}"]
+    lines = [f"g0.sh_degree={work.sh_degree}", f"g0.budget={work.budget}"]
     done = 0
     for name, steps, trainings in (
         ("g0", spent.g0, 1),
         ("rivr.distil", spent.round, spent.rounds),
         ("consolidate.distil", spent.consolidate, 1),
     ):
-        lines.append(f"{name}.budget={work.budget}")
         if not steps:  # the stage does not run
             continue
         lines.append(f"{name}.steps={steps}")

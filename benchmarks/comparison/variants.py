@@ -36,7 +36,6 @@ _WEIGHT_ONE = (
 
 _PLAIN_G0 = ("g0.formation.enabled=false",)
 """Raw frames are compared with the sharp render."""
-_PLAIN = (*_PLAIN_G0, "rivr.distil.formation.enabled=false", "consolidate.distil.formation.enabled=false")
 
 VARIANTS: tuple[Variant, ...] = (
     Variant("all-view", "all-view G0", "g0", ("rva.enabled=false", *_PLAIN_G0)),
@@ -49,7 +48,7 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("rva", "RVA G0", "g0", _PLAIN_G0),
     Variant("formation", "RVA G0 with formation", "g0"),
     Variant("all-view-formation", "all-view G0 with formation", "g0", ("rva.enabled=false",)),
-    Variant("no-formation", "ClearGS w/o formation", "consolidate", _PLAIN),
+    Variant("no-formation", "ClearGS w/o formation", "consolidate", _PLAIN_G0),
     Variant(
         "no-repairs",
         "ClearGS w/o repairs",

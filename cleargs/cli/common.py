@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args
 import click
 
 from cleargs.pipeline.session import usable_cores
-from cleargs.splat.effort import Quality, quality_settings
+from cleargs.splat.budget import Quality
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -59,7 +59,7 @@ def parse_size(
 
 
 def _quality(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...]:
-    return () if value is None else quality_settings(value)
+    return () if value is None else (f"g0.quality={value}",)
 
 
 quality_option = click.option(

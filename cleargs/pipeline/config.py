@@ -159,10 +159,10 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     for name in document:
         if name != "seed" and name not in models:
             raise _unknown(name, "", {"seed": None, **models}, models)
-    sections = {}
+    sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
-            sections[name] = model.model_validate(document.get(name, {}))
+            sections[name] = model.model_validate(document.get(name, {}), context=sections)
         except ValidationError as error:
             raise _setting_error(name, model, models, error) from error
     return Config(seed, sections)
@@ -177,6 +177,10 @@ def _setting_error(
     """The first complaint of pydantic as one line of cause and one of remedy."""
     first = error.errors(include_url=False)[0]
     parts = [str(part) for part in first["loc"]]
+    if first["type"] == "retired":
+        gone = first["ctx"]
+        name = ".".join([section, *parts, gone["name"]])
+        return ConfigError(f"{name} = {gone['value']!r} is no setting any more", hint=gone["hint"])
     owner, field = _locate(model, parts)
     if owner is None and not parts[-1].isdigit():
         parts.pop()  # which member of a union pydantic tried

@@ -15,6 +15,9 @@ from cleargs.manifest import KeyParts
 from cleargs.pipeline.stage import Device, Stage
 from cleargs.plugins import Socket, installed_version, plugin
 
+UPSTREAM = "of "
+"""How the name of a table begins that holds the settings of another stage."""
+
 
 def key_config(config: BaseModel) -> dict[str, Any]:
     """The settings that enter the key, as JSON values.
@@ -31,6 +34,12 @@ def key_config(config: BaseModel) -> dict[str, Any]:
         value = getattr(config, name)
         kept[name] = key_config(value) if isinstance(value, BaseModel) else plain[name]
     return kept
+
+
+def stage_key_config(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> dict[str, Any]:
+    """The settings that enter the key of the stage ``name``, those of other stages in tables of their own."""
+    inherited = {f"{UPSTREAM}{other}": key_config(sections[other]) for other in stage.SETTINGS}
+    return {**key_config(sections[name]), **inherited}
 
 
 def library_versions(stage: Stage, device: Device) -> dict[str, str]:
@@ -76,7 +85,8 @@ def differences(
     for name in sorted(old_settings.keys() | new_settings.keys()):
         before, after = old_settings.get(name, "(none)"), new_settings.get(name, "(none)")
         if before != after:
-            lines.append(f"setting {new.stage}.{name}: {_show(before)} -> {_show(after)}")
+            own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
+            lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
     for where, before, after in (
         ("input", _input_digests(old), _input_digests(new)),
         ("external", old.externals, new.externals),

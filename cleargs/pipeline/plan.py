@@ -14,7 +14,7 @@ from cleargs.errors import InputError, StoreError
 from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import differences, key_config, library_versions, plugin_versions
+from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store
@@ -99,7 +99,7 @@ class Planner:
         parts = KeyParts(
             stage=name,
             version=stage.VERSION,
-            config=key_config(config),
+            config=stage_key_config(stage, name, self.run.config.sections),
             inputs=inputs,
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
@@ -221,6 +221,7 @@ class Planner:
         """All that the stage ``name`` is told."""
         return StageContext(
             config=self.run.config.sections[name],
+            settings={other: self.run.config.sections[other] for other in self.dag.load(name).SETTINGS},
             source=self.run.source,
             inputs=inputs,
             externals=externals,
@@ -254,7 +255,9 @@ class Planner:
         digests = self.external_digests(name)
         return parts.model_copy(
             update={
-                "config": _known(key_config(self.run.config.sections[name]), parts.config),
+                "config": _known(
+                    stage_key_config(self.dag.load(name), name, self.run.config.sections), parts.config
+                ),
                 "seed": self.run.config.seed,
                 "inputs": _known(self.inputs(name, shown)[0], parts.inputs),
                 "externals": _known({role: tree_digest(digests[role]) for role in digests}, parts.externals),

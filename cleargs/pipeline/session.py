@@ -125,13 +125,12 @@ def _kept(dag: Dag, folder: Path) -> Document | None:
     """The settings of the run in ``folder``; None without one. Raises ConfigError when they are damaged."""
     try:
         kept = kept_settings(folder)
-        if kept is not None:
-            check_document(dag, kept)
+        # Checked, it has no names that are gone: they would contradict what is set now.
+        return None if kept is None else check_document(dag, kept).document()
     except ConfigError as error:
         raise ConfigError(
             f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
         ) from error
-    return kept
 
 
 def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:

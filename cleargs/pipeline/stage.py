@@ -42,6 +42,8 @@ class StageContext(Generic[C]):
     reporter: Reporter
     expected: Mapping[str, Estimate] = field(default_factory=dict)
     """When a cost is estimated: what the upstream stages expect that are not in ``inputs`` yet."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The sections of the stages that the stage names in ``SETTINGS``."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ class Stage(Protocol):
     VERSION: int
     """Raised whenever the stage's source changes its results."""
     CONFIG: type[BaseModel]
+    SETTINGS: tuple[str, ...]
+    """Upstream stages whose settings hold for this one too; they enter the key."""
     INPUTS: Mapping[str, tuple[str, ...]]
     """Upstream stage -> files and folders in it that this stage reads; their digests enter the key."""
     OUTPUTS: tuple[str, ...]

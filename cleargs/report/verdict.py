@@ -278,7 +278,7 @@ def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterat
             yield Caution(
                 f"The scene of {stage} was rejected",
                 f"It explains frames kept aside worse than before ({harm}), so the one before it stays.",
-                (f"{stage}.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
+                ("rivr.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
             )
     rounds = _figure(manifests, "rivr", "rounds") or []
     refused = sum(found["repairs_refused"] for found in rounds)

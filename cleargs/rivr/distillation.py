@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +27,7 @@ from cleargs.rivr.restoring import Deblurred, Explained, observation
 from cleargs.rivr.selection import hide_masked
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
-from cleargs.splat.config import DistilConfig, FormationConfig
+from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
@@ -139,17 +140,21 @@ class Snapshot:
     def trained(
         self,
         views: Sequence[View],
-        config: DistilConfig,
+        config: TrainConfig,
         folder: Path,
         *,
         seed: Sequence[int],
         label: str,
         round: int,
+        pseudo_share: float | Literal["even"],
+        pseudo_weight: float,
         repaired: float = 1.0,
         reporter: Reporter,
     ) -> Snapshot:
         """This scene after training on, with Adam's moments, on raw and repaired views, kept in ``folder``.
 
+        pseudo_share, pseudo_weight: share of the steps that draw a repair (even: each as often as any raw
+        frame), and the factor on its loss.
         repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
         go to the raw frames: drawn as often as all of them, a few repairs would drown these.
         A training that is done already is read back; one that was cut off resumes from its checkpoint, which
@@ -171,8 +176,8 @@ class Snapshot:
                 seed=seed,
                 formation=formation,
                 moments=read_moments(self.folder / STATE, self.scene.gaussians),
-                pseudo_share=_pseudo_share(config, views, repaired),
-                pseudo_weight=config.pseudo_weight,
+                pseudo_share=_pseudo_share(pseudo_share, views, repaired),
+                pseudo_weight=pseudo_weight,
                 checkpoint=folder / CHECKPOINT,
                 reporter=reporter,
                 label=label,
@@ -209,10 +214,8 @@ def superseded(training: Path) -> None:
     (training / STATE).unlink(missing_ok=True)
 
 
-def _pseudo_share(config: DistilConfig, views: Sequence[View], repaired: float) -> float:
-    if isinstance(config.pseudo_share, str):  # even
-        return sum(view.kind == "pseudo" for view in views) / len(views)
-    return config.pseudo_share * repaired
+def _pseudo_share(share: float | Literal["even"], views: Sequence[View], repaired: float) -> float:
+    return sum(view.kind == "pseudo" for view in views) / len(views) if share == "even" else share * repaired
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -11,10 +11,11 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.record import Settings
 from cleargs.rivr.candidates import Image
-from cleargs.rivr.config import GateConfig
 
 BLOCK = 64
 """Side of the blocks that are compared, px."""
@@ -30,6 +31,21 @@ _FLAT = 0.02  # a block of lower standard deviation has too little texture to be
 _AT_REST = 0.8  # see `_lengths`
 
 Array = NDArray[np.float64]
+
+
+class GateConfig(Settings):
+    """When a repair is refused because it disagrees with both the raw frame and the render.
+
+    docs/experiments/rivr.md has the measurements behind the thresholds.
+    """
+
+    max_share: float = Field(
+        0.1, ge=0.0, le=1.0, description="share of the blocks that may disagree; 1: no repair is refused"
+    )
+    max_shift: float = Field(0.6, ge=0.0, description="a block disagrees when it is further out of place, px")
+    max_colour: float = Field(
+        0.06, ge=0.0, description="or when its mean light differs by more in any channel, in sRGB"
+    )
 
 
 def rejection_reason(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:

@@ -21,8 +21,7 @@ from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, writ
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import CANDIDATES, Image, fuse
-from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import REFUSED, all_masked, rejection_reason
+from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.manifest_summary import chosen_counts
 from cleargs.rivr.restoring import Explained, Restoration, observation
 from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten

@@ -1,19 +1,18 @@
-"""Settings of everything that trains a scene: the first scene (G0) and the later distillations."""
+"""How a scene is trained."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from cleargs.record import Unit
-from cleargs.splat.effort import Quality, steps_from_frames
+from cleargs.record import Inherited, Settings
+from cleargs.splat.budget import Quality, steps_from_frames
 
 
-class FormationConfig(BaseModel):
+class FormationConfig(Settings):
     """What the camera did to each raw frame, found during the training and put into its loss."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = Field(
         True,
@@ -26,14 +25,6 @@ class FormationConfig(BaseModel):
     every: int = Field(
         10, ge=1, description="a frame's formation is estimated again after so many steps on it"
     )
-    accept: float = Field(
-        0.02, ge=0, le=1, description="share of a frame's misfit that a model must explain to be taken"
-    )
-    trust: float = Field(
-        1.0,
-        ge=0,
-        description="how fast an explained frame loses weight with what is left unexplained; 0: never",
-    )
     pose: bool = Field(False, description="correct the pose of a frame along with its motion")
     unexplained: float = Field(
         0.0,
@@ -43,8 +34,13 @@ class FormationConfig(BaseModel):
         "that stay unexplained count less: for captures with people or things that move; 0: never",
     )
 
+    accept: ClassVar[float] = 0.02
+    """Share of a frame's misfit that a model must explain to be taken (docs/experiments/formation.md)."""
+    trust: ClassVar[float] = 1.0
+    """Power of the share that an explained frame keeps of its weight: in proportion to its misfit."""
 
-class TrainConfig(BaseModel):
+
+class TrainConfig(Settings):
     """How a scene is optimised.
 
     The trainings of a run follow one schedule (image sizes, growth, SH degree, rates), each in its part from
@@ -57,7 +53,7 @@ class TrainConfig(BaseModel):
     docs/experiments/training.md has what that is worth.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    RETIRED: ClassVar[Mapping[str, Any]] = {"strategy": "mcmc", "adaptive": Inherited("g0", strictly=False)}
 
     quality: Quality = Field(
         "standard",
@@ -87,7 +83,6 @@ class TrainConfig(BaseModel):
         le=1,
         description="share of the schedule, its first, with reduced images; 0 = off",
     )
-    coarse_factor: float = Field(0.5, gt=0, le=1, description="factor on width and height of reduced images")
 
     densify: bool = Field(True, description="let the strategy change the number and places of the Gaussians")
     budget: int | None = Field(
@@ -102,9 +97,6 @@ class TrainConfig(BaseModel):
         le=20_000_000,
         description="most Gaussians where budget is unset, before the quality's factor",
     )
-    growth: float = Field(
-        0.05, ge=0, le=1, description="most new Gaussians per refinement, as a share of those there"
-    )
     refine_every: float = Field(
         1 / 64, gt=0, le=1, description="share of the schedule between refinements; one step at least"
     )
@@ -114,7 +106,6 @@ class TrainConfig(BaseModel):
     refine_stop: float = Field(
         0.8, ge=0, le=1, description="share of the schedule after which nothing is refined"
     )
-    min_opacity: float = Field(0.005, gt=0, lt=1, description="opacity at or below which a Gaussian is dead")
     noise: float = Field(
         6.5e4, ge=0, description="noise on the means, as a multiple of their rate (gsplat: 5e5 on 1.6e-4)"
     )
@@ -124,9 +115,6 @@ class TrainConfig(BaseModel):
     scale_reg: float = Field(0.01, ge=0, description="factor on the mean scale in the loss")
 
     lr_means: float = Field(4e-4, ge=0, description="rate of the means at the first step (3DGS: 1.6e-4)")
-    lr_means_final: float = Field(
-        0.01, gt=0, le=1, description="share of lr_means left at the last step, exponential decay"
-    )
     rate_factor: float | None = Field(
         None,
         gt=0,
@@ -141,7 +129,6 @@ class TrainConfig(BaseModel):
     lr_rotations: float = Field(1e-3, ge=0, description="rate of the quaternions")
     lr_opacities: float = Field(0.1, ge=0, description="rate of the opacity logits (3DGS: 0.05)")
     lr_sh: float = Field(2.5e-3, ge=0, description="rate of the SH constant term; the others get a fifth")
-    lr_exposure: float = Field(1e-3, ge=0, description="rate of the exposure affines, where they are on")
     sh_every: float = Field(
         5 / 32,
         ge=0,
@@ -165,12 +152,20 @@ class TrainConfig(BaseModel):
         json_schema_extra={"key": False},
     )
 
-    share_of_steps: ClassVar[float] = 1.0
-    """Share of a first scene's steps that it takes where ``steps`` is unset."""
+    coarse_factor: ClassVar[float] = 0.5
+    """Factor on width and height of reduced images."""
+    growth: ClassVar[float] = 0.05
+    """Most new Gaussians per refinement, as a share of those there (3DGS-MCMC)."""
+    min_opacity: ClassVar[float] = 0.005
+    """Opacity at or below which a Gaussian is dead (3DGS)."""
+    lr_means_final: ClassVar[float] = 0.01
+    """Share of ``lr_means`` left at the last step, exponential decay (3DGS)."""
+    lr_exposure: ClassVar[float] = 1e-3
+    """Rate of the exposure affines, where they are on (the last one of 3DGS)."""
 
     def steps_for(self, frames: int) -> int:
         """Steps of a training of so many active frames."""
-        return self.steps or max(1, round(self.share_of_steps * steps_from_frames(frames, self.quality)))
+        return self.steps or steps_from_frames(frames, self.quality)
 
     @property
     def length(self) -> int:
@@ -199,63 +194,3 @@ class TrainConfig(BaseModel):
         if self.begin >= self.end:
             raise ValueError(f"the schedule cannot end at {self.end} where it begins at {self.begin}")
         return self
-
-
-G0_END, ROUNDS_END = 16 / 19, 18 / 19
-"""Where in the schedule of the whole method the first scene is done, and where RIVR's rounds are."""
-
-
-class G0Config(TrainConfig):
-    """The first scene, from the sparse points and the frames that RVA keeps."""
-
-    end: float = Field(
-        G0_END,
-        gt=0,
-        le=1,
-        description="share of the schedule that lies behind when this training ends; RIVR and the "
-        "consolidation go on from there. 1: for a scene that nothing follows",
-    )
-    sh_degree: int | None = Field(
-        None, ge=0, le=3, description="largest SH degree; unset = from the number of active frames"
-    )
-    exposure: Literal["auto", "on", "off"] = Field(
-        "auto",
-        description="one colour affine a frame; auto = on where the frames' gains on the points differ",
-    )
-    exposure_threshold: float = Field(
-        0.05, ge=0, description="auto: spread of the frames' gains from which it is on (0.05 = 5 %)"
-    )
-    antialias: bool = Field(False, description="compensate the opacity of sub-pixel splats (Mip-Splatting)")
-    background: tuple[Unit, Unit, Unit] = Field((0.0, 0.0, 0.0), description="sRGB behind the scene")
-    min_points: int = Field(
-        10_000,
-        ge=1,
-        le=5_000_000,
-        description="fewest Gaussians to start from, within the budget; points are added to reach it",
-    )
-    init_scale: float = Field(
-        0.5, gt=0, description="starting scale as a share of the distance to the neighbours"
-    )
-    init_opacity: float = Field(0.5, gt=0, lt=1, description="starting opacity")
-
-
-class DistilConfig(TrainConfig):
-    """Training on from where a scene has got to, with repaired views beside the real ones."""
-
-    share_of_steps: ClassVar[float] = (1.0 - ROUNDS_END) / G0_END
-
-    steps: int | None = Field(
-        None,
-        ge=1,
-        le=1_000_000,
-        description="optimisation steps, one view each; unset = a sixteenth of a first scene's",
-    )
-    densify: bool = Field(False, description="let the strategy change the number and places of the Gaussians")
-    opacity_reg: float = Field(0.0, ge=0, description="factor on the mean opacity in the loss")
-    scale_reg: float = Field(0.0, ge=0, description="factor on the mean scale in the loss")
-    pseudo_share: Annotated[float, Field(ge=0, le=1)] | Literal["even"] = Field(
-        0.7,
-        description="share of the steps that draw a repaired view; even: the repaired views' share of all "
-        "views, so that each is drawn as often as any raw one",
-    )
-    pseudo_weight: float = Field(1.0, ge=0, description="factor on the loss of a repaired view")

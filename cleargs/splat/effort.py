@@ -1,54 +1,25 @@
-"""How much is spent on a training where the settings leave it open: steps and Gaussians, from the capture.
-
-Neither is one number for all captures. Steps follow the frames, since each is to be seen often enough;
-Gaussians follow the pixels, since they have that much to say. ``quality`` scales both. docs/speed.md has
-what each step up costs and brings.
-"""
+"""What a training is expected to take, from its settings and its views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.splat.budget import budget_from_pixels
+from cleargs.splat.config import TrainConfig
+
 if TYPE_CHECKING:
-    from cleargs.splat.config import TrainConfig
     from cleargs.splat.views import View
-
-Quality = Literal["draft", "standard", "high"]
-
-STEPS_A_FRAME = 50
-MIN_STEPS, MAX_STEPS = 3200, 7200
-STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
-
-PIXELS_A_GAUSSIAN = 160
-MIN_BUDGET = 40_000
-BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
 # Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
 # And a megapixel of a frame that is asked what its camera did: the first time, and again.
 SEARCH_S, SEARCH_AGAIN_S = 4.0, 1.0
 
-Settings = TypeVar("Settings", bound="TrainConfig")
-
-
-def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
-    """Steps of the first scene of a capture with so many active frames."""
-    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
-
-
-def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
-    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all.
-
-    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
-    40,000 at least, since fewer cost a small capture a dB, and ``max_budget`` at most: all times the
-    quality's factor.
-    """
-    standard = min(max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET), max_budget)
-    return max(1, int(BUDGET_FACTOR[quality] * standard))
+Settings = TypeVar("Settings", bound=TrainConfig)
 
 
 def gaussians_by_step(config: TrainConfig, start: int) -> NDArray[np.float64]:
@@ -90,11 +61,6 @@ def training_cost(
     whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})
     seconds = seconds_by_step(whole, frames, megapixels, budget if start is None else min(start, budget))
     return float(seconds.sum()), 1.5e-6 * budget
-
-
-def quality_settings(quality: str) -> tuple[str, ...]:
-    """The settings that give all trainings of a run that quality."""
-    return tuple(f"{name}.quality={quality}" for name in ("g0", "rivr.distil", "consolidate.distil"))
 
 
 def decided(config: Settings, views: Sequence[View]) -> Settings:

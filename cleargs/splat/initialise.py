@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cleargs.random_streams import Stream
-from cleargs.splat.config import G0Config
+from cleargs.splat.budget import INIT_OPACITY, INIT_SCALE
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.views import View
@@ -54,25 +54,29 @@ class SparsePoints:
 def starting_gaussians(
     sparse: SparsePoints,
     views: Sequence[View],
-    config: G0Config,
     *,
+    at_least: int,
+    at_most: int | None,
+    sh_degree: int | None,
     seed: int,
     say: Callable[[str], None] = lambda remark: None,
 ) -> Gaussians:
-    """One Gaussian a sparse point, and more behind random pixels of the views until there are
-    ``config.min_points``; never more than ``config.budget``. ``say`` is told of points added or left out."""
-    most = config.budget or max(config.min_points, len(sparse.xyz))
+    """Return one Gaussian per sparse point, and more behind random pixels of the views until there are
+    ``at_least``; never more than ``at_most``. ``say`` receives a line on points added or left out.
+
+    Where ``sh_degree`` is None it follows the number of views.
+    """
+    most = at_most or max(at_least, len(sparse.xyz))
     if len(sparse.xyz) > most:
         say(f"{most} of {len(sparse.xyz)} sparse points, which g0.budget allows")
         sparse = fewer_points(sparse, most, seed=seed)
-    missing = min(config.min_points, most) - len(sparse.xyz)
+    missing = min(at_least, most) - len(sparse.xyz)
     if missing > 0:
         say(f"{len(sparse.xyz)} sparse points, {missing} are added between them")
         sparse = add_points(sparse, views, missing, seed=seed)
-    sh_degree = sh_degree_from_views(len(views)) if config.sh_degree is None else config.sh_degree
-    return from_points(
-        sparse, sh_degree=sh_degree, init_scale=config.init_scale, init_opacity=config.init_opacity
-    )
+    if sh_degree is None:
+        sh_degree = sh_degree_from_views(len(views))
+    return from_points(sparse, sh_degree=sh_degree, init_scale=INIT_SCALE, init_opacity=INIT_OPACITY)
 
 
 def sh_degree_from_views(count: int) -> int:

@@ -37,21 +37,16 @@ def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) 
         work = Work(steps=total, frames=20, budget=12_345, sh_degree=2)
         config = variant_config(installed(), variant, recipe, (), 0, work)
         assert steps_of(config, 20, variant.stage).total == total
-        trainings = [
-            config.sections["g0"],
-            config.sections["rivr"].distil,
-            config.sections["consolidate"].distil,
-        ]
-        assert {training.budget for training in trainings} == {12_345}
-        assert config.sections["g0"].sh_degree == 2
-        made = trainings[: ("g0", "rivr", "consolidate").index(variant.stage) + 1]
+        g0, rivr = config.sections["g0"], config.sections["rivr"]
+        later = [stage.distil.applied_to(g0, 20) for stage in (rivr, config.sections["consolidate"])]
+        assert (g0.budget, g0.sh_degree) == (12_345, 2)
+        made = [g0, *later][: ("g0", "rivr", "consolidate").index(variant.stage) + 1]
         assert [made[0].begin, *(later.begin for later in made[1:]), 1.0] == [
             0.0,
             *(training.end for training in made),
         ]
         if variant.stage != "g0":
-            rivr = config.sections["rivr"]
-            made[1] = rivr.distillation(rivr.rounds, 0, rivr.distil.steps, 20)
+            made[1] = rivr.distillation(g0, rivr.rounds, 0, rivr.distil.steps, 20)
         assert {training.planned for training in made} == {total}
 
 
@@ -61,7 +56,7 @@ def test_the_recipe_s_own_total_changes_nothing_but_budget_and_degree() -> None:
     work = Work(steps_of(plain, 20).total, 20, budget=40_000, sh_degree=1)
     same = (
         "g0.sh_degree=1",
-        *(f"{name}.budget=40000" for name in ("g0", "rivr.distil", "consolidate.distil")),
+        "g0.budget=40000",
         *("g0.steps=3200", "rivr.distil.steps=200", "consolidate.distil.steps=200"),  # the least there are
     )
     assert variant_config(installed(), full, "default", (), 0, work) == load_config(

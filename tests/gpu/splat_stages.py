@@ -27,9 +27,9 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
-from cleargs.splat.config import G0Config
 from cleargs.splat.ply import read_ply
 from cleargs.splat.views import view_of
+from cleargs.stages.g0 import G0Config
 
 
 class Lines(SilentReporter):

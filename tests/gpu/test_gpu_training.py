@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -98,12 +99,15 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     assert np.abs(offsets[10:].mean(dim=0).numpy()).max() < 0.05 * math.sqrt(np.abs(expected).max())
 
 
-CONFIG = TrainConfig(
+class FastGrowth(TrainConfig):
+    growth: ClassVar[float] = 0.3
+
+
+CONFIG = FastGrowth(
     steps=5,
     refine_every=2 / 5,
     refine_start=0.1,
     budget=14,
-    growth=0.3,
     checkpoint_interval=3,
     sh_every=2 / 5,
     coarse_share=0.4,

@@ -28,7 +28,7 @@ from cleargs.models.registry import (
     verify,
 )
 from cleargs.models.scorer import scorer_path
-from cleargs.rivr.config import RivrConfig
+from cleargs.stages.rivr import RivrConfig
 
 
 @pytest.fixture(scope="module")

@@ -67,6 +67,7 @@ class Count:
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     OUTPUTS: tuple[str, ...] = ("numbers", "log.txt")
     LEFTOVERS: tuple[str, ...] = ("numbers/*.txt",)
+    SETTINGS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ("pydantic",)
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
@@ -111,6 +112,7 @@ class Square:
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"count": ("numbers", "masks")})
     OUTPUTS: tuple[str, ...] = ("powers",)
     LEFTOVERS: tuple[str, ...] = ("powers/[0-9]*.txt",)
+    SETTINGS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:
@@ -165,6 +167,7 @@ class Total:
     )
     OUTPUTS: tuple[str, ...] = ("total.txt",)
     LEFTOVERS: tuple[str, ...] = ()
+    SETTINGS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:

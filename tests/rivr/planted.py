@@ -14,8 +14,7 @@ import numpy as np
 
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.rivr.candidates import Image, gaussian_blur
-from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import rejection_reason
+from cleargs.rivr.gates import GateConfig, rejection_reason
 
 Fault: TypeAlias = Callable[[Image, np.random.Generator], Image]
 

@@ -17,8 +17,7 @@ from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import Image
-from cleargs.rivr.config import GateConfig
-from cleargs.rivr.gates import all_masked, colour_differences, rejection_reason, shifts
+from cleargs.rivr.gates import GateConfig, all_masked, colour_differences, rejection_reason, shifts
 from cleargs.rivr.rounds import recorded_row
 from cleargs.rivr.tables import read_selection
 from cleargs.stages import rivr

@@ -17,7 +17,7 @@ from test_stages import (
     expert,
     make_capture,
 )
-from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_rivr
+from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_g0, tiny_rivr
 
 from cleargs.media.exr import read_exr
 from cleargs.rivr.groups import trajectory_groups
@@ -112,11 +112,9 @@ def test_steps_of_groups_without_a_repair_go_to_the_next(capture: Capture) -> No
 
 def test_every_frame_is_a_target_and_nothing_is_judged(capture: Capture) -> None:
     """The paper's way: nothing held back, no veto even of a wrecked scene."""
-    changes: dict[str, Any] = {
-        "harm": {"held_back": 0.0, "psnr_margin": 0.0, "score_margin": 0.0},
-        "distil": {"steps": 12, "lr_scales": 3.0},
-    }
-    context = capture.context("rivr", tiny_rivr(rounds=1, group=4, **changes))
+    wrecking = tiny_g0(lr_scales=3.0)
+    config = tiny_rivr(rounds=1, group=4, harm={"held_back": 0.0, "psnr_margin": 0.0, "score_margin": 0.0})
+    context = capture.context("rivr", config, g0=wrecking)
     result = rivr.run(context)
     rows = read_selection(context.out / "selection.parquet")
     assert [row.frame_id for row in rows] == list(range(len(ROLES)))
@@ -124,7 +122,7 @@ def test_every_frame_is_a_target_and_nothing_is_judged(capture: Capture) -> None
     assert result.summary["held_back"]["psnr_after"] is None
     assert result.summary["published"] == "distilled scene"
     assert not (context.out / "rejected.ply").exists()
-    after = capture.context("consolidate", tiny_consolidate(**changes))
+    after = capture.context("consolidate", tiny_consolidate(), g0=wrecking, rivr=config)
     assert consolidate.run(after).summary["published"] == "consolidated scene"
     assert pq.read_table(after.out / "repairs.parquet").num_rows == len(ROLES)
 

@@ -22,11 +22,11 @@ from tiny_capture import (
     Sharpen,
     orbit,
     tiny_consolidate,
+    tiny_g0,
     tiny_rivr,
     write_capture,
 )
 
-from cleargs.errors import InputError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
@@ -200,8 +200,10 @@ class Faithful:
 def keeping(**changes: Any) -> Any:
     """The default: motion undone, no fusion, raw frames kept. The stand-in scorers have no calibrated scale,
     so that the margin leaves the choice to them only where they differ grossly."""
-    plain = {"steps": 12, "checkpoint_interval": 5, "formation": {"enabled": False}}
-    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, distil=plain, **changes)
+    return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
+
+
+PLAIN = tiny_g0(formation={"enabled": False})
 
 
 def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
@@ -236,7 +238,7 @@ def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest
     """Sharp frames are kept and supervise as raw frames alone; blurred ones get repairs."""
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Faithful())
     capture.use_good_scene()
-    context = capture.context("rivr", keeping())
+    context = capture.context("rivr", keeping(), g0=PLAIN)
     result = rivr.run(context)
     rows = read_selection(context.out / "selection.parquet")
     kept = {(row.round, row.frame_id) for row in rows if row.chosen == "observed"}
@@ -324,15 +326,14 @@ def test_masked_pixels_do_not_reach_the_scores(
 @pytest.mark.parametrize("stage", ["rivr", "consolidate"])
 def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
     """Rates that wreck the scene: it is not published, and lies beside the one that is."""
-    wrecking = {"steps": 12, "lr_scales": 3.0}
-    harm = {"psnr_margin": 0.5, "score_margin": 100}
-    first = capture.context(
-        "rivr", tiny_rivr(distil=wrecking, harm=harm) if stage == "rivr" else tiny_rivr(rounds=1)
-    )
-    result, context, better = rivr.run(first), first, capture.root / "g0"
-    if stage == "consolidate":
-        config = tiny_consolidate(distil=wrecking, harm=harm)
-        context, better = capture.context("consolidate", config), first.out
+    wrecking, strict = tiny_g0(lr_scales=3.0), tiny_rivr(harm={"psnr_margin": 0.5, "score_margin": 100})
+    if stage == "rivr":
+        context, better = capture.context("rivr", strict, g0=wrecking), capture.root / "g0"
+        result = rivr.run(context)
+    else:
+        first = capture.context("rivr", tiny_rivr(rounds=1))
+        rivr.run(first)
+        context, better = capture.context(stage, tiny_consolidate(), g0=wrecking, rivr=strict), first.out
         result = consolidate.run(context)
     assert same_scene(context.out, better)
     assert (context.out / "rejected.ply").read_bytes() != (context.out / "scene.ply").read_bytes()
@@ -363,20 +364,12 @@ def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> Non
     assert result.summary["repairs"] == len(TARGETS) - 1
 
 
-def test_frames_that_judge_must_not_have_been_repaired(capture: Capture) -> None:
-    harm = {"held_back": 0.0, "psnr_margin": 100, "score_margin": 100}
-    rivr.run(capture.context("rivr", tiny_rivr(rounds=1, harm=harm)))
-    with pytest.raises(InputError, match="held_back keeps from repair"):
-        consolidate.run(capture.context("consolidate", tiny_consolidate()))
-
-
 def test_a_draft_repairs_only_what_is_not_sharp(capture: Capture) -> None:
-    distil = {"steps": 12, "checkpoint_interval": 5, "quality": "draft"}
-    context = capture.context("rivr", tiny_rivr(rounds=1, distil=distil))
+    context = capture.context("rivr", tiny_rivr(rounds=1), g0=tiny_g0(quality="draft"))
     rivr.run(context)
     rows = read_selection(context.out / "selection.parquet")
     assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
-    assert tiny_rivr(distil=distil, targets="all").which_targets == "all"
+    assert tiny_rivr(targets="all").which_targets("draft") == "all"
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:

@@ -21,7 +21,6 @@ from cleargs.media.image import write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
-from cleargs.rivr.config import ConsolidateConfig, RivrConfig
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
@@ -31,6 +30,9 @@ from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import save_state
 from cleargs.splat.types import Moments
+from cleargs.stages.consolidate import ConsolidateConfig
+from cleargs.stages.g0 import G0Config
+from cleargs.stages.rivr import RivrConfig
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 ROLES = ("strong", "suppressed", "geometric", "strong", "auxiliary", "strong", "reactivated", "suppressed")
@@ -90,8 +92,10 @@ class Capture:
         nearly.sh += 0.05
         write_ply(self.root / "g0" / "scene.ply", Scene(nearly))
 
-    def context(self, stage: str, config: Any, *, threads: int = 1, run: str = "run") -> StageContext[Any]:
-        """A context whose outputs go to ``root/run/stage``."""
+    def context(
+        self, stage: str, config: Any, *, threads: int = 1, run: str = "run", **settings: Any
+    ) -> StageContext[Any]:
+        """A context whose outputs go to ``root/run/stage``; ``settings``: of the stages before."""
         out, checkpoints = self.root / run / stage, self.root / run / "work" / stage
         out.mkdir(parents=True, exist_ok=True)
         checkpoints.mkdir(parents=True, exist_ok=True)
@@ -111,7 +115,13 @@ class Capture:
             device="cpu",
             threads=threads,
             reporter=SilentReporter(),
+            settings={"g0": tiny_g0(), "rivr": tiny_rivr(), **settings},
         )
+
+
+def tiny_g0(**changes: Any) -> G0Config:
+    """Checkpoints every five steps."""
+    return G0Config(**({"checkpoint_interval": 5} | changes))
 
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
@@ -122,19 +132,15 @@ def tiny_rivr(**changes: Any) -> RivrConfig:
         "undo_motion": False,
         "use_fused": True,
         "keep_raw": False,
-        "distil": {"steps": 12, "checkpoint_interval": 5},
+        "distil": {"steps": 12},
         "harm": {"psnr_margin": 100, "score_margin": 100},
     }
     return RivrConfig(**(settings | changes))
 
 
 def tiny_consolidate(**changes: Any) -> ConsolidateConfig:
-    """A few steps, with harm margins that nothing exceeds."""
-    settings: dict[str, Any] = {
-        "distil": {"steps": 12, "checkpoint_interval": 5},
-        "harm": {"psnr_margin": 100, "score_margin": 100},
-    }
-    return ConsolidateConfig(**(settings | changes))
+    """A few steps."""
+    return ConsolidateConfig(**({"distil": {"steps": 12}} | changes))
 
 
 def write_capture(root: Path) -> None:

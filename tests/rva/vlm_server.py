@@ -198,6 +198,7 @@ class PreparedIngest:
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     OUTPUTS: tuple[str, ...] = ("frames.parquet", "observations.parquet", "images")
     LEFTOVERS: tuple[str, ...] = ()
+    SETTINGS: tuple[str, ...] = ()
     LIBRARIES: tuple[str, ...] = ()
 
     def externals(self, config: Any, source: Path) -> Mapping[str, Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from helpers.splat_toy import gaussians, images, start, views
@@ -10,17 +10,12 @@ from helpers.splat_toy import gaussians, images, start, views
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config, override
 from cleargs.pipeline.dag import installed
-from cleargs.splat.config import DistilConfig, G0Config, TrainConfig
-from cleargs.splat.effort import (
-    Quality,
-    budget_from_pixels,
-    decided,
-    gaussians_by_step,
-    quality_settings,
-    steps_from_frames,
-    training_cost,
-)
+from cleargs.splat.budget import Quality, budget_from_pixels, steps_from_frames
+from cleargs.splat.config import TrainConfig
+from cleargs.splat.effort import decided, gaussians_by_step, training_cost
 from cleargs.splat.trainer import Trainer
+from cleargs.stages.config import DistilConfig
+from cleargs.stages.g0 import G0Config
 
 
 def test_steps_follow_the_frames_within_bounds() -> None:
@@ -47,7 +42,7 @@ def test_what_is_given_stays() -> None:
     assert open_.length == steps_from_frames(3) and open_.budget == budget_from_pixels(0, 10**6)
     given = decided(G0Config(steps=7, budget=9, quality="high"), seen)
     assert (given.length, given.budget) == (7, 9)
-    assert decided(DistilConfig(), seen).length * 16 == steps_from_frames(3)
+    assert DistilConfig().applied_to(G0Config(), 3).length * 16 == steps_from_frames(3)
 
 
 def test_a_training_decides_for_itself() -> None:
@@ -58,14 +53,17 @@ def test_a_training_decides_for_itself() -> None:
 
 
 def test_quality_reaches_every_training() -> None:
-    config = override(installed(), load_config(installed(), "default"), quality_settings("high"))
-    found = (config.sections["g0"], config.sections["rivr"].distil, config.sections["consolidate"].distil)
-    assert {training.quality for training in found} == {"high"}
+    config = override(installed(), load_config(installed(), "default"), ["g0.quality=high"])
+    g0: Any = config.sections["g0"]
+    later: list[Any] = [config.sections["rivr"], config.sections["consolidate"]]
+    assert [stage.distil.applied_to(g0, 3).length * 16 for stage in later] == [
+        steps_from_frames(3, "high")
+    ] * 2
     assert invoke(["run", "nowhere.mp4", "-o", "nowhere", "--quality", "best"]) == 2
 
 
 def test_the_growth_of_a_training_is_foreseen() -> None:
-    config = TrainConfig(steps=120, budget=90, growth=0.1)
+    config = TrainConfig(steps=120, budget=90)
     trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
     while trainer.done < trainer.length:
         trainer.step()
@@ -75,7 +73,7 @@ def test_the_growth_of_a_training_is_foreseen() -> None:
 
 
 def test_later_steps_are_known_to_take_longer() -> None:
-    config = TrainConfig(steps=1000, budget=300_000, growth=0.1)
+    config = TrainConfig(steps=1000, budget=300_000)
     trainer = Trainer(start(60), views(images(gaussians(), 3)), config, seed=(1,))
     shares = trainer.shares_of_work()
     assert shares[0] == 0.0 and len(shares) == 1001 and shares[-1] == pytest.approx(1.0)

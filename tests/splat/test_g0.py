@@ -24,12 +24,12 @@ from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter, SilentTask, Task
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
-from cleargs.splat.config import G0Config
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.ply import read_ply
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.stages import g0
+from cleargs.stages.g0 import G0Config
 
 ACTIVE = {0: 0.9, 1: 0.97, 2: 1.0, 5: 0.12}
 SUPPRESSED, HELD_OUT, UNREGISTERED = 3, 4, 6

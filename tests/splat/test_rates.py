@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cleargs.rivr.config import ConsolidationDistilConfig, RivrConfig, RoundsDistilConfig
-from cleargs.splat.config import G0Config, TrainConfig
+from cleargs.splat.config import TrainConfig
 from cleargs.splat.schedule import INRIA_STEPS, Schedule, rate_factor
+from cleargs.stages.consolidate import FinalDistilConfig
+from cleargs.stages.g0 import G0Config
+from cleargs.stages.rivr import RivrConfig, RoundsConfig
 
 GROUPS = ("means", "log_scales", "rotations", "sh", "logit_opacities")
 
@@ -43,12 +45,12 @@ def test_rates_fall_to_the_share_that_is_asked_for() -> None:
 def test_a_distillation_goes_on_where_the_first_scene_ends() -> None:
     """One schedule for the whole method: G0, two rounds and the consolidation are its parts."""
     whole = TrainConfig(steps=950)
-    rivr = RivrConfig(distil=RoundsDistilConfig(steps=50))
+    g0, rivr = G0Config(steps=800), RivrConfig(distil=RoundsConfig(steps=50))
     parts = (
-        G0Config(steps=800),
-        rivr.distillation(1, 0, 50, frames=16),
-        rivr.distillation(2, 0, 50, frames=16),
-        ConsolidationDistilConfig(steps=50),
+        g0,
+        rivr.distillation(g0, 1, 0, 50, frames=16),
+        rivr.distillation(g0, 2, 0, 50, frames=16),
+        FinalDistilConfig(steps=50).applied_to(g0, 16),
     )
     assert [part.planned for part in parts] == [950] * 4
     assert [part.first for part in parts] == [0, 800, 850, 900]
