@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -92,17 +93,17 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.harm import judge_harm
-    from cleargs.rivr.manifest_summary import consolidation_summary
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
-    from cleargs.rivr.supervision import load_supervision
     from cleargs.rivr.tables import (
+        chosen_counts,
         kept_raw,
         latest_accepted,
         read_selection,
         repaired_share,
         write_repairs,
     )
+    from cleargs.rivr.targets import load_supervision
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
@@ -156,5 +157,15 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         {row.frame_id: row for row in repairs},
         rivr,
     )
-    figures = consolidation_summary(repairs, len(kept), scorer.name, verdict)
-    return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})
+    better = "consolidated scene" if verdict.harm is None else "RIVR's scene"
+    return StageResult(
+        summary={
+            "repairs": len(repairs),
+            "chosen": chosen_counts(repairs) | {"observed": len(kept)},
+            "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
+            "scorer": scorer.name,
+            "held_back": verdict.summary(),
+            "published": better if repairs or kept else "G0",
+            "psnr_unseen": final.psnr_unseen(supervision.real),
+        }
+    )

@@ -24,10 +24,9 @@ from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot
-    from cleargs.rivr.restoring import Restorations
-    from cleargs.rivr.rounds import Rules
-    from cleargs.rivr.supervision import Supervision
+    from cleargs.rivr.rounds import Restorations, Rules
     from cleargs.rivr.tables import Selection
+    from cleargs.rivr.targets import Supervision
     from cleargs.splat.views import View
 
 
@@ -204,12 +203,10 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.harm import judge_harm
-    from cleargs.rivr.manifest_summary import refused_repairs, summary
-    from cleargs.rivr.restoring import Restorations
-    from cleargs.rivr.rounds import Rules, forget_others
+    from cleargs.rivr.rounds import Restorations, Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
-    from cleargs.rivr.supervision import load_supervision
-    from cleargs.rivr.tables import write_selection
+    from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
+    from cleargs.rivr.targets import load_supervision
     from cleargs.splat.kernels.runtime import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
@@ -263,8 +260,15 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     last = {row.frame_id: row for row in rows}
     shown = [last[view.frame_id] for view in worst]
     write_candidates_sheet(context.out / "candidates.png", shown, context.out)
-    figures = summary(rows, expert.name, verdict)
-    return StageResult(summary={**figures, "psnr_unseen": final.psnr_unseen(supervision.real)})
+    return StageResult(
+        summary={
+            "expert": expert.name,
+            "rounds": [round_figures(number, rows) for number in sorted({row.round for row in rows})],
+            "held_back": verdict.summary(),
+            "published": "distilled scene" if verdict.harm is None else "G0",
+            "psnr_unseen": final.psnr_unseen(supervision.real),
+        }
+    )
 
 
 def _repair_and_distil(
@@ -278,9 +282,9 @@ def _repair_and_distil(
     """Every round along the trajectory, group by group: what each frame got, the folders of the trainings,
     and the last scene."""
     from cleargs.rivr.distillation import superseded
-    from cleargs.rivr.groups import trajectory_groups
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share
+    from cleargs.rivr.targets import trajectory_groups
 
     config, reporter, g0_config = context.config, context.reporter, context.settings["g0"]
     frames = len(supervision.real)

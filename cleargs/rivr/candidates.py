@@ -1,10 +1,14 @@
-"""The three candidates of a target frame (the paper's Table "RIVR candidates").
+"""The three candidates of a target frame (the paper's Table "RIVR candidates"), and the choice between them.
 
-Images are [H, W, 3] float32 sRGB in [0, 1].
+The paper's rule needs no reference: the primary scorer decides (MUSIQ in the paper); when the best two of
+its scores are within a margin, the tie-break scorer (CLIP-IQA in the paper) decides among the candidates
+within it. Images are [H, W, 3] float32 sRGB in [0, 1].
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -20,6 +24,13 @@ Source: TypeAlias = Literal["observation", "deblurred", "render"]
 
 CANDIDATES: tuple[CandidateName, ...] = ("render", "restored", "fused")
 """R_t, D_t and F_t; in a perfect tie the earlier one is chosen."""
+
+NEGLIGIBLE = 0.15
+"""Change by the repair, as a share of what the render leaves unexplained, below which there is nothing to
+repair. docs/experiments/rivr.md has the measurement."""
+
+KEPT = "needs no repair"
+"""The reason of a row whose raw frame is kept."""
 
 
 def fuse(render: Image, restored: Image, sigma: float) -> Image:
@@ -49,3 +60,61 @@ def gaussian_blur(image: Image, sigma: float) -> NDArray[np.float64]:
         for k, weight in enumerate(kernel):
             result += weight * padded.take(np.arange(k, k + length), axis=axis)
     return result
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen candidate and why."""
+
+    chosen: CandidateName
+    reason: str
+
+
+def choose(
+    primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
+) -> Choice:
+    """The candidate with the highest primary score, or the tie-break's favourite within ``margin`` of it.
+
+    primary, tiebreak: score of each candidate, higher is better, on a scale of 0-100; both have the same
+    candidates. Equal tie-break scores: the higher primary score wins, then the order of `CANDIDATES`.
+    Raises ValueError when a score is not finite.
+    """
+    if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
+        raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
+    names = [name for name in CANDIDATES if name in primary]
+    best = max(primary.values())
+    close = [name for name in names if best - primary[name] <= margin]
+    if len(close) == 1:
+        return Choice(close[0], "primary score")
+    chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
+    return Choice(chosen, "tie-break among " + ", ".join(close))
+
+
+def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:
+    """Whether no candidate's score is above that of the raw frame by more than ``margin``."""
+    return max(candidates.values()) - raw <= margin
+
+
+def hardly_changes(observed: Image, restored: Image, render: Image) -> bool:
+    """Whether the repair hardly changes the raw frame: |D - O|^2 < 0.15 |R - O|^2.
+
+    A frame that is blurred or skewed differs from a good scene's render by just that, and its repair undoes
+    much of it. In a sharp frame what the render leaves unexplained is the scene's own error, and a repair
+    that follows it only carries it into the frame. Scores alone do not tell: sharpening raises them either
+    way.
+
+    observed, restored, render: O_t, D_t and R_t [H, W, 3], equal where the frame is masked.
+    """
+    changed, unexplained = (
+        float(np.square(image - observed, dtype=np.float64).sum()) for image in (restored, render)
+    )
+    return changed < NEGLIGIBLE * unexplained
+
+
+def hide_masked(image: Image, observed: Image, mask: np.ndarray | None) -> Image:
+    """``image`` with the observation in its masked pixels.
+
+    All candidates then agree there, so that what is masked cannot decide between them.
+    mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
+    """
+    return image if mask is None else np.where(mask[..., None], image, observed)

@@ -21,10 +21,9 @@ from cleargs.formation.undo import undo
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import Image
+from cleargs.rivr.candidates import Image, hide_masked
 from cleargs.rivr.harm import Fidelity
-from cleargs.rivr.restoring import Deblurred, Explained, observation
-from cleargs.rivr.selection import hide_masked
+from cleargs.rivr.rounds import Deblurred, Explained, observation
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig

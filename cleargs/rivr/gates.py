@@ -51,7 +51,7 @@ class GateConfig(Settings):
 def rejection_reason(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:
     """Why ``repair`` [H, W, 3] of a frame must not become supervision; None when it may.
 
-    Masked pixels must be the same in all three images (`selection.hide_masked`).
+    Masked pixels must be the same in all three images (`candidates.hide_masked`).
     """
     if limits.max_share >= 1.0:
         return None

@@ -1,4 +1,4 @@
-"""One round of RIVR: the candidates of every target frame, scored, one of them chosen, recorded in an EXR.
+"""One round of RIVR: every target frame restored, its candidates scored, one of them chosen, all in an EXR.
 
 The EXR is the record of a frame: it holds the candidates and, as attributes, its row of the selection table.
 It appears whole or not at all, so a round that was cut off resumes at the first frame without one.
@@ -16,16 +16,24 @@ import numpy as np
 
 from cleargs.errors import StoreError
 from cleargs.files import remove
-from cleargs.formation.frame import described
+from cleargs.formation.frame import FrameFormation, described
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import CANDIDATES, Image, fuse
+from cleargs.rivr.candidates import (
+    CANDIDATES,
+    KEPT,
+    Choice,
+    Image,
+    Source,
+    choose,
+    fuse,
+    hardly_changes,
+    hide_masked,
+    unbeaten,
+)
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
-from cleargs.rivr.manifest_summary import chosen_counts
-from cleargs.rivr.restoring import Explained, Restoration, observation
-from cleargs.rivr.selection import KEPT, Choice, choose, hardly_changes, hide_masked, unbeaten
-from cleargs.rivr.tables import SELECTION, Selection
+from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
 from cleargs.splat.views import Mask, View
 
 PREFIX = "cleargs:"
@@ -33,17 +41,88 @@ PREFIX = "cleargs:"
 
 _NULLABLE = tuple(field.name for field in SELECTION if field.nullable)
 
+TRUSTED = 0.5
+"""Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
+EXPLAINED = "explained: "
+"""How the reason of such a frame begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deblurred:
+    """A raw frame without what its camera did to it."""
+
+    image: Image
+    """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
+    formation: FrameFormation
+    """What was undone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A raw frame as the training explains it."""
+
+    image: Image
+    """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
+    formation: FrameFormation
+    weight: float
+    """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
+
+
+@dataclass(frozen=True, eq=False)
+class Restoration:
+    """D_t, and what it was made from."""
+
+    image: Image
+    source: Source
+    deblurred: Deblurred | None = None
+    """The raw frame without its motion, where that is the source."""
+
+
+class Restorations:
+    """D_t of target frames. That of a raw frame is made when it is first asked for and kept in ``cache``."""
+
+    def __init__(
+        self, restore: Callable[[Image], Image], cache: Path, *, use_observation: bool, undo_motion: bool
+    ) -> None:
+        self._restore = restore
+        self._cache = cache
+        self._use_observation = use_observation
+        self._undo_motion = undo_motion
+
+    def __call__(self, view: View, render: Image, deblur: Callable[[View], Deblurred | None]) -> Restoration:
+        """D_t in the light of the render R_t; ``deblur`` undoes what the scene says of the frame's camera."""
+        if not self._use_observation:
+            return Restoration(self._restore(render), "render")
+        deblurred = deblur(view) if self._undo_motion else None
+        if deblurred is None:
+            return Restoration(self._restored_observation(view, observation(view)[0]), "observation")
+        return Restoration(self._restore(deblurred.image), "deblurred", deblurred)
+
+    def _restored_observation(self, view: View, observed: Image) -> Image:
+        """As the cache gives it back, so that every round and every resumed run has the same bits."""
+        path = self._cache / f"{view.frame_id:06d}.exr"
+        try:
+            return from_layer(read_exr(path).layers["restored"])
+        except StoreError:  # not made yet, or not whole
+            self._cache.mkdir(exist_ok=True)
+            write_exr(path, LayeredImage({"restored": to_layer(self._restore(observed))}, {}))
+            return from_layer(read_exr(path).layers["restored"])
+
+
+def observation(view: View) -> tuple[Image, Mask | None]:
+    """O_t as float32 sRGB, and its mask."""
+    pixels, mask = view.load()
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.float32) / np.float32(255.0), mask
+    return pixels.astype(np.float32), mask
+
+
 Renderer = Callable[[View], Image]
 """The current scene at a view, through the frame's exposure: R_t."""
 Restorer = Callable[[View, Image], Restoration]
 """D_t, given the view and its render R_t."""
 Explainer = Callable[[View], Explained | None]
 """What the training found of a raw frame's camera."""
-
-TRUSTED = 0.5
-"""Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
-EXPLAINED = "explained: "
-"""How the reason of such a frame begins."""
 
 
 @dataclass(frozen=True)

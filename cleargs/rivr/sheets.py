@@ -10,7 +10,7 @@ from cleargs.media.image import write_rgb
 from cleargs.report.contact import Tile, contact_sheet
 from cleargs.rivr.candidates import CANDIDATES
 from cleargs.rivr.distillation import Snapshot
-from cleargs.rivr.restoring import observation
+from cleargs.rivr.rounds import observation
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import View
 

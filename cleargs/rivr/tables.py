@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from statistics import fmean
+from typing import Annotated, Any
 
 import pyarrow as pa
 
 from cleargs.parquet import read_table, schema_of, write_table
-from cleargs.rivr.candidates import Chosen, Source
+from cleargs.rivr.candidates import CANDIDATES, Chosen, Source
+from cleargs.rivr.gates import REFUSED
 
 _NAME = "name of the scorer that decides"
 _SCORE = "score, 0-100, higher is better, of"
@@ -57,6 +60,9 @@ class Repair:
     chosen: Annotated[Chosen, "layer that supervises: render, restored or fused"]
 
 
+CHOICES: tuple[Chosen, ...] = (*CANDIDATES, "observed")
+"""What a row may name as chosen."""
+
 SELECTION, REPAIRS = schema_of(Selection), schema_of(Repair)
 
 
@@ -96,3 +102,35 @@ def write_repairs(path: Path, repairs: list[Selection]) -> None:
     """Write ``consolidate/repairs.parquet``."""
     columns = [{name: getattr(row, name) for name in REPAIRS.names} for row in repairs]
     write_table(path, pa.Table.from_pylist(columns, REPAIRS), REPAIRS)
+
+
+def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
+    """What round ``number`` chose, for the manifest."""
+    rows = [row for row in rows if row.round == number]
+    refused = [row for row in rows if not row.accepted and row.chosen != "observed"]
+    means = {
+        f"{role}_{name}": fmean(scores)
+        for role in ("primary", "tiebreak")
+        for name in CHOICES
+        if (scores := [score for row in rows if (score := getattr(row, f"{role}_{name}")) is not None])
+    }
+    return {
+        "round": number,
+        "chosen": chosen_counts(rows),
+        "accepted": sum(row.accepted for row in rows),
+        "refused": dict(Counter(row.reason for row in refused)),
+        "repairs_refused": refused_repairs(rows),
+        "tie_breaks": sum(row.reason.startswith("tie-break") for row in rows),
+        "scorers": {"primary": rows[0].primary_metric, "tiebreak": rows[0].tiebreak_metric},
+        "mean_scores": means,
+    }
+
+
+def refused_repairs(rows: Sequence[Selection]) -> int:
+    """How many repairs the gate kept out of the choice."""
+    return sum(row.reason.startswith(REFUSED) for row in rows)
+
+
+def chosen_counts(rows: Sequence[Selection]) -> dict[Chosen, int]:
+    """How often each was chosen."""
+    return {name: sum(row.chosen == name for row in rows) for name in CHOICES}

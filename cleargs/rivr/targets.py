@@ -1,11 +1,21 @@
-"""Which frames RIVR repairs, and which it holds back to measure whether repairing does harm."""
+"""The frames of a capture as RIVR and the consolidation see them: those that are repaired, in groups along
+the trajectory, and those that are held back to measure whether repairing does harm."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal, TypeAlias
+
+import pyarrow as pa
+
+from cleargs.capture.tables import load_frames
+from cleargs.errors import StageError
+from cleargs.parquet import read_table
+from cleargs.rva.tables import FRAMES
+from cleargs.splat.views import View, view_of
 
 Targets: TypeAlias = Literal["all", "degraded"]
 
@@ -22,6 +32,8 @@ class Appraisal:
     """With RVA on, the strong frames; in the all-view ablation, where all are strong, the sharp ones."""
     stand_in: bool
     """No frame is reliable, and this one is among the best by R - B."""
+    weight: float = 1.0
+    """Of the frame's raw supervision; 0: it is never loaded."""
 
 
 def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collection[int]) -> list[int]:
@@ -59,3 +71,83 @@ def _best(frames: Sequence[Appraisal]) -> Appraisal:
     middle = len(frames) // 2
     ranked = sorted(enumerate(frames), key=lambda item: (item[1].B - item[1].R, abs(item[0] - middle)))
     return ranked[0][1]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Target frames that are rendered from one scene."""
+
+    targets: Sequence[View]
+    steps: int
+    """Steps of the distillation of what was accepted so far, after its frames."""
+
+
+def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> list[Group]:
+    """``targets`` in their order, in as few groups of at most ``size`` frames as hold them, all in one for
+    None; sizes differ by one at most. ``steps`` is shared in proportion to the frames and adds up exactly.
+
+    The paper repairs along the trajectory: what is accepted early is distilled before later frames are
+    rendered, and may fade while theirs are. That is what the consolidation is for. Each group's distillation
+    is a training of its own, in its part of the schedule: over one of two rounds the means' rate falls by a
+    fifth, so that the end of the trajectory gets its geometry too.
+    """
+    frames = len(targets)
+    count = 1 if size is None else max(1, -(-frames // size))
+    borders = [k * frames // count for k in range(count + 1)]
+    return [
+        Group(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
+        for start, end in pairwise(borders)
+    ]
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """Views of the registered training frames, by frame_id, each with its RVA weight (which may be 0)."""
+
+    views: dict[int, View]
+    appraisals: list[Appraisal]
+    held_back: list[int]
+    """Frames that get no repairs, to measure whether those of the others do harm; none where the settings
+    hold none back."""
+
+    @property
+    def real(self) -> list[View]:
+        """The active raw frames: D_real, the held-back ones among them, as for G0."""
+        return [view for view in self.views.values() if view.weight > 0.0]
+
+    @property
+    def judges(self) -> list[View]:
+        """The held-back frames."""
+        return [self.views[frame_id] for frame_id in self.held_back]
+
+    def targets(self, which: Targets) -> list[View]:
+        """The frames that every round repairs."""
+        return [self.views[frame_id] for frame_id in target_frames(self.appraisals, which, self.held_back)]
+
+    def worst(self, frame_ids: Sequence[int], count: int) -> list[View]:
+        """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""
+        wanted = set(frame_ids)
+        ranked = sorted(self.appraisals, key=lambda frame: (frame.R - frame.B, frame.frame_id))
+        return [self.views[frame.frame_id] for frame in ranked if frame.frame_id in wanted][:count]
+
+
+def load_supervision(ingest: Path, rva: Path, held_back: float) -> Supervision:
+    """Read the finished folders of ingest and rva; frames that RVA could not score stay out. Decodes no
+    image.
+
+    held_back: share of the reliable frames that judge the result.
+
+    Raises StoreError when a table is damaged, StageError when no frame can judge the result.
+    """
+    frames = {f.frame_id: f for f in load_frames(ingest) if f.registered and f.split == "train"}
+    columns = pa.schema([FRAMES.field(field.name) for field in fields(Appraisal)])
+    rows = [Appraisal(**row) for row in read_table(rva / "frames.parquet", columns).to_pylist()]
+    scored = [row for row in rows if row.frame_id in frames and row.R is not None]
+    appraisals = sorted(scored, key=lambda frame: frame.frame_id)
+    views = {a.frame_id: view_of(frames[a.frame_id], ingest, a.weight) for a in appraisals}
+    judges = held_back_frames(appraisals, held_back)
+    if held_back > 0.0 and not judges:
+        raise StageError(
+            "no frame is reliable, and no frame takes the place of one", hint="run rva again with --force rva"
+        )
+    return Supervision(views, appraisals, judges)

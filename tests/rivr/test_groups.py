@@ -20,8 +20,8 @@ from test_stages import (
 from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_g0, tiny_rivr
 
 from cleargs.media.exr import read_exr
-from cleargs.rivr.groups import trajectory_groups
 from cleargs.rivr.tables import read_selection
+from cleargs.rivr.targets import trajectory_groups
 from cleargs.stages import consolidate, rivr
 
 __all__ = ["capture", "expert"]  # fixtures

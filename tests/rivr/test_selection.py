@@ -9,8 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cleargs.rivr.candidates import CANDIDATES, CandidateName
-from cleargs.rivr.selection import choose, hardly_changes, hide_masked, unbeaten
+from cleargs.rivr.candidates import (
+    CANDIDATES,
+    CandidateName,
+    choose,
+    hardly_changes,
+    hide_masked,
+    unbeaten,
+)
 
 three_scores = st.tuples(*[st.floats(0, 100)] * 3)
 

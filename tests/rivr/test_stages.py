@@ -427,7 +427,6 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
 @pytest.mark.parametrize(
     ("where", "after"),
     [
-        ("cleargs.rivr.restoring.write_exr", 3),
         ("cleargs.rivr.rounds.write_exr", 3),  # inside round 1
         ("cleargs.rivr.rounds.write_exr", 10),  # inside round 2
         ("cleargs.splat.trainer.Trainer.step", 8),  # inside the distillation of round 1

@@ -21,7 +21,7 @@ from cleargs.parquet import read_table
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.stage import StageContext, StageResult
 from cleargs.progress import SilentReporter
-from cleargs.rivr.supervision import load_supervision
+from cleargs.rivr.targets import load_supervision
 from cleargs.rva import tables
 from cleargs.stages.rva import RvaConfig
 
