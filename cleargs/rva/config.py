@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
 from pydantic import Field, JsonValue, field_validator, model_validator
 
 from cleargs.plugins import require_known
-from cleargs.record import Record, Unit
+from cleargs.record import Record, Settings, Unit
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
 
@@ -28,7 +28,7 @@ _PLACE: dict[str, JsonValue] = {
 }  # where the work is done, not what comes of it: stays out of the stage's key
 
 
-class QwenConfig(Record):
+class QwenConfig(Settings):
     """The evaluator ``qwen3-vl``: a vision-language model behind a server, or in a folder of this machine.
 
     The server's key is no setting: it comes from the environment (CLEARGS_VLM_API_KEY) and is written
@@ -51,7 +51,8 @@ class QwenConfig(Record):
         json_schema_extra=_PLACE,
         description="folder of a Qwen3-VL model to run in process (extra vlm) in place of a server",
     )
-    prompt: Literal[1] = Field(1, description="version of the prompt")
+    prompt: ClassVar[int] = 1
+    """Version of the prompt."""
     image_size: int = Field(
         1024, ge=64, le=4096, description="px; larger images are reduced to this long side"
     )
@@ -130,16 +131,12 @@ class EvaluatorConfig(Record):
         return self
 
 
-class ScoreConfig(Record):
+class ScoreConfig(Settings):
     """How cues become scores, and which frames are reliable."""
 
-    stand_in_share: float = Field(
-        0.10,
-        gt=0.0,
-        le=1.0,
-        description="when no frame is reliable, this share of the registered frames (at least one), "
-        "best by R - B, stands in for the reliable set in the geometry",
-    )
+    stand_in_share: ClassVar[float] = 0.10
+    """When no frame is reliable, this share of the registered frames (at least one), best by R - B, stands in
+    for the reliable set in the geometry."""
     w_R: tuple[Unit, Unit, Unit, Unit, Unit] = Field(
         (0.30, 0.25, 0.20, 0.15, 0.10),
         description="weights in R of sharpness, structure, texture, cleanness, exposure; they sum to 1",
@@ -232,15 +229,13 @@ class AllocationConfig(ScoreConfig):
     strong_gain: float = Field(0.20, ge=0.0, le=1.0, description="weight of a strong frame: base + gain R")
     geometric_G: float = Field(0.60, ge=0.0, le=1.0, description="a geometric frame has at least this G")
     geometric_B: float = Field(0.80, ge=0.0, le=1.0, description="a geometric frame has at most this B")
-    geometric_mix: tuple[Unit, Unit] = Field(
-        (0.35, 0.65), description="weight of a geometric frame: base + gain (mix[0] R + mix[1] G); sums to 1"
-    )
+    geometric_mix: ClassVar[tuple[float, float]] = (0.35, 0.65)
+    """The paper's: a geometric frame weighs base + gain (mix[0] R + mix[1] G)."""
     auxiliary_R: float = Field(0.35, ge=0.0, le=1.0, description="an auxiliary frame has at least this R")
     auxiliary_G: float = Field(0.25, ge=0.0, le=1.0, description="an auxiliary frame has at least this G")
     auxiliary_B: float = Field(0.75, ge=0.0, le=1.0, description="an auxiliary frame has at most this B")
-    auxiliary_mix: tuple[Unit, Unit] = Field(
-        (0.50, 0.50), description="weight of an auxiliary frame: base + gain (mix[0] R + mix[1] G); sums to 1"
-    )
+    auxiliary_mix: ClassVar[tuple[float, float]] = (0.50, 0.50)
+    """The paper's: an auxiliary frame weighs base + gain (mix[0] R + mix[1] G)."""
     attenuated_base: float = Field(
         0.30, gt=0.0, le=1.0, description="base of the weight of geometric and auxiliary frames"
     )
@@ -250,8 +245,6 @@ class AllocationConfig(ScoreConfig):
 
     @model_validator(mode="after")
     def _weights_stay_in_range(self) -> AllocationConfig:
-        for name in ("geometric_mix", "auxiliary_mix"):
-            _require_sum_of_one(name, sum(getattr(self, name)))
         for base, gain in (("strong_base", "strong_gain"), ("attenuated_base", "attenuated_gain")):
             if getattr(self, base) + getattr(self, gain) > 1.0 + _SUM_TOLERANCE:
                 raise ValueError(f"{base} + {gain} must not exceed 1: it is the largest weight of a frame")
