@@ -23,8 +23,10 @@ _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
 _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 
-_BACK = {6: 8, 8: 6}
-"""EXIF's orientation -> the one that undoes it; the others undo themselves."""
+_MIRRORED = {
+    1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)
+}  # fmt: skip
+"""EXIF's orientation -> steps through rows and columns of the stored image."""
 
 
 class Header(NamedTuple):
@@ -33,7 +35,7 @@ class Header(NamedTuple):
     width: int
     height: int
     orientation: int
-    """EXIF's, 1 to 8."""
+    """EXIF's, 1 to 8, and 1 where there is none."""
     format: str
 
 
@@ -51,7 +53,8 @@ def read_header(path: Path) -> Header:
         geterror()  # else OpenImageIO prints it on stderr at the end
     elif source.format_name() in _FORMATS:
         spec = source.spec()
-        return Header(spec.width, spec.height, spec.get_int_attribute("Orientation", 1), source.format_name())
+        noted = spec.get_int_attribute("Orientation", 1)
+        return Header(spec.width, spec.height, noted if 1 <= noted <= 8 else 1, source.format_name())
     fault = "is empty (zero bytes)" if empty else "is not an image that can be read"
     raise InputError(f"{path} {fault}", hint=_HINT)
 
@@ -67,10 +70,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
 
     ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
     """
-    flags = cv2.IMREAD_COLOR if upright else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr, header = _decode(path, flags)
-    # OpenCV turns a TIFF whatever the flags are.
-    bgr = _arranged(bgr, header, is_upright=upright or header.format == "tiff", upright=upright)
+    bgr = _decode(path, cv2.IMREAD_COLOR, upright=upright)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -79,7 +79,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
 
     The border lies in the middle, of masks of 0 and 1 alone, as some programs write them, above 0.
     """
-    grey, _ = _decode(path, cv2.IMREAD_GRAYSCALE)
+    grey = _decode(path, cv2.IMREAD_GRAYSCALE)
     border = 127 if grey.max() > 1 else 0
     return np.where(grey > border, np.uint8(255), np.uint8(0))
 
@@ -91,27 +91,11 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
     """
     if path.suffix.lower() in _OPAQUE:
         return None
-    image, header = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(path, cv2.IMREAD_UNCHANGED, upright=upright)
     if image.ndim != 3 or image.shape[2] != 4:
         return None
     opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
-    if opaque.all():
-        return None
-    # Of an image that keeps its alpha OpenCV turns TIFFs alone.
-    arranged = _arranged(opaque, header, is_upright=header.format == "tiff", upright=upright)
-    return np.where(arranged, np.uint8(255), np.uint8(0))
-
-
-def _arranged(image: NDArray[Any], header: Header, *, is_upright: bool, upright: bool) -> NDArray[Any]:
-    """An image [H, W, ...] as it is to be seen (``upright``) or as it is stored, whichever it is."""
-    if is_upright == upright:
-        return image
-    orientation = header.orientation if upright else _BACK.get(header.orientation, header.orientation)
-    if orientation >= 5:  # mirrored at the diagonal, then as the first four
-        image = image.swapaxes(0, 1)
-    mirrored = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
-    down, across = mirrored.get(orientation, (1, 1))
-    return np.ascontiguousarray(image[::down, ::across])
+    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
 
 
 def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
@@ -133,8 +117,11 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int) -> tuple[NDArray[Any], Header]:
-    """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
+def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
+    """The image [H, W, ...] as it is to be seen (``upright``) or as it is stored.
+
+    It is decoded from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr.
+    """
     header = read_header(path)
     if header.width * header.height > MAX_PIXELS:
         raise InputError(
@@ -149,10 +136,20 @@ def _decode(path: Path, flags: int) -> tuple[NDArray[Any], Header]:
     # libpng would tell of a file that breaks off on stderr.
     if header.format != "png" or b"IEND" in content:
         with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            ignore = 0 if flags == cv2.IMREAD_UNCHANGED else cv2.IMREAD_IGNORE_ORIENTATION
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | ignore)
     if image is None:
         raise InputError(f"{path} is not an image that can be read", hint=_HINT)
-    return np.asarray(image), header
+    # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
+    turn = header.orientation
+    if header.format == "tiff":
+        turn = 1 if upright else {6: 8, 8: 6}.get(turn, turn)  # the others undo themselves
+    elif not upright:
+        turn = 1
+    if turn >= 5:  # mirrored at the diagonal, then as the first four
+        image = image.swapaxes(0, 1)
+    down, across = _MIRRORED[turn]
+    return np.ascontiguousarray(image[::down, ::across])
 
 
 def _encode(path: Path, image: NDArray[np.uint8]) -> None:

@@ -103,7 +103,7 @@ def test_a_mask_of_zeros_and_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["png", "tif"])
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("orientation", range(1, 10))
 def test_an_image_turns_with_its_transparency_or_stays(tmp_path: Path, orientation: int, kind: str) -> None:
     """OpenCV turns a TIFF even where it is to be read as it is stored."""
     opaque = np.random.default_rng(orientation).integers(0, 2, (4, 6, 1), np.uint8) * 255
