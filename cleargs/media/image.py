@@ -136,8 +136,7 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
     # libpng would tell of a file that breaks off on stderr.
     if header.format != "png" or b"IEND" in content:
         with suppress(cv2.error):
-            ignore = 0 if flags == cv2.IMREAD_UNCHANGED else cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | ignore)
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError(f"{path} is not an image that can be read", hint=_HINT)
     # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
