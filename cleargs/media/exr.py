@@ -130,7 +130,9 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
             name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
             for name in names
         }
-        kept = {item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)}
+        kept: dict[str, Any] = {
+            item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
+        }
     except FAULTS as error:  # OpenImageIO's own words may hold bytes of the file that are no text
         raise StoreError(
             f"cannot read {path.name}: {cause(error)}", hint="delete the file and run its stage again"
