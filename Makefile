@@ -82,7 +82,7 @@ lint: .venv/dev.stamp
 convert-env: .venv-convert/stamp
 
 test-convert: convert-env
-	.venv-convert/bin/python -m pytest tools/tests/test_convert_models.py
+	.venv-convert/bin/python -m pytest tests/tools/test_convert_models.py
 
 browser: .venv/browser.stamp
 

@@ -97,10 +97,14 @@ def _write(
         spec.attribute(name, value)
     with atomic_path(path) as temporary:
         output = ImageOutput.create(str(temporary))
-        if output is None:
-            raise _unwritable(path, geterror())
-        if not (output.open(str(temporary), spec) and output.write_image(pixels) and output.close()):
-            raise _unwritable(path, output.geterror())
+        if not (
+            output and output.open(str(temporary), spec) and output.write_image(pixels) and output.close()
+        ):
+            reason = cause(ValueError((output.geterror() if output else geterror()).strip()))
+            raise StoreError(
+                f"cannot write {path.name}: {reason}",
+                hint="check the free space and the permissions of the run folder",
+            )
 
 
 def read_exr(path: Path, prefix: str = "") -> LayeredImage:
@@ -112,43 +116,25 @@ def read_exr(path: Path, prefix: str = "") -> LayeredImage:
         open_regular(path).close()
         source = ImageInput.open(str(path))
         if source is None:
-            raise ValueError(_first_line(geterror()))
-        try:
-            return _read(source, prefix)
-        finally:
-            source.close()
+            raise ValueError(geterror().strip())
+        spec = source.spec()
+        if spec.width * spec.height > MAX_PIXELS or spec.nchannels > _MAX_CHANNELS:
+            raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
+        pixels = source.read_image(HALF)
+        if pixels is None:
+            raise ValueError(source.geterror().strip())
+        place = {name: k for k, name in enumerate(spec.channelnames)}
+        # The plain channels are one of the layers again.
+        names = dict.fromkeys(name.rpartition(".")[0] for name in place if name not in _CHANNELS)
+        layers = {
+            name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
+            for name in names
+        }
+        kept: dict[str, Any] = {
+            item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
+        }
     except FAULTS as error:  # OpenImageIO's own words may hold bytes of the file that are no text
         raise StoreError(
             f"cannot read {path.name}: {cause(error)}", hint="delete the file and run its stage again"
         ) from error
-
-
-def _read(source: ImageInput, prefix: str) -> LayeredImage:
-    spec = source.spec()
-    if spec.width * spec.height > MAX_PIXELS or spec.nchannels > _MAX_CHANNELS:
-        raise ValueError(f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels are too many")
-    pixels = source.read_image(HALF)
-    if pixels is None:
-        raise ValueError(_first_line(source.geterror()))
-    place = {name: k for k, name in enumerate(spec.channelnames)}
-    named = (name for name in spec.channelnames if name not in _CHANNELS)  # those are one of the layers again
-    names = dict.fromkeys(name.rpartition(".")[0] for name in named)
-    layers = {
-        name: np.ascontiguousarray(pixels[..., [place[f"{name}.{channel}"] for channel in _CHANNELS]])
-        for name in names
-    }
-    attributes: dict[str, Any] = {
-        item.name: item.value for item in spec.extra_attribs if item.name.startswith(prefix)
-    }
-    return LayeredImage(layers, attributes)
-
-
-def _unwritable(path: Path, reason: str) -> StoreError:
-    return StoreError(
-        f"cannot write {path.name}: {_first_line(reason)}",
-        hint="check the free space and the permissions of the run folder",
-    )
-
-
-def _first_line(reason: str) -> str:
-    return (reason.strip() or "unknown error").splitlines()[0]
+    return LayeredImage(layers, kept)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,17 +14,55 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
-from cleargs.media.header import PNG
-from cleargs.media.header import image_size as stated_size
 from cleargs.untrusted import cause, open_regular, read_bytes
+
+_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp"})
+"""Formats that are read, as OpenImageIO names them."""
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
-_TIFF = frozenset({b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"})
-"""How a TIFF begins, and a BigTIFF."""
+_HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 
-_BACK = {6: 8, 8: 6}
-"""EXIF's orientation -> the one that undoes it; the others undo themselves."""
+_MIRRORED = {
+    1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)
+}  # fmt: skip
+"""EXIF's orientation -> steps through rows and columns of the stored image."""
+
+
+class Header(NamedTuple):
+    """What the first bytes of an image file state: what decoding takes is known before."""
+
+    width: int
+    height: int
+    orientation: int
+    """EXIF's, 1 to 8, and 1 where there is none."""
+    format: str
+
+
+def read_header(path: Path) -> Header:
+    """The header of the image in ``path``. Raises InputError when there is no image."""
+    from OpenImageIO import ImageInput, geterror
+
+    try:
+        with open_regular(path) as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()  # else OpenImageIO prints it on stderr at the end
+    elif source.format_name() in _FORMATS:
+        spec = source.spec()
+        noted = spec.get_int_attribute("Orientation", 1)
+        return Header(spec.width, spec.height, noted if 1 <= noted <= 8 else 1, source.format_name())
+    fault = "is empty (zero bytes)" if empty else "is not an image that can be read"
+    raise InputError(f"{path} {fault}", hint=_HINT)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of the image in ``path``, as it is stored. Raises InputError like `read_header`."""
+    header = read_header(path)
+    return header.width, header.height
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -32,29 +70,8 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
 
     ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
     """
-    flags = cv2.IMREAD_COLOR if upright else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = _arranged(_decode(path, flags), path, is_upright=upright or _is_tiff(path), upright=upright)
+    bgr = _decode(path, cv2.IMREAD_COLOR, upright=upright)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the image in ``path``, as it is stored, from its header alone.
-
-    Raises InputError when there is no image.
-    """
-    from OpenImageIO import ImageInput, geterror
-
-    try:
-        open_regular(path).close()
-        source = ImageInput.open(str(path))
-    except OSError:
-        source = None
-    if source is None:
-        geterror()  # else it is told on stderr at the end
-        raise InputError(f"{path} is not an image that can be read", hint="convert it to JPEG or PNG")
-    spec = source.spec()
-    source.close()
-    return spec.width, spec.height
 
 
 def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
@@ -74,51 +91,11 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
     """
     if path.suffix.lower() in _OPAQUE:
         return None
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(path, cv2.IMREAD_UNCHANGED, upright=upright)
     if image.ndim != 3 or image.shape[2] != 4:
         return None
     opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
-    if opaque.all():
-        return None
-    # Of an image that keeps its alpha OpenCV turns TIFFs alone.
-    arranged = _arranged(opaque, path, is_upright=_is_tiff(path), upright=upright)
-    return np.where(arranged, np.uint8(255), np.uint8(0))
-
-
-def _orientation(path: Path) -> int:
-    """EXIF's orientation, 1 to 8; 1 where there is none."""
-    from OpenImageIO import ImageInput, geterror
-
-    source = ImageInput.open(str(path))
-    if source is None:
-        geterror()  # else it is told on stderr at the end
-        return 1
-    orientation = source.spec().get_int_attribute("Orientation", 1)
-    source.close()
-    return int(orientation)
-
-
-def _is_tiff(path: Path) -> bool:
-    """Whether it is a TIFF, which OpenCV turns whatever it is told."""
-    with open_regular(path) as file:
-        return file.read(4) in _TIFF
-
-
-def _arranged(image: NDArray[Any], path: Path, *, is_upright: bool, upright: bool) -> NDArray[Any]:
-    """An image [H, W, ...] as it is to be seen (``upright``) or as it is stored, whichever it is."""
-    if is_upright == upright:
-        return image
-    orientation = _orientation(path)
-    return _turned(image, orientation if upright else _BACK.get(orientation, orientation))
-
-
-def _turned(image: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """A stored image as it is to be seen."""
-    if orientation >= 5:  # mirrored at the diagonal, then as the first four
-        image = image.swapaxes(0, 1)
-    mirrored = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
-    down, across = mirrored.get(orientation, (1, 1))
-    return np.ascontiguousarray(image[::down, ::across])
+    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
 
 
 def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
@@ -140,32 +117,38 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
-    """Decode from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr."""
+def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
+    """The image [H, W, ...] as it is to be seen (``upright``) or as it is stored.
+
+    It is decoded from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr.
+    """
+    header = read_header(path)
+    if header.width * header.height > MAX_PIXELS:
+        raise InputError(
+            f"{path} has {header.width}x{header.height} pixels; at most {MAX_PIXELS} are read",
+            hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
+        )
     try:
         content = read_bytes(path)
     except OSError as error:
-        raise InputError(
-            f"cannot read {path}: {cause(error)}",
-            hint="check that the file exists and is readable",
-        ) from error
-    if not content:
-        raise InputError(f"{path} is empty (zero bytes)", hint="remove the file, or copy it again")
-    image, size = None, stated_size(content)
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        raise InputError(
-            f"{path} has {size[0]}x{size[1]} pixels; at most {MAX_PIXELS} are read",
-            hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
-        )
+        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    image = None
     # libpng would tell of a file that breaks off on stderr.
-    if size is not None and not (content.startswith(PNG) and b"IEND" not in content):
+    if header.format != "png" or b"IEND" in content:
         with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InputError(
-            f"{path} is not an image that can be read", hint="convert it to JPEG or PNG, or remove the file"
-        )
-    return np.asarray(image)
+        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
+    # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
+    turn = header.orientation
+    if header.format == "tiff":
+        turn = 1 if upright else {6: 8, 8: 6}.get(turn, turn)  # the others undo themselves
+    elif not upright:
+        turn = 1
+    if turn >= 5:  # mirrored at the diagonal, then as the first four
+        image = image.swapaxes(0, 1)
+    down, across = _MIRRORED[turn]
+    return np.ascontiguousarray(image[::down, ::across])
 
 
 def _encode(path: Path, image: NDArray[np.uint8]) -> None:

@@ -37,6 +37,8 @@ _HEAD_CHANNELS: dict[Net, tuple[int, ...]] = {
     "alex": (64, 192, 384, 256, 256),
     "vgg": (64, 128, 256, 512, 512),
 }
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError)
+"""What reading another archive may raise."""
 _MIN_SIDE = 32  # below this AlexNet's third block has no pixel left to speak of
 
 
@@ -143,7 +145,7 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
                 save_file(_state_dict(net, tree, tree[backbone]), path)
                 load_network(net, path)  # names and shapes must fit
                 written.append(path)
-    except (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError) as error:
+    except _FAULTS as error:
         raise InputError(
             f"this is not the published LPIPS checkpoint: {cause(error)}",
             hint="let `cleargs models install lpips` fetch the source distribution itself",

@@ -10,7 +10,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -117,8 +117,12 @@ class OnnxModel:
         options.use_deterministic_compute = True
         options.log_severity_level = _FATAL  # what goes wrong is raised, and told once
         options.add_session_config_entry(_EXTERNAL_FOLDER, os.devnull)  # nothing can lie in there
+        session = None
+        if device == "cuda":  # the provider may not load, which onnxruntime also prints on stdout
+            providers = [(CUDA_PROVIDER, _CUDA_OPTIONS), "CPUExecutionProvider"]
+            with suppress(Exception), redirect_stdout(StringIO()):
+                session = onnxruntime.InferenceSession(model, options, providers=providers)
         try:
-            session = _cuda_session(model, options) if device == "cuda" else None
             if session is None:
                 session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's exceptions share no base class of their own
@@ -208,18 +212,6 @@ def _raise_exhausted(path: Path, error: Exception) -> None:
 
 def _reason(error: Exception) -> str:
     return (str(error).strip() or "no reason was given").splitlines()[0]
-
-
-def _cuda_session(model: bytes, options: Any) -> Any:
-    """A session on the GPU; None where that fails, be it for the provider or for the model."""
-    import onnxruntime
-
-    providers = [(CUDA_PROVIDER, _CUDA_OPTIONS), "CPUExecutionProvider"]
-    try:
-        with redirect_stdout(StringIO()):  # onnxruntime prints on stdout that a provider does not load
-            return onnxruntime.InferenceSession(model, options, providers=providers)
-    except Exception:  # onnxruntime's exceptions share no base class of their own
-        return None
 
 
 def _describe(arguments: Sequence[Any]) -> tuple[TensorInfo, ...]:

@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -41,8 +41,8 @@ def image(height: int, width: int) -> np.ndarray[Any, np.dtype[np.float32]]:
         )
         for s in (1, 4, 16)
     ]
-    mean: np.ndarray[Any, np.dtype[np.float32]] = (sum(planes) / 3)[0].permute(1, 2, 0).numpy()  # type: ignore[union-attr, index]
-    return np.ascontiguousarray(mean)
+    mean = torch.stack(planes).sum(dim=0)[0] / 3
+    return np.ascontiguousarray(mean.permute(1, 2, 0).numpy())
 
 
 def peak_gb() -> float:
@@ -56,7 +56,7 @@ def checkpoint(network: nn.Module) -> bytes:
     return buffer.getvalue()
 
 
-def published(name: str) -> nn.Module:
+def published(name: str) -> Any:
     """The published architecture with random weights, none of which leaves the image as it is."""
     from tools.convert_models.torch_export import mend_torchvision
 
@@ -92,7 +92,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
     """Convert the random network and compare it with PyTorch."""
     from cleargs.models.expert import OnnxExpert
     from cleargs.models.musiq import MusiqScorer
-    from cleargs.models.scorer import LearnedScorer
+    from cleargs.models.scorer import LearnedScorer, Scorer
     from tools.convert_models import restorer, scorers
 
     network, start = published(name), time.process_time()
@@ -107,7 +107,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
     else:
         if name == "musiq":
             scorers.convert("musiq", checkpoint(network), path)
-            reference, scorer, factor = network, MusiqScorer(path), 1.0
+            reference, scorer, factor = network, cast(Scorer, MusiqScorer(path)), 1.0
         else:
             from pyiqa.archs import clipiqa_arch
 
