@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-from cleargs.evaluate.eval_report import LOWER_IS_BETTER
-from cleargs.evaluate.figures import Figures
+from cleargs.evaluate.eval_report import LOWER_IS_BETTER, Figures
 
 ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
 """Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the

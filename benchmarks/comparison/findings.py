@@ -119,7 +119,7 @@ def roles_of(made: Made) -> Roles:
 
 def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
     """How RIVR chose, against the truth; None where there is no RIVR or no truth. Kept by content."""
-    from cleargs.evaluate.metric_set import load_metrics
+    from cleargs.evaluate.metrics import load_metrics
 
     rivr = next((manifest for manifest in made.manifests if manifest.stage == "rivr"), None)
     truth = made.sample.capture / "truth"

@@ -15,7 +15,7 @@ from benchmarks.comparison.choices import Choices
 from benchmarks.comparison.evidence import Outcome, Section
 from benchmarks.comparison.roles import Roles
 from benchmarks.comparison.tables import Results
-from cleargs.evaluate.figures import Figures
+from cleargs.evaluate.eval_report import Figures
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
 from cleargs.untrusted import read_bytes

@@ -84,7 +84,7 @@ class Recipe:
     @cached_property
     def weights(self) -> dict[str, str]:
         """Digests of the weights of the metrics that can be had now."""
-        from cleargs.evaluate.metric_set import load_metrics
+        from cleargs.evaluate.metrics import load_metrics
 
         return dict(load_metrics(self.options).weights)
 

@@ -16,12 +16,11 @@ from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
+from cleargs.pipeline.session import SCENE, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
     from cleargs.evaluate.references import Reference
-
-SCENE = "scene.ply"
 
 _LABELS = {
     "psnr": "PSNR",
@@ -163,24 +162,14 @@ def eval(
     else:
         raise InputError("there is nothing to compare with", hint="give --reference DIR")
 
-    def keep(subject: str) -> Path | None:
-        return save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
-
-    evaluations = [
-        evaluate_scene(
-            scene,
-            reference,
-            options=options,
-            threads=count,
-            reporter=reporter,
-            subject=subject,
-            save=keep(subject),
+    evaluations = []
+    for subject, scene in scenes.items():
+        save = save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
+        found = evaluate_scene(
+            scene, reference, options=options, threads=count, reporter=reporter, subject=subject, save=save
         )
-        for subject, scene in scenes.items()
-    ]
-    for place, found in enumerate(evaluations):
-        trained = None if run is None else views_trained_on(run, found.subject, reference)
-        evaluations[place] = found.model_copy(update={"trained_on": trained})
+        trained = None if run is None else views_trained_on(run, subject, reference)
+        evaluations.append(found.model_copy(update={"trained_on": trained}))
     if renders is not None:
         evaluations.append(
             evaluate_images(
@@ -200,7 +189,8 @@ def eval(
         if line := _seen_before(report):
             click.echo(line)
         _print(report, per_image, output)
-        if run is not None and not align_colour and _exposure_counts(run):
+        g0 = None if run is None else linked_manifest(run, "g0")
+        if g0 is not None and g0.summary.get("exposure") and not align_colour:  # it was compensated
             click.echo(
                 "the exposure of each reference counts in these figures: --align-colour leaves it out, as "
                 "the training did"
@@ -219,12 +209,6 @@ def _older(run: Path, path: Path) -> Report:
     digests = {subject: file_digest(scene) for subject, scene in scenes.items() if scene.is_file()}
     kept = (evaluation for evaluation in found if evaluation.scene == digests.get(evaluation.subject))
     return Report(evaluations=tuple(kept))
-
-
-def _exposure_counts(run: Path) -> bool:
-    """Whether the scene was trained with exposure compensation, which an evaluation leaves out."""
-    g0 = linked_manifest(run, "g0")
-    return g0 is not None and bool(g0.summary.get("exposure"))
 
 
 def _seen_before(report: Report) -> str:
@@ -257,16 +241,11 @@ def _scenes(dag: Dag, target: Path | None, renders: Path | None, stages: Sequenc
         raise InputError(
             f"{target} is no run: it has no {RUN_FILE}", hint="give the folder of `cleargs run -o`"
         )
-    done = [name for name in dag.names if (target / name / SCENE).is_file()]
-    if not done:
-        raise InputError(f"there is no scene in {target}", hint=f"see cleargs status {target}")
-    chosen = done if "all" in stages else [dag.check(name) for name in dict.fromkeys(stages)] or done[-1:]
-    for name in chosen:
-        if name not in done:
-            raise InputError(
-                f"{name} has no scene in {target}", hint=f"the stages with a scene are {', '.join(done)}"
-            )
-    return {name: target / name / SCENE for name in chosen}
+    if "all" in stages:
+        chosen = [name for name in dag.names if (target / name / SCENE).is_file()]
+    else:
+        chosen = [scene_stage(dag, target, name) for name in dict.fromkeys(stages)]
+    return {name: target / name / SCENE for name in chosen or [scene_stage(dag, target, None)]}
 
 
 # -- on the terminal ---------------------------------------------------------------------------------------

@@ -32,8 +32,7 @@ def answer_signals() -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
-    # Until all is in place a signal waits: it is raised at the end, where the caller expects it. What was
-    # blocked before stays blocked: whoever started us sees to that signal (`cleargs.batch.slurm_watch`).
+    # Until all is in place a signal waits: it is raised at the end, where the caller expects it.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     os.register_at_fork(after_in_child=restore)
     signal.signal(signal.SIGINT, interrupt)

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.figures import Figures
-from cleargs.evaluate.regions import Region
 from cleargs.files import disk_error, write_json
 from cleargs.parquet import column, write_table
+from cleargs.record import Record
 from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
@@ -30,6 +29,20 @@ _REGIONS = {
 
 LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """All other metrics are better the higher they are."""
+
+
+class Figures(Record):
+    """A record whose JSON writes an infinite figure, as the PSNR of a perfect image, as ``"Infinity"``: JSON
+    has no number for it. Read back, it is a number again."""
+
+    model_config = ConfigDict(ser_json_inf_nan="strings")
+
+
+class Region(Figures):
+    """A part of an image, or of all of them."""
+
+    share: float = Field(ge=0, le=1, description="Of the pixels that count.")
+    psnr: float | None = Field(description="dB, of its mean squared error; null where it is empty.")
 
 
 class Alignment(Figures):

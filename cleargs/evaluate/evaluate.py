@@ -15,14 +15,23 @@ from numpy.typing import NDArray
 
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
-from cleargs.evaluate.colour_alignment import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
-from cleargs.evaluate.metric_set import MetricSet, load_metrics
-from cleargs.evaluate.metrics import Mask, Pixels
+from cleargs.evaluate.metrics import (
+    Mask,
+    MetricSet,
+    Pixels,
+    apply_affine,
+    clipped_pixels,
+    depth_of_points,
+    far_pixels,
+    fit_affine,
+    load_metrics,
+    pooled,
+    region,
+)
 from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, require_match
 from cleargs.evaluate.refinement import refine_pose
-from cleargs.evaluate.regions import clipped_pixels, depth_of_points, far_pixels, pooled, region
 from cleargs.files import disk_error
 from cleargs.manifest import versions
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
@@ -75,8 +84,8 @@ def evaluate_scene(
         ) from error
     set_threads(threads)
     renderer = _Renderer(loaded, options.refine_poses, reference.points)
-    predictions = _Predictions(subject or scene.name, file_digest(scene), renderer)
-    return _evaluate(predictions, reference, options, threads, reporter, save)
+    name = subject or scene.name
+    return _evaluate(name, file_digest(scene), renderer, reference, options, threads, reporter, save)
 
 
 def evaluate_images(
@@ -113,23 +122,14 @@ def evaluate_images(
         return _Prediction(image / 255.0)
 
     restricted = Reference(reference.name, matched, reference.poses, reference.alignment)
-    predictions = _Predictions(folder.resolve().name, None, predict)
-    found = _evaluate(predictions, restricted, options, threads, reporter, save)
+    name = folder.resolve().name
+    found = _evaluate(name, None, predict, restricted, options, threads, reporter, save)
     if len(matched) < len(reference.views):
         reporter.warn(
             f"{folder} has images for {len(matched)} of {len(reference.views)} references: "
             "the means are over these"
         )
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Predictions:
-    """A method to evaluate: its name, the digest of its scene, and how to get its images."""
-
-    subject: str
-    scene: str | None
-    predict: Predict
 
 
 class _Renderer:
@@ -176,7 +176,9 @@ class _Renderer:
 
 
 def _evaluate(
-    predictions: _Predictions,
+    subject: str,
+    scene: str | None,
+    predict: Predict,
     reference: Reference,
     options: EvalOptions,
     threads: int,
@@ -193,13 +195,13 @@ def _evaluate(
     images: list[ImageResult] = []
     waiting: deque[Future[ImageResult]] = deque()
     with (
-        reporter.task(f"evaluating {predictions.subject}", len(reference.views)) as task,
+        reporter.task(f"evaluating {subject}", len(reference.views)) as task,
         one_thread(),
         ThreadPoolExecutor(threads) as pool,
     ):
         for view in reference.views:
             target, mask = view.load()
-            prediction = predictions.predict(view, target, mask)
+            prediction = predict(view, target, mask)
             waiting.append(pool.submit(_measure, metrics, options, view.name, prediction, target, mask, save))
             if len(waiting) > 2 * threads:  # so that memory does not grow with the number of images
                 images.append(waiting.popleft().result())
@@ -208,8 +210,8 @@ def _evaluate(
             images.append(future.result())
             task.advance()
     return Evaluation(
-        subject=predictions.subject,
-        scene=predictions.scene,
+        subject=subject,
+        scene=scene,
         reference=reference.name,
         split=split_hash({image.name: image.reference for image in images}),
         poses=reference.poses,

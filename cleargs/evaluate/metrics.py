@@ -1,4 +1,4 @@
-"""PSNR and SSIM of two 8-bit sRGB images, in float64.
+"""Measures of an image against its reference: PSNR and SSIM in float64, learned metrics, regions, colours.
 
 Sums are exact or taken by numpy in a fixed order, so the figures do not depend on the thread count.
 """
@@ -6,17 +6,38 @@ Sums are exact or taken by numpy in a fixed order, so the figures do not depend 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.evaluate.config import INSTALLABLE, EvalOptions
+from cleargs.evaluate.eval_report import Region
+from cleargs.models.lpips import Lpips, weights_file
+from cleargs.models.registry import file_digest, model_dir
+from cleargs.models.scorer import Scorer, load_scorer
+from cleargs.splat.camera import Camera
+
 Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Image = NDArray[np.float32]
 
 WINDOW = 11
 SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
+
+RIDGE = 1e-6
+"""It holds the directions of colour that an image does not show at the identity."""
+
+FEWEST = 10
+"""Sparse points that a view must see before the farthest of them says anything."""
+
+FARTHEST = 0.99
+"""Quantile of their depths: a few are wrong matches, far behind everything."""
+
+CLIPPED = 254
 
 
 def psnr(
@@ -61,3 +82,150 @@ def _windowed(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Gaussian mean of the window around each pixel. [H, W, 3]"""
     kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
     return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101))
+
+
+# -- learned metrics -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MetricSet:
+    """The metrics of an evaluation, ready to be asked from several threads at once."""
+
+    lpips: Mapping[str, Callable[[Image, Image], float]]
+    """Metric -> distance of two float32 sRGB images."""
+    scorers: Mapping[str, Scorer]
+    weights: Mapping[str, str]
+    """Metric -> digest of its weights."""
+    unavailable: Mapping[str, str]
+    """Metric -> why it cannot be had."""
+
+    def measure(
+        self,
+        image: Pixels,  # [H, W, 3]
+        reference: Pixels,  # [H, W, 3]
+        mask: Mask | None,  # [H, W] True = counts
+    ) -> dict[str, float | None]:
+        """All metrics of an image; those that cannot be had are None.
+
+        LPIPS sees the reference's own pixels where the mask ignores the image's. Scorers, which know no
+        masks, see the whole image.
+        """
+        values = {"psnr": psnr(image, reference, mask), "ssim": ssim(image, reference, mask)}
+        seen = image if mask is None else np.where(mask[..., None], image, reference)
+        for name, distance in self.lpips.items():
+            values[name] = distance(_floats(seen), _floats(reference))
+        for name, scorer in self.scorers.items():
+            values[name] = scorer.score(_floats(image))
+        return values | dict.fromkeys(self.unavailable)
+
+
+def load_metrics(options: EvalOptions) -> MetricSet:
+    """Load what ``options`` asks for. Weights that a user installs may be absent: their metrics will be null.
+
+    Raises InputError for a scorer of an unknown name or an unusable file.
+    """
+    lpips: dict[str, Callable[[Image, Image], float]] = {}
+    scorers: dict[str, Scorer] = {}
+    weights: dict[str, str] = {}
+    unavailable: dict[str, str] = {}
+    for net in options.lpips:
+        file = model_dir() / weights_file(net)
+        if file.is_file():
+            lpips[f"lpips_{net}"] = Lpips(net).distance
+            weights[f"lpips_{net}"] = file_digest(file)
+        else:
+            unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
+    for name in options.scorers:
+        scorer = _scorer(name)
+        if scorer is not None:
+            scorers[name] = scorer
+            weights[name] = scorer.digest
+        else:
+            unavailable[name] = "not installed: see `cleargs models list`"
+    return MetricSet(lpips, scorers, weights, unavailable)
+
+
+def _scorer(name: str) -> Scorer | None:
+    """The scorer of that name; None for one of `INSTALLABLE` that the user has not installed."""
+    if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
+        return None
+    return load_scorer(name)
+
+
+def _floats(image: Pixels) -> Image:
+    return image.astype(np.float32) / np.float32(255)
+
+
+# -- colours ---------------------------------------------------------------------------------------------
+
+
+def fit_affine(
+    image: NDArray[np.float64],  # [H, W, 3] sRGB in [0, 1]
+    reference: NDArray[np.float64],  # [H, W, 3]
+    mask: Mask | None,  # [H, W] True = counts
+) -> NDArray[np.float64]:  # [3, 4]
+    """Matrix and offset of least squares over the pixels that count; the identity when none does."""
+    x = image.reshape(-1, 3) if mask is None else image[mask]
+    y = reference.reshape(-1, 3) if mask is None else reference[mask]
+    identity = np.eye(3, 4)
+    if not len(x):
+        return identity
+    design = np.column_stack([x, np.ones(len(x))])
+    # einsum, not BLAS, whose order of summation depends on its threads.
+    normal = np.einsum("ni,nj->ij", design, design) / len(x) + RIDGE * np.eye(4)
+    right = np.einsum("ni,nj->ij", design, y) / len(x) + RIDGE * identity.T
+    affine: NDArray[np.float64] = np.linalg.solve(normal, right).T
+    return affine
+
+
+def apply_affine(image: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The image [H, W, 3] through ``affine`` [3, 4], clipped to [0, 1]."""
+    mapped: NDArray[np.float64] = np.einsum("hwj,ij->hwi", image, affine[:, :3]) + affine[:, 3]
+    return mapped.clip(0.0, 1.0)
+
+
+# -- regions: the far, and the clipped, where scenes fail that look well on average ----------------------
+
+
+def depth_of_points(
+    points: NDArray[np.float64],  # [P, 3] in the scene's world
+    camera: Camera,
+) -> float | None:
+    """The depth behind which the view has no sparse points; None where it sees hardly any."""
+    x, y, depth = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+    seen = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return float(np.quantile(depth[seen], FARTHEST)) if seen.sum() >= FEWEST else None
+
+
+def far_pixels(
+    depth: NDArray[np.float32],  # [H, W] summed with the weights of blending
+    alpha: NDArray[np.float32],  # [H, W]
+    farthest: float,
+) -> Mask:
+    """Where a scene shows something behind ``farthest``, or hardly anything."""
+    return np.asarray((alpha < 0.5) | (depth > farthest * alpha))
+
+
+def clipped_pixels(reference: Pixels) -> Mask:
+    """Where a channel is at its upper end."""
+    return np.asarray((reference >= CLIPPED).any(axis=-1))
+
+
+def region(image: Pixels, reference: Pixels, part: Mask, mask: Mask | None) -> Region:
+    """What an image is like in ``part`` of those pixels that ``mask`` lets count."""
+    counting = part if mask is None else part & mask
+    pixels = part.size if mask is None else int(mask.sum())
+    return Region(share=float(counting.sum()) / max(1, pixels), psnr=psnr(image, reference, counting))
+
+
+def pooled(parts: Iterable[Region | None]) -> Region | None:
+    """The region over all images, each of the same weight: PSNR of the mean squared error over its pixels."""
+    found = [part for part in parts if part is not None]
+    if not found:
+        return None
+    share = math.fsum(part.share for part in found)
+    error = math.fsum(part.share * 10 ** (-part.psnr / 10) for part in found if part.psnr is not None)
+    level = None if not share else -10 * math.log10(error / share) if error else math.inf
+    return Region(share=share / len(found), psnr=level)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
-from cleargs.synth.room import BOX, SPHERE, Balloon, Room
-from cleargs.synth.textures import LEVELS, SIZE, TEXELS_PER_METRE
+from cleargs.synth.room import BOX, LEVELS, SIZE, SPHERE, TEXELS_PER_METRE, Balloon, Room
 
 configure_numba("raycast")
 

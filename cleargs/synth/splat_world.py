@@ -17,8 +17,8 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.views import view_of
-from cleargs.synth.course import CameraCourse, camera_course
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
+from cleargs.synth.path import CameraCourse, camera_course
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""

@@ -18,11 +18,10 @@ from cleargs.media.encode import require_even, write_video
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
-from cleargs.synth.course import Course, orbit
 from cleargs.synth.develop import FRAMES, develop, write_depth, write_image, write_transforms
 from cleargs.synth.image_motion import FrameMotion, follow
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, World, disc, phone_lens, still
-from cleargs.synth.path import FPS, frame_times, make_path
+from cleargs.synth.path import FPS, Course, frame_times, make_path, orbit
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, Protocol, find_protocol, noisy_poses, plan
 

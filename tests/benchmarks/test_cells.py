@@ -11,7 +11,7 @@ from benchmarks.comparison.cells import Cell, Cells, ViewSet, spread, student_t
 from benchmarks.comparison.findings import Compared
 from benchmarks.comparison.roles import FOR_SHARE, KINDS, Roles
 from benchmarks.comparison.tables import Results, difference_text, markdown
-from cleargs.evaluate.regions import Region
+from cleargs.evaluate.eval_report import Region
 
 LABELS = {"all-view": "all-view G0", "full": "ClearGS"}
 

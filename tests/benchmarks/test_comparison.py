@@ -20,7 +20,7 @@ from benchmarks.comparison.scenes import Made, Recipe, evaluated, existing, view
 from cleargs.capture.tables import load_frames
 from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.errors import InputError
-from cleargs.evaluate import evaluate, metric_set
+from cleargs.evaluate import evaluate, metrics
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
@@ -270,9 +270,9 @@ def test_metrics_whose_weights_came_later_are_measured(
             made = existing(run, dag, None)
             return evaluated(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[0].weights
 
-    whole = metric_set.load_metrics(options)
+    whole = metrics.load_metrics(options)
     bare = replace(whole, scorers={}, weights={}, unavailable={"clarity-net": "not installed"})
-    monkeypatch.setattr(metric_set, "load_metrics", lambda options: bare)
+    monkeypatch.setattr(metrics, "load_metrics", lambda options: bare)
     monkeypatch.setattr(evaluate, "load_metrics", lambda options: bare)
     assert kept_weights() == {}
     monkeypatch.undo()

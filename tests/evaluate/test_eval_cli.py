@@ -27,7 +27,6 @@ from cleargs.capture.tables import FRAMES
 from cleargs.cli.main import invoke
 from cleargs.media.image import write_rgb
 from cleargs.parquet import write_table
-from cleargs.rva.tables import FRAMES as ALLOCATION
 
 Shell = Callable[..., tuple[int, str, str]]
 
@@ -125,26 +124,6 @@ def test_a_scene_says_how_many_of_its_views_it_was_trained_on(shell: Shell, run:
     assert code == 0 and out.startswith("note: 1 of 2 views are of frames that the scene was trained on\n")
     found = json.loads((run / "eval" / "holdout" / "eval.json").read_text())["evaluations"][0]
     assert found["trained_on"] == 1
-
-
-def test_a_comparison_says_first_what_it_was_trained_on(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    frames = pq.read_table(run / "ingest" / "frames.parquet").to_pylist()
-    for row in frames:
-        row["split"] = "test" if row["frame_id"] in (2, 4) else "train"
-    write_table(run / "ingest" / "frames.parquet", pa.Table.from_pylist(frames, FRAMES), FRAMES)
-    note_finished(run, "ingest", {"poses": "input", "similarity": WORLD.to_json()})
-    write_table(run / "rva" / "frames.parquet", pa.Table.from_pylist([], ALLOCATION), ALLOCATION)
-    settings = run / "run.toml"
-    settings.write_text(settings.read_text().replace('holdout = "none"', 'holdout = "every:4"'))
-    out = tmp_path / "out"
-    options = ("--lpips", "none", "--threads", "1", "-q", "--no-report", "-o", str(out))
-    assert invoke(["compare", str(run), *options]) == 0
-    text = capsys.readouterr().out
-    assert text.splitlines()[2] == "note: 1 of 2 views of run are of frames that it was trained on"
-    assert "No scene was trained on these frames" not in text
-    assert [cell["trained_on"] for cell in json.loads((out / "comparison.json").read_text())["cells"]] == [1]
 
 
 def test_views_of_frames_that_were_trained_on_are_told_from_others(

@@ -32,10 +32,10 @@ from cleargs.capture.cameras import Pose
 from cleargs.capture.poses import Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate.alignment import align_cameras, umeyama
-from cleargs.evaluate.colour_alignment import apply_affine, fit_affine
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
+from cleargs.evaluate.metrics import apply_affine, fit_affine
 from cleargs.evaluate.references import Reference, reference_in, reference_of
 from cleargs.media.image import write_mask, write_rgb
 

@@ -14,8 +14,7 @@ from safetensors.torch import save_file
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.metric_set import load_metrics
-from cleargs.evaluate.metrics import psnr, ssim
+from cleargs.evaluate.metrics import load_metrics, psnr, ssim
 from cleargs.models.lpips import LpipsNetwork, weights_file
 
 

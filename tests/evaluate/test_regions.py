@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from cleargs.evaluate.regions import Region, clipped_pixels, depth_of_points, far_pixels, pooled, region
+from cleargs.evaluate.eval_report import Region
+from cleargs.evaluate.metrics import clipped_pixels, depth_of_points, far_pixels, pooled, region
 from cleargs.splat.camera import Camera
 
 CAMERA = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))

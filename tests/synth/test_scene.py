@@ -19,7 +19,7 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.synth.course import camera_course, look_at
+from cleargs.synth.path import camera_course, look_at
 from cleargs.synth.splat_world import open_scene
 from cleargs.synth.synthetic_capture import make_capture
 

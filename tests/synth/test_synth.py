@@ -19,8 +19,8 @@ from cleargs.errors import InputError
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.progress import SilentReporter
 from cleargs.synth import raycast
-from cleargs.synth.course import look_at
 from cleargs.synth.optics import Lens
+from cleargs.synth.path import look_at
 from cleargs.synth.protocols import PROTOCOLS
 from cleargs.synth.raycast import RoomWorld
 from cleargs.synth.room import DEPTH, SPHERE, Room, make_room
