@@ -226,11 +226,12 @@ def unpacked(row: NDArray[np.float64]) -> FrameFormation:
     """Return the frame of which `packed` gave these numbers."""
     frame_id, model, draws = (int(value) for value in row[:3])
     vector, rest = row[3 : 3 + 3 * TWIST], [float(value) for value in row[3 + 3 * TWIST :]]
+    disc_px, focus, median_depth, *measured, gain = rest
     return FrameFormation(
         frame_id,
-        FrameMotion(**dict(zip(LENS, rest, strict=False))).with_vector(vector),
+        FrameMotion(disc_px=disc_px, focus=focus, median_depth=median_depth).with_vector(vector),
         MODELS[model],
-        skew_gain=rest[-1] if rest[-1] >= 0.0 else None,
+        skew_gain=gain if gain >= 0.0 else None,
         draws=draws,
-        **dict(zip(MEASURED, rest[len(LENS) : -1], strict=True)),
+        **dict(zip(MEASURED, measured, strict=True)),
     )

@@ -110,6 +110,7 @@ def test_hard_cases_equal_the_oracle(case: str, device: torch.device) -> None:
     assert (len(warp.samples) == 1) == ("one sample" in case)
     height, width = fields.radius.shape
     image, light = random_image(height + 2 * margin, width + 2 * margin), random_image(height, width) - 0.5
+    light[..., 3] = 0.0  # padding
     there = Warp.of(placed(fields, device), margin)
     made, back = there.forward(image.to(device)).cpu(), there.transpose(light.to(device)).cpu()
     expected = oracle(image[..., :3], warp)

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from cleargs.cli.main import main
 from cleargs.errors import InputError
 from cleargs.manifest import KeyParts
 from cleargs.pipeline import session
@@ -64,18 +63,3 @@ def test_the_device_is_part_of_the_key(stage: str) -> None:
         libraries=library_versions(module, "cpu"),
     )
     assert parts.key != parts.model_copy(update={"device": "cuda"}).key
-
-
-def test_the_gpu_benchmark_says_what_it_needs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(session, "cuda_obstacle", lambda: "there is no NVIDIA GPU")
-    with pytest.raises(SystemExit) as caught:
-        main(["bench", "splat", "--device", "cuda"])
-    assert caught.value.code == 2
-    message = capsys.readouterr().err
-    assert "there is no NVIDIA GPU" in message
-    assert "--device cpu" in message
-    with pytest.raises(SystemExit) as caught:
-        main(["bench", "splat", "--device", "cuda", "--threads", "2"])
-    assert caught.value.code == 2
