@@ -144,11 +144,11 @@ def show(
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     elif plot:
-        from cleargs.report.allocation_picture import load_allocation, plot_allocation
+        from cleargs.report.allocation_picture import plot_allocation
 
         picture = output or run / PLOT
         picture.parent.mkdir(parents=True, exist_ok=True)
-        plot_allocation(picture, load_allocation(run / "rva", run / "ingest"), run.resolve().name)
+        plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
         else:
@@ -189,10 +189,10 @@ def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
     print_table(table)
     if None in manifests.values():
         click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
-    if found := at_work(run.folder, run.store):
-        count = f"{found.done} of {found.total}" if found.total else str(found.done or "")
-        click.echo(f"\n{found.stage} is at work: {', '.join(filter(None, (found.label, count, found.note)))}")
-        if preview := preview_of(found, run.store):
+    if work := at_work(run.folder, run.store):
+        count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
+        click.echo(f"\n{work.stage} is at work: {', '.join(filter(None, (work.label, count, work.note)))}")
+        if preview := preview_of(work, run.store):
             click.echo(f"preview: {preview.path}")
 
 
