@@ -129,7 +129,7 @@ def _draw_plan(panel: Axes, rows: Sequence[Row], frames: Sequence[Frame]) -> Non
         panel.annotate(text, (x[k], z[k]), (7, -4), textcoords="offset points", zorder=6)
     panel.set_aspect("equal", adjustable="datalim")
     panel.margins(0.12)
-    panel.set(title="from above; arrow: view, size: weight", xlabel="x (normalised world)", ylabel="z")
+    panel.set(title="from above; arrow: view, size: weight", xlabel="x; z upwards (normalised world)")
 
 
 def _draw_along(
