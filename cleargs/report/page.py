@@ -10,7 +10,7 @@ from typing import Any
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
-from cleargs.manifest import Manifest
+from cleargs.pipeline.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
 from cleargs.report.frame_pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
@@ -82,12 +82,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     return page_of(run)
 
 
-def _fill(
-    folder: Path,
-    planner: Planner,
-    manifests: Mapping[str, Manifest],
-    last: LastRun | None,
-) -> None:
+def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
     """Write the page and all that it needs into ``folder``."""
     run = planner.run.folder
     set_threads(planner.threads)

@@ -9,7 +9,8 @@ import shutil
 from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -24,11 +25,13 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
-from cleargs.report import facts, verdict
+from cleargs.report import facts
 from cleargs.report.charts import weight_colour
+from cleargs.report.frame_strip import UNPLACED
 from cleargs.report.html import json_in_html
 from cleargs.report.page import write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
+from cleargs.report.verdict import judge
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
 
 
@@ -156,18 +159,6 @@ def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> 
     assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
 
 
-def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
-    run = FinishedRun(tmp_path)
-    for stage in ("g0", "rivr", "consolidate"):
-        shutil.rmtree(run.folder / stage)
-    with DigestMemo(tmp_path / "digests.sqlite") as memo:
-        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
-    assert "no scene is trained yet" in text and is_current(
-        run.folder, linked_manifests(run.folder, run.dag.names)
-    )
-    assert "none tried" in text and "the restored frame" not in text
-
-
 def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     made = linked_manifest(run.folder, "consolidate")
@@ -217,7 +208,13 @@ def test_weights_run_from_amber_to_teal() -> None:
 
 def test_advice_is_only_what_can_help() -> None:
     def advice(frames: int, available: int, *settings: str) -> list[str]:
-        return list(verdict._closer(frames, available, load_config(installed(), "default", settings)))
+        lost = SimpleNamespace(
+            role=UNPLACED, frame=SimpleNamespace(registered=False), weight=None, blur_px=None
+        )
+        manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
+        rows: Any = [lost] * frames
+        judged = judge(manifests, rows, load_config(installed(), "default", settings))
+        return list(judged.warnings[0].settings)
 
     assert advice(40, 40) == []  # every frame is used, and compared with every other
     assert advice(40, 60) == ["ingest.max_frames=60"]
