@@ -363,7 +363,7 @@ def test_tables_in_figures() -> None:
 def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
     """Python cannot raise KeyboardInterrupt in the call below, which would take hours."""
     program = (
-        "import hashlib; from cleargs.cli.interrupt import answer_signals; answer_signals()\n"
+        "import hashlib; from cleargs.cli.entry import answer_signals; answer_signals()\n"
         "print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'x', b'y', 2**31 - 1)"
     )
     process = subprocess.Popen(
@@ -380,11 +380,11 @@ def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
 
 def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     program = (
-        "import os, signal, time; from cleargs.cli.interrupt import GRACE, answer_signals; answer_signals()\n"
+        "import os, signal, time; from cleargs.cli.entry import GRACE_S, answer_signals; answer_signals()\n"
         "child = os.fork()\n"
         "if child == 0: time.sleep(60); os._exit(0)\n"
         "time.sleep(0.2); os.kill(child, signal.SIGTERM); os.waitpid(child, 0)\n"
-        "time.sleep(GRACE + 0.5); print('alive')"
+        "time.sleep(GRACE_S + 0.5); print('alive')"
     )
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout == "alive\n", done.stderr
@@ -393,7 +393,7 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
 def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
     """Slurm's SIGTERM before a time limit is not for the stage: its watcher ends it behind a checkpoint."""
     program = (
-        "import os, signal; from cleargs.cli.interrupt import answer_signals\n"
+        "import os, signal; from cleargs.cli.entry import answer_signals\n"
         "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); answer_signals()\n"
         "os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )
