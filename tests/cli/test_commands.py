@@ -18,7 +18,7 @@ from toy import Bench
 from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.outcome import print_outcomes
-from cleargs.cli.progress_bars import LineTask
+from cleargs.cli.progress_bars import LineReporter
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.parquet import column
 from cleargs.pipeline.runner import Outcome
@@ -463,12 +463,12 @@ def test_the_time_left_counts_from_the_first_step_on(
     """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    task = LineTask("G0", 1000)
-    for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
-        clock[0] = now
-        task.update(done=done)
+    with LineReporter().task("G0", 1000) as task:
+        for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
+            clock[0] = now
+            task.update(done=done)
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left"]
+    assert lines == ["G0: 1/1000", "G0: 101/1000, 180 s left", "G0: done in 120.0 s"]
 
 
 def test_the_time_left_follows_the_work_where_steps_differ(
@@ -477,11 +477,11 @@ def test_the_time_left_follows_the_work_where_steps_differ(
     """Half of the steps may be a quarter of the work: a training's last steps have the most Gaussians."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    task = LineTask("G0", 1000)
-    for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
-        clock[0] = now
-        task.update(done=done, share=share)
-    assert capsys.readouterr().err.splitlines()[-1] == "G0: 500/1000, 30 s left"
+    with LineReporter().task("G0", 1000) as task:
+        for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
+            clock[0] = now
+            task.update(done=done, share=share)
+    assert "G0: 500/1000, 30 s left" in capsys.readouterr().err.splitlines()
 
 
 def test_a_gpu_that_is_not_used_is_told_of(
