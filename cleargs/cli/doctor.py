@@ -17,6 +17,7 @@ from cleargs.cli.common import json_option, print_json
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 from cleargs.splat.kernels.memory import available_memory
+from cleargs.splat.pace import remembered_pace
 
 LIBRARIES = (
     "torch",

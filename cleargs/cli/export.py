@@ -12,7 +12,6 @@ from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.manifest import linked_manifest
 from cleargs.pipeline.session import SCENE, scene_stage
 
 MODEL = "colmap/sparse/0"
@@ -108,10 +107,9 @@ def export(
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
-    from cleargs.capture.model import read_model, write_model
-    from cleargs.capture.moved import moved
+    from cleargs.capture.model import moved, read_model, write_model
+    from cleargs.capture.poses import Similarity
     from cleargs.capture.tables import load_frames, load_points
-    from cleargs.capture.world import Similarity
     from cleargs.files import write_json
     from cleargs.splat.camera import cameras_json
     from cleargs.splat.ply import read_ply

@@ -94,8 +94,8 @@ def cli(debug: bool) -> None:
     """
 
 
-def main(arguments: Sequence[str] | None = None, dag: Dag | None = None) -> None:
-    """Run the command line and exit. ``dag`` replaces the installed stages (tests)."""
+def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
+    """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages (tests)."""
     from cleargs.cli.entry import answer_signals, protect_streams
 
     protect_streams()

@@ -12,7 +12,7 @@ import click
 from cleargs.cli.common import print_json
 from cleargs.cli.show import line_table, print_table, text_of
 from cleargs.errors import InputError
-from cleargs.pipeline.manifest import Manifest
+from cleargs.manifest import Manifest
 
 if TYPE_CHECKING:
     from cleargs.report.frame_strip import FrameRow

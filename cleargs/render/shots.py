@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import rigid_pose
+from cleargs.capture.poses import Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest

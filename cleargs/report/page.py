@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
-from cleargs.pipeline.manifest import Manifest
+from cleargs.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
 from cleargs.report.frame_pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures

@@ -22,9 +22,9 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from cleargs.errors import InputError
+from cleargs.manifest import plain_json
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import at_work, preview_of
-from cleargs.pipeline.manifest import plain_json
 from cleargs.pipeline.run_file import Run
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 

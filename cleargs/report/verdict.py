@@ -12,7 +12,6 @@ from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
-from cleargs.pipeline.manifest import Manifest
 from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow, last_scene
 from cleargs.report.words import count, decibel
 

@@ -20,6 +20,7 @@ from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.outcome import print_outcomes
 from cleargs.cli.progress_bars import LineReporter
 from cleargs.cli.show import describe_table, sampled_rows
+from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
 from cleargs.pipeline.runner import Outcome
 
@@ -209,18 +210,19 @@ def test_show(shell: Shell) -> None:
     code, out, _ = shell("show", folder)
     assert code == 0 and "complete" in out and "total 55" in out
     assert json.loads(shell("show", folder, "square", "--json")[1])["summary"] == {"total": 55}
-    shell(
-        "run", str(shell.bench.capture), "-o", f"{folder}-2", "--workflow", shell.recipe, "--until", "count"
-    )
-    out = shell("show", f"{folder}-2")[1]
-    rows = [line.split()[:2] for line in out.splitlines()[1:4]]
+
+
+def test_show_and_status_after_a_change(shell: Shell) -> None:
+    shell.run()
+    again(shell, "--set", "square.power=3", "--until", "count")
+    folder = str(shell.bench.folder)
+    rows = [line.split()[:2] for line in shell("show", folder)[1].splitlines()[1:4]]
     assert rows == [["count", "complete"], ["square", "not"], ["total", "not"]]
-    assert f"not done: see cleargs status {folder}-2" in out
-    assert json.loads(shell("show", f"{folder}-2", "--json")[1])["square"] is None
-    assert "square is not done" in shell("show", f"{folder}-2", "square")[2]
-    assert shell("show", folder, "sqare")[2].startswith(
-        "error: there is no stage 'sqare'\nhint: did you mean"
-    )
+    assert "square       missing  setting square.power: 2 -> 3" in shell("status", folder)[1]
+    assert f"not done: see cleargs status {folder}" in shell("show", folder)[1]
+    assert json.loads(shell("show", folder, "--json")[1])["square"] is None
+    code, _, err = shell("show", folder, "square")
+    assert code == 2 and f"see cleargs status {folder}" in err
 
 
 def test_gc(shell: Shell) -> None:

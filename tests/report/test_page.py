@@ -159,6 +159,18 @@ def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> 
     assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
 
 
+def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
+    run = FinishedRun(tmp_path)
+    for stage in ("g0", "rivr", "consolidate"):
+        shutil.rmtree(run.folder / stage)
+    with DigestMemo(tmp_path / "digests.sqlite") as memo:
+        text = write_report(run.planner(Store(tmp_path, memo))).read_text()
+    assert "no scene is trained yet" in text and is_current(
+        run.folder, linked_manifests(run.folder, run.dag.names)
+    )
+    assert "none tried" in text and "the restored frame" not in text
+
+
 def test_a_run_without_a_repair_claims_none(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     made = linked_manifest(run.folder, "consolidate")
