@@ -20,9 +20,9 @@ from cleargs.files import atomic_path
 from cleargs.media.image import read_rgb
 from cleargs.parquet import read_table
 from cleargs.rva.allocation import Role, effective_sample_size
+from cleargs.rva.assessment import poses_from
 from cleargs.rva.geometry import camera_centres, view_directions
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.rva.tabulate import poses_from
 
 Row = Mapping[str, Any]
 """Of rva/frames.parquet."""

@@ -11,7 +11,6 @@ import socket
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict
 from functools import partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -148,7 +147,7 @@ class _Handler(SimpleHTTPRequestHandler):
             stages.append({"name": name, "state": state, "seconds": seconds})
         return {
             "name": run.folder.name,
-            "now": None if work is None else asdict(work),
+            "now": None if work is None else work.model_dump(),
             "stages": stages,
             "preview": None if preview is None else str(preview.version),
             "report": page_of(run.folder).is_file(),

@@ -15,10 +15,9 @@ from cleargs.capture import tables as ingest
 from cleargs.errors import InputError
 from cleargs.parquet import read_table, write_table
 from cleargs.report.allocation_picture import Row, extremes, plot_allocation
-from cleargs.rva.assessment import Observations, assess
-from cleargs.stages.rva import RvaConfig
+from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from
 from cleargs.rva.tables import BINS, FRAMES
-from cleargs.rva.tabulate import bins_table, frames_table, poses_from
+from cleargs.stages.rva import RvaConfig
 
 COUNT = 12
 UNREGISTERED, HELD_OUT, UNSCORED = 3, 5, 7
