@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 PLOT = "rva-plot.png"
 """The picture of ``--plot`` in the run's folder, unless another is named."""
 
-MAX_COLUMNS = 8
-"""A table of more columns is shown with a line per column."""
-
 MAX_COUNTED = 12
 """A column of words with more different values than this is not counted value by value."""
 
@@ -147,7 +144,6 @@ def show(
         from cleargs.report.allocation_picture import plot_allocation
 
         picture = output or run / PLOT
-        picture.parent.mkdir(parents=True, exist_ok=True)
         plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
@@ -159,18 +155,13 @@ def show(
 
 def _facts(manifest: Manifest) -> dict[str, Any]:
     """The state of a stage as JSON values."""
+    names = ("status", "key", "digest", "started", "seconds", "device", "summary")
     return {
-        "status": manifest.status,
+        **{name: getattr(manifest, name) for name in names},
         "missing": [*manifest.inherited, *manifest.missing],
-        "key": manifest.key,
-        "digest": manifest.digest,
-        "started": manifest.started,
-        "seconds": manifest.seconds,
-        "device": manifest.device,
         "files": len(manifest.files),
         "bytes": manifest.bytes,
         "versions": {**manifest.versions, **manifest.parts.libraries},
-        "summary": manifest.summary,
     }
 
 
@@ -213,8 +204,8 @@ def _show_stage(
         described = {
             name: {"rows": data.num_rows, "columns": describe_table(data)} for name, data in tables.items()
         }
-        facts = {"stage": stage, **_facts(manifest), "tables": described}
-        print_json(facts if frames is None else {**facts, "frames": frames})
+        shown = {} if frames is None else {"frames": frames}
+        print_json({"stage": stage, **_facts(manifest), "tables": described, **shown})
         return
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)
@@ -384,9 +375,9 @@ def _column_table(title: str, data: pa.Table) -> Table:
 
 
 def _row_table(title: str, data: pa.Table, wanted: int) -> Table:
-    names, rows = data.column_names, sampled_rows(data, wanted)
-    table = new_table(*names if len(names) <= MAX_COLUMNS else (), title=title and f"\n{title}")
-    cells = [[text_of(row[name]) for name in names] for row in rows]
-    for line in cells if len(names) <= MAX_COLUMNS else zip(names, *cells, strict=True):
+    """Some rows of a table, one per column of the terminal."""
+    rows = [[text_of(value) for value in row.values()] for row in sampled_rows(data, wanted)]
+    table = new_table(title=title and f"\n{title}")
+    for line in zip(data.column_names, *rows, strict=True):
         table.add_row(*line)
     return table

@@ -75,6 +75,7 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
         for panel, row in zip(line, chosen, strict=False):
             _draw_frame(panel, ingest / frames[row["frame_id"]].image, row)
         line[0].set_ylabel(name, fontsize=11)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
 
