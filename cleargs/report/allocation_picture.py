@@ -63,7 +63,7 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
     heights = [6.0, 2.6 * len(shown)]
     figure = Figure(figsize=(16.0, sum(heights)), dpi=100, layout="constrained")
     figure.suptitle(_headline(rows, covered, title), fontsize=12, parse_math=False)  # names may hold dollars
-    top, bottom = figure.subfigures(2, 1, height_ratios=heights)
+    top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
     grid = top.add_gridspec(2, 2, width_ratios=(1.0, 1.6))
     _draw_plan(top.add_subplot(grid[:, 0]), rows, [frames[row["frame_id"]] for row in rows])
     _draw_along(top.add_subplot(grid[0, 1]), top.add_subplot(grid[1, 1]), rows, frames, covered)

@@ -163,15 +163,16 @@ class Bars(NamedTuple):
 
 def fitted_bars(rows: Sequence[FrameRow]) -> list[Bars]:
     """The figures of each frame's exposure, as far as they are known."""
+    figures: dict[tuple[str, str], list[float | None]] = {
+        ("Motion blur", "px"): [row.blur_px for row in rows],
+        ("Rolling shutter", "px"): [row.skew_px for row in rows],
+        ("Defocus", "px"): [row.formation.get("defocus_px") for row in rows],
+        ("Exposure", "stops"): [row.gain_ev for row in rows],
+    }
     bars = []
-    for title, unit, figure in (
-        ("Motion blur", "px", lambda row: row.blur_px),
-        ("Rolling shutter", "px", lambda row: row.skew_px),
-        ("Defocus", "px", lambda row: row.formation.get("defocus_px")),
-        ("Exposure", "stops", lambda row: row.gain_ev),
-    ):
-        found = [(row.frame.frame_id, figure(row)) for row in rows]
-        known = [(frame_id, float(value)) for frame_id, value in found if value is not None]
+    for (title, unit), found in figures.items():
+        numbered = zip((row.frame.frame_id for row in rows), found, strict=True)
+        known = [(frame_id, float(value)) for frame_id, value in numbered if value is not None]
         if not known:
             continue
         values = np.array([value for _, value in known])
