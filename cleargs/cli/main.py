@@ -96,7 +96,7 @@ def cli(debug: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
     """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages (tests)."""
-    from cleargs.cli.entry import answer_signals, protect_streams
+    from cleargs.cli.terminal import answer_signals, protect_streams
 
     protect_streams()
     given = list(sys.argv[1:] if arguments is None else arguments)

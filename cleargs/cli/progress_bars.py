@@ -82,7 +82,7 @@ class BarReporter:
     def __init__(self) -> None:
         from rich.console import Console
 
-        # Not sys.stderr, which escapes (see `cleargs.cli.entry`): bars move the cursor.
+        # Not sys.stderr, which escapes (see `cleargs.cli.terminal`): bars move the cursor.
         self._console = Console(file=sys.__stderr__)
         self._progress: Progress | None = None
 

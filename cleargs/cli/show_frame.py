@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cleargs.cli.common import print_json
-from cleargs.cli.show import line_table, print_table, text_of
+from cleargs.cli.tables import line_table, print_table, text_of
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 

@@ -365,7 +365,7 @@ def test_tables_in_figures() -> None:
 def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
     """Python cannot raise KeyboardInterrupt in the call below, which would take hours."""
     program = (
-        "import hashlib; from cleargs.cli.entry import answer_signals; answer_signals()\n"
+        "import hashlib; from cleargs.cli.terminal import answer_signals; answer_signals()\n"
         "print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'x', b'y', 2**31 - 1)"
     )
     process = subprocess.Popen(
@@ -382,7 +382,8 @@ def test_interrupt_reaches_a_program_that_is_deep_in_compiled_code() -> None:
 
 def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     program = (
-        "import os, signal, time; from cleargs.cli.entry import GRACE_S, answer_signals; answer_signals()\n"
+        "import os, signal, time; from cleargs.cli.terminal import GRACE_S, answer_signals\n"
+        "answer_signals()\n"
         "child = os.fork()\n"
         "if child == 0: time.sleep(60); os._exit(0)\n"
         "time.sleep(0.2); os.kill(child, signal.SIGTERM); os.waitpid(child, 0)\n"
@@ -395,7 +396,7 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
 def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
     """Slurm's SIGTERM before a time limit is not for the stage: its watcher ends it behind a checkpoint."""
     program = (
-        "import os, signal; from cleargs.cli.entry import answer_signals\n"
+        "import os, signal; from cleargs.cli.terminal import answer_signals\n"
         "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); answer_signals()\n"
         "os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )

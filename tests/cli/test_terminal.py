@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from toy import Bench
 
-from cleargs.cli.entry import EscapingStream
 from cleargs.cli.main import explanation, invoke
 from cleargs.cli.progress_bars import LineReporter
+from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
 from cleargs.text import printable
 
