@@ -189,7 +189,9 @@ def _show_stage(
     lines.append(("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}"))
     print_table(line_table(f"{stage}: {manifest.status}", lines))
     if frames is not None and not columns and rows is None:
+        click.echo()
         table = new_table(*frames[0] if frames else ())
+        table.padding = (0, 1, 0, 0)  # all fits on 80 columns
         for column in table.columns:
             column.no_wrap = column.header != "reason"
         for row in frames:
