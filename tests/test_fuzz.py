@@ -40,7 +40,7 @@ from cleargs.media.video import read_timeline
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.config import read_toml
 from cleargs.progress import SilentReporter
-from cleargs.render.pose_files import read_poses
+from cleargs.render.shots import read_poses
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import read_ply, write_ply

@@ -15,8 +15,8 @@ from benchmarks.images import read_rgb_float
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.references import images_by_stem
 from cleargs.files import atomic_path
+from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
-from cleargs.report.contact import Tile, contact_sheet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -191,8 +191,8 @@ def _cues_of(
 def _write_sheet(path: Path, agreement: Agreement, frames: Sequence[Frame], ingest: Path) -> Path:
     """The frames of the widest gaps, each with what both say of it."""
     from benchmarks.images import read_rgb_float
+    from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
-    from cleargs.report.contact import Tile, contact_sheet
 
     tiles = [
         Tile(

@@ -6,10 +6,9 @@ import os
 import platform
 import shutil
 import tempfile
-from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import click
 
@@ -17,6 +16,7 @@ import cleargs
 from cleargs.cli.common import json_option, print_json
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
+from cleargs.splat.kernels.memory import available_memory
 from cleargs.splat.pace import remembered_pace
 
 LIBRARIES = (
@@ -34,8 +34,7 @@ MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 5.0
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One thing looked at."""
 
     what: str
@@ -51,20 +50,23 @@ def doctor(folder: Path, as_json: bool) -> int:
 
     FOLDER is where runs would be kept. Exit code 1 when something would keep a run from working.
     """
+    obstacle, pace = cuda_obstacle(), remembered_pace()
+    device = f"cpu; {UNUSED_GPU}" if obstacle is None else f"cpu ({obstacle})"
+    speed = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
     findings = [
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
         Finding("cores", "ok", str(usable_cores())),
         _memory(),
         _disk(folder),
-        _device(),
-        _pace(),
+        Finding("device", "note" if obstacle is None else "ok", device),
+        Finding("pace", "ok", speed),
         _writable("runs", folder),
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
         _writable("temporary files", Path(tempfile.gettempdir())),
     ]
     if as_json:
-        print_json([asdict(finding) for finding in findings])
+        print_json([finding._asdict() for finding in findings])
     else:
         for finding in findings:
             click.echo(f"{finding.state:<5} {finding.what:<32} {finding.text}")
@@ -81,12 +83,7 @@ def _library(name: str) -> Finding:
 
 
 def _memory() -> Finding:
-    """Free memory as Linux counts it (what can be had without swapping)."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        available = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) / 1e6
-    except (OSError, StopIteration, ValueError):
-        return Finding("memory", "note", "unknown")
+    available = available_memory() / 1e9
     enough = available >= MIN_MEMORY_GB
     advice = "" if enough else f"; a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size"
     return Finding("memory", "ok" if enough else "note", f"{available:.1f} GB free{advice}")
@@ -97,19 +94,6 @@ def _disk(folder: Path) -> Finding:
     enough = free >= MIN_DISK_GB
     advice = "" if enough else "; cleargs gc frees what no run needs"
     return Finding("disk", "ok" if enough else "note", f"{free:.1f} GB free at {folder.absolute()}{advice}")
-
-
-def _device() -> Finding:
-    obstacle = cuda_obstacle()
-    if obstacle is None:
-        return Finding("device", "note", f"cpu; {UNUSED_GPU}")
-    return Finding("device", "ok", f"cpu ({obstacle})")
-
-
-def _pace() -> Finding:
-    pace = remembered_pace()
-    text = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
-    return Finding("pace", "ok", text)
 
 
 def _writable(what: str, folder: Path) -> Finding:

@@ -92,7 +92,7 @@ def export(
     force: bool,
 ) -> None:
     """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
-    beside it."""
+    next to it."""
     from cleargs.cli.export_pruning import cropped, parse_crop, parse_prune, pruned
     from cleargs.splat.formats import check_options, format_of, padded, write_scene
 
@@ -108,6 +108,7 @@ def export(
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
     from cleargs.capture.model import moved, read_model, write_model
+    from cleargs.capture.poses import Similarity
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.splat.camera import cameras_json
@@ -120,7 +121,13 @@ def export(
     named = [(frame.name, view_of(frame, ingest, 0.0).camera) for frame in posed]
     similarity: dict[str, Any] = {}
     if world == "input":
-        similarity = _similarity(run, dag.names[0])
+        manifest = linked_manifest(run, ingest.name)
+        world_of = Similarity.from_json(manifest and manifest.summary.get("similarity"), ingest)
+        similarity = {
+            "scale": world_of.scale,
+            "rotation": world_of.rotation.T,
+            "translation": world_of.origin,
+        }
     elif up is not None:
         from cleargs.splat.transforms import upright
 
@@ -154,21 +161,3 @@ def export(
         click.echo(remark)
     where = f"{up} is up" if up is not None else f"{world} world"
     click.echo(f"{output}: the scene of {stage}, {scene.gaussians.num} Gaussians, {where}")
-
-
-def _similarity(run: Path, first: str) -> dict[str, Any]:
-    """The similarity from the normalised world back to the input's, as the first stage noted it: scale,
-    rotation [3, 3], translation [3]."""
-    manifest = linked_manifest(run, first)
-    found = manifest.summary.get("similarity") if manifest is not None else None
-    if not isinstance(found, dict):
-        raise InputError(
-            f"{run / first} does not say how it was normalised", hint="run that stage with --force"
-        )
-    import numpy as np
-
-    return {
-        "scale": float(found["scale"]),
-        "rotation": np.array(found["rotation"], dtype=np.float64),
-        "translation": np.array(found["translation"], dtype=np.float64),
-    }

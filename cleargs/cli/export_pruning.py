@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import lt
 from pathlib import Path
 from statistics import fmean
 
@@ -31,10 +32,10 @@ def parse_prune(rules: Sequence[str]) -> dict[str, float]:
     """Least ``opacity`` and least ``contribution``, of those that are given. Raises InputError."""
     thresholds: dict[str, float] = {}
     for rule in rules:
-        kind, value = _parsed(rule, "--prune", PRUNE_HINT)
-        if len(value) != 1 or kind not in ("opacity", "contribution") or kind in thresholds or value[0] < 0:
+        kind, values = _parsed(rule, opacity=1, contribution=1)
+        if not values or kind in thresholds or values[0] < 0:
             raise InputError(f"--prune {rule} cannot be understood", hint=PRUNE_HINT)
-        thresholds[kind] = value[0]
+        thresholds[kind] = values[0]
     return thresholds
 
 
@@ -42,23 +43,21 @@ def parse_crop(rule: str | None) -> tuple[float, ...] | None:
     """The corners of a box (six numbers), or a percentage (one). Raises InputError."""
     if rule is None:
         return None
-    kind, value = _parsed(rule, "--crop", CROP_HINT)
-    box = kind == "box" and len(value) == 6 and all(value[axis] < value[axis + 3] for axis in range(3))
-    if not box and not (kind == "percentile" and len(value) == 1 and 0.0 < value[0] <= 100.0):
+    kind, values = _parsed(rule, box=6, percentile=1)
+    low, high = values[:3], values[3:]
+    if not values or not (all(map(lt, low, high)) if kind == "box" else 0.0 < values[0] <= 100.0):
         raise InputError(f"--crop {rule} cannot be understood", hint=CROP_HINT)
-    return value
+    return values
 
 
-def _parsed(rule: str, option: str, hint: str) -> tuple[str, tuple[float, ...]]:
-    """KIND:NUMBER,NUMBER... in two parts."""
+def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
+    """KIND:NUMBER,NUMBER... in two parts; no numbers where they are not as many as ``counts`` says."""
     kind, _, numbers = rule.partition(":")
     try:
         values = tuple(float(number) for number in numbers.split(","))
     except ValueError:
-        values = (np.nan,)
-    if not np.isfinite(values).all():
-        raise InputError(f"{option} {rule} cannot be understood", hint=hint)
-    return kind, values
+        values = ()
+    return kind, values if len(values) == counts.get(kind) and np.isfinite(values).all() else ()
 
 
 def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str) -> tuple[Scene, str]:

@@ -135,25 +135,18 @@ def print_plans(plans: list[StagePlan], as_json: bool) -> None:
         first, *others = plan.reasons or ("",)
         click.echo(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
         for reason in others:
-            click.echo(f"{'':<12} {'':<8} {reason}")
-    line = cost_line(plans)
-    if line:
+            click.echo(f"{'':<21} {reason}")
+    if line := cost_line(plans):
         click.echo(line)
-
-
-def _plan_json(plan: StagePlan) -> dict[str, Any]:
-    cost = plan.estimate
-    return {
-        "stage": plan.stage,
-        "state": plan.state,
-        "key": plan.key,
-        "reasons": list(plan.reasons),
-        "estimate": None
-        if cost is None
-        else {"minutes": cost.minutes, "memory_gb": cost.memory_gb, "disk_gb": cost.disk_gb},
-    }
 
 
 def duration(seconds: float) -> str:
     """Seconds, or minutes where there are many."""
     return f"{seconds:.1f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
+
+
+def _plan_json(plan: StagePlan) -> dict[str, Any]:
+    figures = ("minutes", "memory_gb", "disk_gb")
+    estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
+    facts = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}
+    return {**facts, "estimate": estimate}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import click
 
@@ -20,10 +20,6 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device, scene_stage
-
-if TYPE_CHECKING:
-    from cleargs.render.output import Kind, Shot
-    from cleargs.render.shots import CaptureShots
 
 SECONDS = 10.0
 """Length of a film, unless told otherwise."""
@@ -130,7 +126,37 @@ def render(
     Without --frame, --turntable and --poses, a film and numbered stills follow the path of the capture, and
     a still is taken in its middle.
     """
-    _check_choices(frame, turntable, poses, world, seconds, side_by_side, output)
+    film, still = output.suffix.lower() == ".mp4", frame is not None
+    for wrong, cause, remedy in (
+        (
+            still + turntable + (poses is not None) > 1,
+            "--frame, --turntable and --poses each say where the camera is",
+            "give one of them",
+        ),
+        (still and film, "--frame is a still", "end --output with .png or .exr, or leave out --frame"),
+        (
+            world is not None and poses is None,
+            "--world describes the poses of a file",
+            "give --poses, or leave it out",
+        ),
+        (
+            seconds is not None and (poses is not None or still),
+            "--seconds is the length of the path or of a turn",
+            "leave it out; --fps sets the pace of --poses",
+        ),
+        (
+            side_by_side and (turntable or poses is not None),
+            "--side-by-side shows frames of the capture, which has none there",
+            "follow the path, or give --frame",
+        ),
+        (
+            side_by_side and output.suffix.lower() == ".exr",
+            "--side-by-side is for films and PNGs",
+            "end --output with .mp4 or .png",
+        ),
+    ):
+        if wrong:
+            raise InputError(cause, hint=remedy)
     from cleargs.render.output import kind_of, require_free, write_shots
 
     kind = kind_of(output)
@@ -145,7 +171,14 @@ def render(
     set_threads(threads_or_all(threads))
     capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)
     count = max(2, round(fps * (seconds or SECONDS)))
-    shots = _shots(capture, kind, frame, turntable, poses, world, count)
+    if poses is not None:
+        shots = capture.poses(poses, world)
+    elif turntable:
+        shots = capture.turntable(count)
+    elif still or kind == "still":
+        shots = capture.still(frame)
+    else:
+        shots = capture.path(count)
     scene = read_ply(run / stage / "scene.ply")
     with reporter.task(f"rendering {output.name}", total=len(shots)) as task:
         write_shots(output, scene, shots, task, fps=fps, codec=codec, device=on)
@@ -157,54 +190,3 @@ def render(
     else:
         pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
         click.echo(f"{output}: {pictures} of {width}x{camera.height} of the scene of {stage}")
-
-
-def _shots(
-    capture: CaptureShots,
-    kind: Kind,
-    frame: int | None,
-    turntable: bool,
-    poses: Path | None,
-    world: Literal["normalised", "input"] | None,
-    count: int,
-) -> list[Shot]:
-    """The shots that the options ask for."""
-    if poses is not None:
-        return capture.poses(poses, world)
-    if turntable:
-        return capture.turntable(count)
-    if frame is not None or kind == "still":
-        return capture.still(frame)
-    return capture.path(count)
-
-
-def _check_choices(
-    frame: int | None,
-    turntable: bool,
-    poses: Path | None,
-    world: str | None,
-    seconds: float | None,
-    side_by_side: bool,
-    output: Path,
-) -> None:
-    """Raise InputError where options contradict each other."""
-    if (frame is not None) + turntable + (poses is not None) > 1:
-        raise InputError(
-            "--frame, --turntable and --poses each say where the camera is", hint="give one of them"
-        )
-    if frame is not None and output.suffix.lower() == ".mp4":
-        raise InputError("--frame is a still", hint="end --output with .png or .exr, or leave out --frame")
-    if world is not None and poses is None:
-        raise InputError("--world describes the poses of a file", hint="give --poses, or leave it out")
-    if seconds is not None and (poses is not None or frame is not None):
-        raise InputError(
-            "--seconds is the length of the path or of a turn",
-            hint="leave it out; --fps sets the pace of --poses",
-        )
-    if side_by_side and (turntable or poses is not None):
-        raise InputError(
-            "--side-by-side shows frames of the capture, which has none there",
-            hint="follow the path, or give --frame",
-        )
-    if side_by_side and output.suffix.lower() == ".exr":
-        raise InputError("--side-by-side is for films and PNGs", hint="end --output with .mp4 or .png")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cleargs.cli.common import json_option, print_json, run_argument
-from cleargs.cli.frame_reasons import COLUMNS, frame_rows, short_name
-from cleargs.cli.manifest_words import headlines, in_words, text_of
-from cleargs.cli.summary import describe_table, sampled_rows
+from cleargs.cli.tables import labelled, line_table, new_table, print_table, text_of
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, linked_manifest
 from cleargs.pipeline.dag import Dag
@@ -19,13 +19,27 @@ from cleargs.pipeline.live import at_work, preview_of
 from cleargs.pipeline.run_file import Run, read_run_file
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-WIDEST = 8
-"""A table of more columns is shown with its rows beside each other."""
+    import pyarrow as pa
+    from rich.table import Table
 
 PLOT = "rva-plot.png"
 """The picture of ``--plot`` in the run's folder, unless another is named."""
+
+MAX_COUNTED = 12
+"""A column of words with more different values than this is not counted value by value."""
+
+HEADLINES = (
+    "frames",
+    "registered",
+    "test",
+    "points",
+    "roles",
+    "gaussians",
+    "psnr_unseen",
+    "repairs",
+    "published",
+)
+"""Figures that the overview of a run shows."""
 
 
 @click.command(
@@ -89,231 +103,193 @@ def show(
         raise InputError(
             "--output names the PNG of --plot or --frame", hint=f"cleargs show {run} rva --plot -o FILE.png"
         )
-    if frame is not None:
-        _show_frame(dag, run, frame, output or run / f"frame-{frame:06d}.png", as_json)
-        return
     settings = read_run_file(run, dag)
-    if stage is None:
-        manifests = {name: linked_manifest(run, name) for name in dag.names}
+    manifests = {name: linked_manifest(run, name) for name in dag.names}
+    done = {name: manifest for name, manifest in manifests.items() if manifest is not None}
+    if frame is not None:
+        from cleargs.cli.show_frame import show_frame
+
+        show_frame(run, done, frame, output or run / f"frame-{frame:06d}.png", as_json)
+    elif stage is None:
         if as_json:
-            print_json({name: _facts(manifest) for name, manifest in manifests.items()})
+            print_json({name: manifest and _facts(manifest) for name, manifest in manifests.items()})
         else:
-            _print_run(manifests)
-            _print_work(settings)
-        return
-    dag.check(stage)
-    manifest = linked_manifest(run, stage)
-    if manifest is None:
+            _print_run(settings, manifests)
+    elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
-    if plot:
-        picture = _plot(run, output or run / PLOT)
+    elif plot:
+        from cleargs.report.allocation_picture import plot_allocation
+
+        picture = output or run / PLOT
+        plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
         if as_json:
             print_json({"stage": stage, "plot": str(picture)})
         else:
             click.echo(f"written: {picture}")
-        return
-    tables = {
-        name: _read(run / stage / name)
-        for name in sorted(manifest.files)
-        if name.endswith(".parquet") and "/" not in name
-    }
-    frames = None
-    if stage == "rva":
-        rivr = run / "rivr" / "selection.parquet"
-        repairs = _read(rivr).to_pylist() if rivr.is_file() else None
-        frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
-    if as_json:
-        shown = {
-            name: {"rows": table.num_rows, "columns": describe_table(table)} for name, table in tables.items()
-        }
-        facts = {"stage": stage, **(_facts(manifest) or {}), "tables": shown}
-        print_json(facts if frames is None else {**facts, "frames": frames})
-        return
-    console = _console()
-    _print_facts(console, manifest)
-    if frames is not None and not columns and rows is None:
-        _print_frames(console, frames)
-        return
-    for name, table in tables.items():
-        wanted = rows if rows is not None else 8 if "step" in table.column_names and not columns else 0
-        if columns:
-            _print_columns(console, name, table)
-        elif wanted and table.num_rows:
-            console.print(f"\n{name}: {table.num_rows} rows")
-        if wanted and table.num_rows:
-            _print_rows(console, table, wanted)
-    if not columns:
-        console.print(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
+    else:
+        _show_stage(run, done, stage, rows, columns, as_json)
 
 
-def _show_frame(dag: Dag, run: Path, frame: int, picture: Path, as_json: bool) -> None:
-    """Print all about one frame, and write the picture of its layers. Raises InputError, StoreError."""
-    from cleargs.cli.show_frame import frame_facts, frame_row, in_lines, write_layers
-
-    made = {name: found for name in dag.names if (found := linked_manifest(run, name)) is not None}
-    if "ingest" not in made:
-        raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
-    row = frame_row(run, made, frame)
-    facts = frame_facts(run, made, row, made["rva"].parts.config if "rva" in made else {})
-    layers = write_layers(picture, run, made, row)
-    if as_json:
-        print_json({**facts, "layers": layers, "picture": str(picture)})
-        return
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, show_header=False, title=f"frame {frame}", title_justify="left")
-    table.add_column(no_wrap=True)
-    for label, text in in_lines(facts, run):
-        table.add_row(label, Text(text))
-    _console().print(table)
-    click.echo(f"written: {picture}")
-
-
-def _plot(run: Path, picture: Path) -> Path:
-    """Draw RUN/rva with the poses and images that it was made from. Raises InputError, StoreError."""
-    from cleargs.report.allocation_picture import load_allocation, plot_allocation
-
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_allocation(picture, load_allocation(run / "rva", run / "ingest"), run.resolve().name)
-    return picture
-
-
-def _read(path: Path) -> Any:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        return pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(
-            f"cannot read {path}: {str(error).splitlines()[0]}",
-            hint="run the same `cleargs run` command again",
-        ) from error
-
-
-def _facts(manifest: Manifest | None) -> dict[str, Any] | None:
-    if manifest is None:
-        return None
+def _facts(manifest: Manifest) -> dict[str, Any]:
+    """The state of a stage as JSON values."""
+    names = ("status", "key", "digest", "started", "seconds", "device", "summary")
     return {
-        "status": manifest.status,
+        **{name: getattr(manifest, name) for name in names},
         "missing": [*manifest.inherited, *manifest.missing],
-        "key": manifest.key,
-        "digest": manifest.digest,
-        "started": manifest.started,
-        "seconds": manifest.seconds,
-        "device": manifest.device,
         "files": len(manifest.files),
         "bytes": manifest.bytes,
         "versions": {**manifest.versions, **manifest.parts.libraries},
-        "summary": manifest.summary,
     }
 
 
-# -- on the terminal ---------------------------------------------------------------------------------------
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(highlight=False, markup=False)  # names may hold brackets
-
-
-def _print_run(manifests: dict[str, Manifest | None]) -> None:
-    from rich.table import Table
-
-    table = Table("stage", "state", "seconds", "MB", "files", "figures", box=None, header_style="bold")
+def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
+    """Print a line per stage, and the present work with its preview."""
+    table = new_table("stage", "state", "seconds", "MB", "files", "figures")
     for name, manifest in manifests.items():
         if manifest is None:
-            table.add_row(name, "not done", "", "", "", "")
+            table.add_row(name, "not done")
             continue
         cells = (f"{manifest.seconds:.1f}", f"{manifest.bytes / 1e6:.1f}", str(len(manifest.files)))
-        table.add_row(name, manifest.status, *cells, headlines(manifest.summary))
-    _console().print(table)
+        found = manifest.summary
+        chosen = {key: found[key] for key in HEADLINES if key in found} or found
+        text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
+        table.add_row(name, manifest.status, *cells, text)
+    print_table(table)
+    if None in manifests.values():
+        click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
+    if work := at_work(run.folder, run.store):
+        count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
+        click.echo(f"\n{work.stage} is at work: {', '.join(filter(None, (work.label, count, work.note)))}")
+        if preview := preview_of(work, run.store):
+            click.echo(f"preview: {preview.path}")
 
 
-def _print_work(run: Run) -> None:
-    """What the run does now, and where the picture of it lies."""
-    found = at_work(run.folder, run.store)
-    if found is None:
+def _show_stage(
+    run: Path, done: Mapping[str, Manifest], stage: str, rows: int | None, columns: bool, as_json: bool
+) -> None:
+    """Print the figures of a stage, and its tables as far as they are asked for."""
+    manifest = done[stage]
+    names = [name for name in sorted(manifest.files) if name.endswith(".parquet") and "/" not in name]
+    tables = {name: _read(run / stage / name) for name in names}
+    frames = None
+    if stage == "rva":
+        from cleargs.cli.show_frame import frame_rows, short_name
+
+        repairs = _read(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
+        frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
+    if as_json:
+        described = {
+            name: {"rows": data.num_rows, "columns": describe_table(data)} for name, data in tables.items()
+        }
+        shown = {} if frames is None else {"frames": frames}
+        print_json({"stage": stage, **_facts(manifest), "tables": described, **shown})
         return
-    count = f"{found.done} of {found.total}" if found.total else str(found.done or "")
-    words = ", ".join(filter(None, (found.label, count, found.note)))
-    console, preview = _console(), preview_of(found, run.store)
-    console.print(f"\n{found.stage} is at work: {words}")
-    if preview is not None:
-        console.print(f"preview: {preview.path}", soft_wrap=True)
+    lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
+    lines += labelled(manifest.summary)
+    lines.append(("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}"))
+    print_table(line_table(f"{stage}: {manifest.status}", lines))
+    if frames is not None and not columns and rows is None:
+        click.echo()
+        table = new_table(*frames[0] if frames else ())
+        table.padding = (0, 1, 0, 0)  # all fits on 80 columns
+        for column in table.columns:
+            column.no_wrap = column.header != "reason"
+        for row in frames:
+            values = (row | {"name": short_name(row["name"])}).values()
+            table.add_row(
+                *(f"{value:.2f}" if isinstance(value, float) else text_of(value) for value in values)
+            )
+        print_table(table)
+        return
+    for name, data in tables.items():
+        wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
+        title = f"{name}: {data.num_rows} rows"
+        if columns:
+            print_table(_column_table(title, data))
+        if wanted and data.num_rows:
+            print_table(_row_table("" if columns else title, data, wanted))
+    if not columns:
+        click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 
 
-def _print_facts(console: Console, manifest: Manifest) -> None:
-    from rich.table import Table
+def _read(path: Path) -> pa.Table:
+    """Return a table of any columns. Raises StoreError when it cannot be read."""
+    import pyarrow.parquet as pq
 
-    table = Table(
-        box=None, show_header=False, title=f"{manifest.stage}: {manifest.status}", title_justify="left"
-    )
-    for missing in (*manifest.inherited, *manifest.missing):
-        table.add_row("missing", missing)
-    for label, text in in_words(manifest.summary):
-        table.add_row(label, text)
-    table.add_row("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}")
-    console.print(table)
+    from cleargs.parquet import damage_told
+
+    with damage_told(path):
+        return pq.read_table(path)
 
 
-def _print_frames(console: Console, frames: list[dict[str, Any]]) -> None:
-    from rich.table import Table
+def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:
+    """Column -> its meaning (from the field's metadata), nulls, and figures that suit its type.
 
-    table = Table(box=None, header_style="bold", padding=(0, 1, 0, 0), pad_edge=False)
-    numbers = ("frame", "weight", "R", "B")
-    for name in COLUMNS:
-        if frames and name in frames[0]:
-            justify: Literal["right", "left"] = "right" if name in numbers else "left"
-            table.add_column(name, justify=justify, no_wrap=name != "reason", overflow="fold")
-    for row in frames:
-        values = (row | {"name": short_name(row["name"])}).values()
-        table.add_row(*(f"{value:.2f}" if isinstance(value, float) else text_of(value) for value in values))
-    console.print()
-    console.print(table)
+    Words and booleans: ``counts`` of each value, most frequent first (``distinct`` where there are many, or
+    where every row has its own).
+    Numbers: ``min``, ``median``, ``mean``, ``max`` over the values that are neither null nor NaN.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    described: dict[str, dict[str, Any]] = {}
+    for field in table.schema:
+        facts: dict[str, Any] = {"type": str(field.type), "nulls": table[field.name].null_count}
+        if meaning := (field.metadata or {}).get(b"meaning"):
+            facts["meaning"] = meaning.decode()
+        values = table[field.name].drop_null()
+        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
+            finite = values.filter(pc.is_finite(values))
+            if len(finite):
+                facts |= pc.min_max(finite).as_py()
+                facts |= {"median": pc.quantile(finite, q=0.5)[0].as_py(), "mean": pc.mean(finite).as_py()}
+            else:
+                facts["distinct"] = 0
+        else:
+            counts = Counter(map(_word, values.to_pylist()))
+            if len(counts) > MAX_COUNTED or 2 < len(counts) == len(values) or pa.types.is_list(field.type):
+                facts["distinct"] = len(counts)
+            else:
+                facts["counts"] = dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+        described[field.name] = facts
+    return described
 
 
-def _print_columns(console: Console, name: str, data: Any) -> None:
-    from rich.table import Table
+def _word(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
-    table = Table(
-        "column",
-        "min .. median .. max, or counts",
-        "meaning",
-        box=None,
-        header_style="bold",
-        title_justify="left",
-    )
-    table.title = f"\n{name}: {data.num_rows} rows"
+
+def sampled_rows(table: pa.Table, wanted: int) -> list[dict[str, Any]]:
+    """``wanted`` rows (at most), evenly spread, the first and the last among them; the last for one."""
+    last = table.num_rows - 1
+    steps = min(wanted, table.num_rows) - 1
+    rows: list[dict[str, Any]] = table.take(
+        [round(index * last / steps) for index in range(steps + 1)] if steps > 0 else [last]
+    ).to_pylist()
+    return rows
+
+
+# -- on the terminal -----------------------------------------------------------------------------------------
+
+
+def _column_table(title: str, data: pa.Table) -> Table:
+    table = new_table("column", "min .. median .. max, or counts", "meaning", title=f"\n{title}")
     for column, facts in describe_table(data).items():
-        table.add_row(column, _describe(facts), facts.get("meaning", ""))
-    console.print(table)
+        if "counts" in facts:
+            words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
+        elif "median" in facts:
+            words = " .. ".join(text_of(facts[name]) for name in ("min", "median", "max"))
+        else:
+            words = f"{facts['distinct']} different"
+        empty = f", {facts['nulls']} empty" if facts["nulls"] else ""
+        table.add_row(column, words + empty, facts.get("meaning", ""))
+    return table
 
 
-def _print_rows(console: Console, data: Any, wanted: int) -> None:
-    from rich.table import Table
-
-    names = data.column_names
-    rows = sampled_rows(data, wanted)
-    if len(names) <= WIDEST:
-        table = Table(*names, box=None, header_style="bold")
-        for row in rows:
-            table.add_row(*(text_of(row[name]) for name in names))
-    else:
-        table = Table(box=None, show_header=False)
-        table.add_column(no_wrap=True)
-        for name in names:
-            table.add_row(name, *(text_of(row[name]) for row in rows))
-    console.print(table)
-
-
-def _describe(facts: dict[str, Any]) -> str:
-    if "counts" in facts:
-        words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
-    elif "median" in facts:
-        words = f"{text_of(facts['min'])} .. {text_of(facts['median'])} .. {text_of(facts['max'])}"
-    else:
-        words = f"{facts['distinct']} different"
-    return f"{words}, {facts['nulls']} empty" if facts["nulls"] else words
+def _row_table(title: str, data: pa.Table, wanted: int) -> Table:
+    """Some rows of a table, one per column of the terminal."""
+    rows = [[text_of(value) for value in row.values()] for row in sampled_rows(data, wanted)]
+    table = new_table(title=title and f"\n{title}")
+    for line in zip(data.column_names, *rows, strict=True):
+        table.add_row(*line)
+    return table

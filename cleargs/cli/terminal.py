@@ -1,15 +1,60 @@
-"""Standard output and error as all commands write to them: no text from a file steers the terminal."""
+"""Signals and standard streams of the process that runs a command."""
 
 from __future__ import annotations
 
 import io
+import os
 import re
+import signal
 import sys
+import threading
+import time
+from types import FrameType
 
 from cleargs.text import printable
 
-_COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")
-"""What our own tables are coloured with. It changes how the text after it looks, and nothing else."""
+GRACE_S = 1.0
+"""Time that the ordinary way out may take after a signal."""
+
+INTERRUPTED = "interrupted; finished work is kept, and the same command resumes from there"
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")  # of our own tables: it changes how the text after it looks
+
+
+def answer_signals() -> None:
+    """Turn SIGINT and SIGTERM into KeyboardInterrupt, with a way out for when Python cannot raise it.
+
+    Python raises it only between two of its instructions, so a long call into compiled code would delay
+    it. A waiting thread then ends the process after `GRACE_S`. That is safe for the results: they survive
+    kill -9 at any moment.
+    """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    def restore() -> None:
+        # A forked child shares the pipe: without this, ending it would end us.
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def end_after_signal() -> None:
+        while True:
+            if not set(_SIGNALS).isdisjoint(os.read(reader, 16)):
+                time.sleep(GRACE_S)
+                os.write(2, f"{INTERRUPTED}\n".encode())
+                os._exit(130)
+
+    # A signal waits until all is in place. What was blocked before stays blocked.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    os.register_at_fork(after_in_child=restore)
+    for number in _SIGNALS:
+        signal.signal(number, interrupt)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=end_after_signal, name="interrupt", daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class EscapingStream(io.TextIOWrapper):
@@ -17,6 +62,16 @@ class EscapingStream(io.TextIOWrapper):
 
     Lines, tabs and colours stay. A character that the stream's encoding lacks is shown in the same way.
     """
+
+    def __init__(self, stream: io.TextIOWrapper) -> None:
+        stream.flush()
+        super().__init__(
+            stream.buffer,
+            stream.encoding,
+            "backslashreplace",
+            line_buffering=stream.line_buffering,
+            write_through=stream.write_through,
+        )
 
     def write(self, text: str) -> int:
         parts = _COLOUR.split(text)
@@ -27,18 +82,7 @@ class EscapingStream(io.TextIOWrapper):
 
 def protect_streams() -> None:
     """Let ``sys.stdout`` and ``sys.stderr`` escape; streams that somebody else put there are left alone."""
-    if isinstance(sys.__stdout__, io.TextIOWrapper) and sys.stdout is sys.__stdout__:
-        sys.stdout = _escaping(sys.__stdout__)
-    if isinstance(sys.__stderr__, io.TextIOWrapper) and sys.stderr is sys.__stderr__:
-        sys.stderr = _escaping(sys.__stderr__)
-
-
-def _escaping(stream: io.TextIOWrapper) -> io.TextIOWrapper:
-    stream.flush()
-    return EscapingStream(
-        stream.buffer,
-        encoding=stream.encoding,
-        errors="backslashreplace",
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, f"__{name}__")
+        if isinstance(stream, io.TextIOWrapper) and getattr(sys, name) is stream:
+            setattr(sys, name, EscapingStream(stream))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import click
 
@@ -17,8 +17,13 @@ from cleargs.pipeline.run_file import Run, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import Store
 
-Fault = tuple[Literal["damaged", "changed"], str, str]
-"""A damaged result or a changed input, the stage, and what is wrong."""
+
+class Fault(NamedTuple):
+    """A damaged result or a changed input."""
+
+    kind: Literal["damaged", "changed"]
+    stage: str
+    what: str
 
 
 @click.command(
@@ -52,27 +57,23 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                 manifest = read_manifest(folder)
             except (OSError, ValueError) as error:
                 text = "it is no longer in the store" if isinstance(error, OSError) else str(error)
-                faults.append(("damaged", name, text))
+                faults.append(Fault("damaged", name, text))
                 continue
             files += len(manifest.files)
             place = folder.resolve()
-            for line in damages(place, manifest, manifest.files, opened.memo, afresh=True):
-                faults.append(("damaged", name, line))
+            lines = damages(place, manifest, manifest.files, opened.memo, afresh=True)
+            faults += [Fault("damaged", name, line) for line in lines]
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:
         raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
     if as_json:
-        names = ("kind", "stage", "what")
-        faults_json = [dict(zip(names, fault, strict=True)) for fault in faults]
-        print_json({"stages": stages, "files": files, "faults": faults_json})
+        print_json({"stages": stages, "files": files, "faults": [fault._asdict() for fault in faults]})
     else:
         for kind, stage, text in faults:
             click.echo(f"{kind:<8} {stage:<12} {text}")
-        count = f"{len(faults)} faults" if len(faults) != 1 else "1 fault"
-        click.echo(
-            f"{files} files of {len(stages)} stages read: {count if faults else 'all as they were made'}"
-        )
-    if any(kind == "damaged" for kind, _, _ in faults):
+        found = {0: "all as they were made", 1: "1 fault"}.get(len(faults), f"{len(faults)} faults")
+        click.echo(f"{files} files of {len(stages)} stages read: {found}")
+    if any(fault.kind == "damaged" for fault in faults):
         click.echo(f"hint: `cleargs run {settings.source} -o {run}` makes damaged results again", err=True)
     return 1 if faults else 0
 
@@ -86,16 +87,16 @@ def _changed_inputs(dag: Dag, run: Run, store: Store, manifest: Manifest) -> Ite
             continue  # the stage was made with other settings, which `cleargs status` tells
         files = named_files(place)
         for name in sorted(before.keys() | files.keys()):
-            label = f"{role} {name}".rstrip()
+            change = None
             if name not in files:
-                yield "changed", stage, f"{label} is missing"
-                continue
-            try:
-                now = store.memo.digests_of(files[name], afresh=True)[""]
-            except InputError as error:
-                yield "changed", stage, f"{label}: {error}"
-                continue
-            if name not in before:
-                yield "changed", stage, f"{label} is new"
-            elif now != before[name]:
-                yield "changed", stage, f"{label} has other content"
+                change = " is missing"
+            elif name not in before:
+                change = " is new"
+            else:
+                try:
+                    if store.memo.digests_of(files[name], afresh=True)[""] != before[name]:
+                        change = " has other content"
+                except InputError as error:
+                    change = f": {error}"
+            if change:
+                yield Fault("changed", stage, f"{role} {name}".rstrip() + change)

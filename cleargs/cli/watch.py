@@ -45,10 +45,8 @@ checkpoint; it renews itself. Afterwards it shows the report.
 def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None:
     """Serve the report of RUN, and how far it is while it is at work, until Ctrl-C."""
     from cleargs.report.serve import Server
-    from cleargs.report.watched_run import Watched
 
-    watched = Watched(dag, read_run_file(run, dag, store=store))
-    with Server(watched, host, port) as server:
+    with Server(dag, read_run_file(run, dag, store=store), host, port) as server:
         if not _is_loopback(host):
             click.echo(f"warning: whoever reaches {host} can read the report of this run", err=True)
         click.echo(f"{server.address}  (Ctrl-C ends it)")

@@ -28,8 +28,6 @@ from cleargs.splat.types import Render
 Kind = Literal["film", "still", "folder"]
 Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
 
-_FILM = frozenset({".mp4"})
-_STILLS = frozenset({".png", ".exr"})
 _NUMBER = re.compile(r"%0?\d*d")
 _OPAQUE = 1 / 255
 """Alpha from which a pixel has a depth."""
@@ -58,9 +56,14 @@ class Photographer:
             return rendered
         return np.concatenate([_fitted(read_rgb(shot.filmed), *rendered.shape[:2]), rendered], axis=1)
 
-    def write_layers(self, path: Path, shot: Shot) -> None:
-        """The view over black with its alpha and the mean depth along the optical axis in world units, 0
-        where nothing is seen."""
+    def write(self, path: Path, shot: Shot) -> None:
+        """Write a still: a PNG of `picture`, or an EXR of the view over black.
+
+        The EXR has alpha, and the mean depth along the optical axis in world units, 0 where nothing is seen.
+        """
+        if path.suffix.lower() != ".exr":
+            write_rgb(path, self.picture(shot))
+            return
         render = self._render(shot.camera, (0.0, 0.0, 0.0), depth=True)
         assert render.depth is not None
         image, alpha, depth = (layer.cpu().numpy() for layer in (render.image, render.alpha, render.depth))
@@ -79,11 +82,11 @@ def kind_of(output: Path) -> Kind:
 
     Raises InputError for any other.
     """
-    suffix = output.suffix.lower()
-    if suffix in _FILM and not _NUMBER.search(output.name):
+    suffix, numbers = output.suffix.lower(), len(_NUMBER.findall(output.name))
+    if suffix == ".mp4" and not numbers:
         return "film"
-    if suffix in _STILLS and len(_NUMBER.findall(output.name)) < 2:
-        return "folder" if _NUMBER.search(output.name) else "still"
+    if suffix in (".png", ".exr") and numbers < 2:
+        return "folder" if numbers else "still"
     raise InputError(
         f"{output} has no ending that says what to write",
         hint="end it with .mp4 (a film), .png or .exr (a still); FOLDER/%04d.png numbers stills",
@@ -123,40 +126,33 @@ def write_shots(
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(error, output) from error
+
+    def pictures() -> Iterator[Picture]:
+        for shot in shots:
+            yield photographer.picture(shot)
+            task.advance()
+
     if kind == "film":
-        write_video(output, _each(photographer, shots, task), fps, codec=codec)
+        write_video(output, pictures(), fps, codec=codec)
     elif kind == "still":
-        _write_still(output, photographer, shots[0])
+        photographer.write(output, shots[0])
         task.advance()
     else:
         _write_folder(output, photographer, shots, task)
 
 
-def _each(photographer: Photographer, shots: Sequence[Shot], task: Task) -> Iterator[Picture]:
-    for shot in shots:
-        yield photographer.picture(shot)
-        task.advance()
-
-
-def _write_still(path: Path, photographer: Photographer, shot: Shot) -> None:
-    if path.suffix.lower() == ".exr":
-        photographer.write_layers(path, shot)
-    else:
-        write_rgb(path, photographer.picture(shot))
-
-
 def _write_folder(output: Path, photographer: Photographer, shots: Sequence[Shot], task: Task) -> None:
-    """The stills in a folder beside its place, renamed when all are there."""
+    """Write stills into a folder next to its place, and rename it when all are there."""
     folder = output.parent
     temporary = folder.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{folder.name}")
     (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
-    names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
+    named = [(f"{before}{digits % number}{after}", shot) for number, shot in enumerate(shots)]
     try:
         temporary.mkdir()
-        for name, shot in zip(names, shots, strict=True):
-            _write_still(temporary / name, photographer, shot)
+        for name, shot in named:
+            photographer.write(temporary / name, shot)
             task.advance()
-        cameras = cameras_json([(name, shot.camera) for name, shot in zip(names, shots, strict=True)])
+        cameras = cameras_json([(name, shot.camera) for name, shot in named])
         write_json(temporary / "cameras.json", cameras)
         sync_tree(temporary)
         temporary.rename(folder)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import pyarrow as pa
 
 from cleargs.parquet import read_table
 from cleargs.report.frame_strip import FrameRow
@@ -21,24 +21,22 @@ _POINTS = 120  # of a curve
 _LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
 
 
-@dataclass(frozen=True)
-class Tick:
-    """A label on an axis, and where it stands."""
+class Tick(NamedTuple):
+    """A label on an axis, and its position."""
 
     at: float
     label: str
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """One figure over all steps of all trainings."""
 
     title: str
     unit: str
     path: str
     """Of an SVG path, in `WIDTH` x `HEIGHT`."""
-    ticks: tuple[Tick, ...]
-    parts: tuple[Tick, ...]
+    ticks: list[Tick]
+    parts: list[Tick]
     """Where each training starts."""
     steps: int
     first: str
@@ -47,70 +45,39 @@ class Curve:
 
 def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
     """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError."""
-    tables, parts, offset = [], [], 0
-    for stage in stages:
-        path = run / stage / "train.parquet"
-        rows = read_table(path, TRAIN) if path.is_file() else None
-        if rows is not None and rows.num_rows:
-            parts.append((offset, stage))
-            tables.append(rows)
-            offset += rows.num_rows
+    paths = {stage: run / stage / "train.parquet" for stage in stages}
+    tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
+    tables = {stage: table for stage, table in tables.items() if table.num_rows}
     if not tables:
         return []
-
-    def joined(name: str) -> NDArray[np.float64]:
-        return np.concatenate([table[name].to_numpy().astype(np.float64) for table in tables])
-
-    real = np.concatenate([np.array(table["kind"].to_pylist()) == "real" for table in tables])
-    marks = tuple(Tick(start / offset * WIDTH, stage) for start, stage in parts)
+    steps = pa.concat_tables(tables.values())
+    real = np.array(steps["kind"].to_pylist()) == "real"
+    starts = np.cumsum([0, *(table.num_rows for table in tables.values())])
+    parts = [Tick(start / len(real) * WIDTH, stage) for start, stage in zip(starts, tables, strict=False)]
 
     def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> Curve:
-        values = joined(name)
-        known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(offset)
-        return _curve(title, unit, known, values[known], offset, marks, digits)
+        values = steps[name].to_numpy().astype(np.float64)
+        known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(len(values))
+        # Medians of equal stretches: a step shows one view, and views differ more than steps do.
+        stretches = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
+        x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
+        y = np.array([np.median(values[part]) for part in stretches])
+        ticks = _nice(float(y.min()), float(y.max()))
+        low, high = min(ticks[0], float(y.min())), max(ticks[-1], float(y.max()))
+
+        def height(value: float) -> float:
+            return HEIGHT * (1.0 - (value - low) / ((high - low) or 1.0))
+
+        path = "M" + " L".join(f"{a:.1f},{height(float(b)):.1f}" for a, b in zip(x, y, strict=True))
+        labels = [Tick(height(tick), f"{tick:,g}") for tick in ticks]
+        first, last = (f"{float(value):,.{digits}f}" for value in (y[0], y[-1]))
+        return Curve(title, unit, path, labels, parts, len(values), first, last)
 
     return [
         curve("PSNR of the frames trained on", "dB", "psnr", 1, only_real=True),
         curve("Loss", "", "loss", 3, only_real=True),
         curve("Gaussians", "", "n_gaussians", 0, only_real=False),
     ]
-
-
-def _curve(
-    title: str,
-    unit: str,
-    steps: NDArray[np.int64],
-    values: NDArray[np.float64],
-    total: int,
-    parts: tuple[Tick, ...],
-    digits: int,
-) -> Curve:
-    """Medians of equal stretches: a step shows one view, and views differ more than steps do."""
-    stretches = np.array_split(np.arange(len(steps)), min(_POINTS, max(1, len(steps) // 6)))
-    x = np.array([steps[part].mean() for part in stretches]) / max(total - 1, 1) * WIDTH
-    y = np.array([np.median(values[part]) for part in stretches])
-    ticks = _nice(float(y.min()), float(y.max()))
-    low, high = min(ticks[0], float(y.min())), max(ticks[-1], float(y.max()))
-    span = (high - low) or 1.0
-
-    def height(value: float) -> float:
-        return HEIGHT * (1.0 - (value - low) / span)
-
-    points = [f"{a:.1f},{height(float(b)):.1f}" for a, b in zip(x, y, strict=True)]
-
-    def text(value: float) -> str:
-        return f"{value:,.{digits}f}"
-
-    return Curve(
-        title,
-        unit,
-        "M" + " L".join(points),
-        tuple(Tick(height(tick), f"{tick:,g}") for tick in ticks),
-        parts,
-        total,
-        text(float(y[0])),
-        text(float(y[-1])),
-    )
 
 
 def _nice(low: float, high: float) -> list[float]:
@@ -123,8 +90,7 @@ def _nice(low: float, high: float) -> list[float]:
     return [round(float(index * step), 10) for index in np.arange(first, last + 1)]
 
 
-@dataclass(frozen=True)
-class Mark:
+class Mark(NamedTuple):
     """A camera from above."""
 
     frame_id: int
@@ -137,14 +103,13 @@ class Mark:
     active: bool
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """The trajectory from above, in units of its SVG."""
 
     width: float
     height: float
     path: str
-    marks: tuple[Mark, ...]
+    marks: list[Mark]
 
 
 def weight_colour(weight: float) -> str:
@@ -181,16 +146,15 @@ def plan_of(rows: Sequence[FrameRow]) -> Plan | None:
         for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
     ]
     path = "M" + " L".join(f"{mark.x},{mark.y}" for mark in marks)
-    return Plan(float(size[0]) + 120.0, height + 120.0, path, tuple(marks))
+    return Plan(float(size[0]) + 120.0, height + 120.0, path, marks)
 
 
-@dataclass(frozen=True)
-class Bars:
+class Bars(NamedTuple):
     """One figure a frame."""
 
     title: str
     unit: str
-    values: tuple[tuple[int, float], ...]
+    values: list[tuple[int, float]]
     """Frame id and value."""
     low: float
     high: float
@@ -198,37 +162,23 @@ class Bars:
 
 
 def fitted_bars(rows: Sequence[FrameRow]) -> list[Bars]:
-    """What was found out about each frame's exposure, as far as it was."""
-    figures: list[tuple[str, str, dict[int, float | None], bool]] = [
-        ("Motion blur", "px", {row.frame.frame_id: row.blur_px for row in rows}, False),
-        ("Rolling shutter", "px", {row.frame.frame_id: _skew(row) for row in rows}, False),
-        ("Defocus", "px", {row.frame.frame_id: row.formation.get("defocus_px") for row in rows}, False),
-        ("Exposure", "stops", {row.frame.frame_id: row.gain_ev for row in rows}, True),
-    ]
+    """The figures of each frame's exposure, as far as they are known."""
+    figures: dict[tuple[str, str], list[float | None]] = {
+        ("Motion blur", "px"): [row.blur_px for row in rows],
+        ("Rolling shutter", "px"): [row.skew_px for row in rows],
+        ("Defocus", "px"): [row.formation.get("defocus_px") for row in rows],
+        ("Exposure", "stops"): [row.gain_ev for row in rows],
+    }
     bars = []
-    for title, unit, found, signed in figures:
-        known = {frame_id: float(value) for frame_id, value in found.items() if value is not None}
+    for (title, unit), found in figures.items():
+        numbered = zip((row.frame.frame_id for row in rows), found, strict=True)
+        known = [(frame_id, float(value)) for frame_id, value in numbered if value is not None]
         if not known:
             continue
-        values = np.array(list(known.values()))
-        summary = (
-            f"from {values.min():+.2f} to {values.max():+.2f} {unit}"
-            if signed
-            else f"median {np.median(values):.1f} {unit}, at most {values.max():.1f} {unit}"
-        )
-        bars.append(
-            Bars(
-                title,
-                unit,
-                tuple(known.items()),
-                min(0.0, float(values.min())),
-                max(float(values.max()), 0.0) or 1.0,
-                summary,
-            )
-        )
+        values = np.array([value for _, value in known])
+        summary = f"median {np.median(values):.1f} {unit}, at most {values.max():.1f} {unit}"
+        if unit == "stops":
+            summary = f"from {values.min():+.2f} to {values.max():+.2f} {unit}"
+        low, high = min(0.0, float(values.min())), max(float(values.max()), 0.0) or 1.0
+        bars.append(Bars(title, unit, known, low, high, summary))
     return bars
-
-
-def _skew(row: FrameRow) -> float | None:
-    found = row.formation.get("skew_px")
-    return found if found is not None else row.selection.skew_px if row.selection else None

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import tomli_w
 from pydantic import BaseModel
@@ -21,8 +20,7 @@ from cleargs.report.words import duration, size
 STATES = {"done": "up to date", "partial": "done in part", "missing": "to be made"}
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """A setting that is not its default."""
 
     name: str
@@ -31,8 +29,7 @@ class Setting:
     meaning: str
 
 
-@dataclass(frozen=True)
-class StageRow:
+class StageRow(NamedTuple):
     """What one stage cost, and whether its results are those of today's settings and input."""
 
     name: str

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -39,8 +39,7 @@ RenderFrame = Callable[[FrameRow, int], Image]
 """The final scene at a frame, at most so many pixels long."""
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture of the report, with the size it has."""
 
     path: str
@@ -49,8 +48,7 @@ class Picture:
     height: int
 
 
-@dataclass(frozen=True)
-class FramePictures:
+class FramePictures(NamedTuple):
     """The pictures of one frame."""
 
     thumbnail: Picture

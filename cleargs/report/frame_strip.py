@@ -57,8 +57,16 @@ class FrameRow:
     @property
     def blur_px(self) -> float | None:
         """How far the pixels moved while exposed."""
-        found = self.formation.get("blur_px")
-        return found if found is not None else self.selection.blur_px if self.selection else None
+        return self._motion("blur_px")
+
+    @property
+    def skew_px(self) -> float | None:
+        """How far the last line of pixels moved against the first."""
+        return self._motion("skew_px")
+
+    def _motion(self, name: str) -> float | None:
+        found: float | None = self.formation.get(name)
+        return found if found is not None or self.selection is None else getattr(self.selection, name)
 
     @property
     def repair(self) -> str:

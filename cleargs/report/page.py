@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import Manifest
@@ -24,6 +22,7 @@ from cleargs.report.web_scene import (
     level_camera,
     opening,
     viewer_pose,
+    viewer_settings,
     write_scene,
     write_viewer,
 )
@@ -46,8 +45,7 @@ UNCHANGED = "the same scene: no repair changed it"
 """What the second is where it has the bytes of the first."""
 
 
-@dataclass(frozen=True)
-class SceneView:
+class SceneView(NamedTuple):
     """One of the two scenes."""
 
     key: str
@@ -82,30 +80,28 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     return page_of(run)
 
 
-def _fill(
-    folder: Path,
-    planner: Planner,
-    manifests: Mapping[str, Manifest],
-    last: LastRun | None,
-) -> None:
+def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
     """Write the page and all that it needs into ``folder``."""
     run = planner.run.folder
     set_threads(planner.threads)
     trained = [stage for stage in SCENES if stage in manifests]
     final = trained[-1] if trained else None
     rows = load_rows(run, manifests)
-    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, rows)
+    placed = [row for row in rows if row.frame.registered]
+    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None
 
     def render(row: FrameRow, side: int) -> Any:
         camera = camera_of(row.frame)
         assert renderer is not None and exposure is not None  # asked for only where there is a scene
-        shown = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-        return renderer(shown, exposure.of(row.frame.frame_id))
+        smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
+        return renderer(smaller, exposure.of(row.frame.frame_id))
 
-    pictures = write_pictures(
-        rows, run, folder, render if renderer else None, _rendered(rows, renderer), planner.threads
-    )
+    shown = placed[:: -(-len(placed) // RENDERED) or 1] if renderer else []
+    rendered = frozenset(row.frame.frame_id for row in shown)
+    pictures = write_pictures(rows, run, folder, render, rendered, planner.threads)
+    times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
+    meanings = formation_meanings(run, final)
     write_page(
         folder,
         "report.html.jinja",
@@ -128,31 +124,36 @@ def _fill(
         versions=facts.versions(manifests),
         command=facts.command(planner.run, planner.dag),
         layers=LAYERS,
-        aspect=_aspect(rows),
-        data=_data(rows, pictures, scenes, formation_meanings(run, final)),
+        aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
+        data={
+            "layers": LAYERS,
+            "opening": {"left": "observed", "right": "final"},
+            "frames": [
+                _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id), meanings)
+                for row in rows
+            ],
+            "viewer": _viewer_data(placed, scenes) if scenes else None,
+        },
     )
 
 
 def _scenes(
-    folder: Path, run: Path, trained: Mapping[str, Manifest], rows: Sequence[FrameRow]
+    folder: Path, run: Path, trained: Mapping[str, Manifest], placed: Sequence[FrameRow]
 ) -> tuple[list[SceneView], Renderer | None]:
     """Write the first and the last scene, each with a still; and what renders the last."""
-    placed = _placed(rows)
     if not trained or not placed:
         return [], None
-    stages = list(trained)
-    first, last = stages[0], stages[-1]
-    chosen = {"before": first, "after": last}
+    first, *_, last = [*trained] * 2
     unchanged = trained[first].files["scene.ply"] == trained[last].files["scene.ply"]
     views: list[SceneView] = []
     renderer = None
-    start = placed[opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])]
-    for key, stage in chosen.items():
+    start = placed[opening([row.weight or 0.0 for row in placed])]
+    for key, stage in (("before", first), ("after", last)):
         scene = read_ply(run / stage / "scene.ply")
         renderer = Renderer(scene)
         camera = camera_of(start.frame)
-        factor = _STILL / max(camera.width, camera.height)
-        size = (max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        longer = max(camera.width, camera.height)
+        size = [max(1, round(_STILL / longer * side)) for side in (camera.width, camera.height)]
         still = write_jpeg(folder, f"{key}.jpg", renderer(level_camera(camera, *size)), _STILL)
         degree = write_scene(folder / f"scene-{key}.js", key, scene)
         views.append(
@@ -172,17 +173,6 @@ def _scenes(
     return views, renderer
 
 
-def _placed(rows: Sequence[FrameRow]) -> list[FrameRow]:
-    return [row for row in rows if row.frame.registered]
-
-
-def _rendered(rows: Sequence[FrameRow], renderer: Renderer | None) -> frozenset[int]:
-    """Frames at which the final scene is rendered."""
-    placed = _placed(rows) if renderer else []
-    every = -(-len(placed) // RENDERED) or 1
-    return frozenset(row.frame.frame_id for row in placed[::every])
-
-
 def _plans(planner: Planner) -> dict[str, StagePlan]:
     """The state of every stage; empty when the capture has gone."""
     try:
@@ -192,32 +182,7 @@ def _plans(planner: Planner) -> dict[str, StagePlan]:
         return {}
 
 
-def _aspect(rows: Sequence[FrameRow]) -> str:
-    """Of the frames, as CSS takes it."""
-    frame: Frame | None = rows[0].frame if rows else None
-    return f"{frame.width} / {frame.height}" if frame else "16 / 9"
-
-
 # -- what the scripts of the page know ----------------------------------------------------------------------
-
-
-def _data(
-    rows: Sequence[FrameRow],
-    pictures: Mapping[int, FramePictures],
-    scenes: Sequence[SceneView],
-    meanings: Mapping[str, str],
-) -> dict[str, Any]:
-    placed = _placed(rows)
-    times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
-    return {
-        "layers": LAYERS,
-        "opening": {"left": "observed", "right": "final"},
-        "frames": [
-            _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id), meanings)
-            for row in rows
-        ],
-        "viewer": _viewer_data(placed, scenes) if scenes else None,
-    }
 
 
 def _frame_data(
@@ -225,17 +190,10 @@ def _frame_data(
 ) -> dict[str, Any]:
     figures = {"R": row.R, "B": row.B, "G": row.G, **row.geometry}
     selection = row.selection
-    scores = (
-        {}
-        if selection is None
-        else {
-            metric: scores_of(selection, role)
-            for role, metric in (
-                ("primary", selection.primary_metric),
-                ("tiebreak", selection.tiebreak_metric),
-            )
-        }
-    )
+    scores = {}
+    if selection is not None:
+        scores[selection.primary_metric] = scores_of(selection, "primary")
+        scores[selection.tiebreak_metric] = scores_of(selection, "tiebreak")
     found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,
@@ -264,9 +222,23 @@ def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dic
     The trajectory is an animation track: its keys are the frames' poses, to which the page goes by time.
     """
     poses = [viewer_pose(camera_of(row.frame)) for row in placed]
-    start = opening([row.frame for row in placed], [row.weight or 0.0 for row in placed])
-    duration = max(_SECONDS_A_FRAME * len(poses), _SECONDS_A_FRAME)
-    off = {"enabled": False}
+    start = opening([row.weight or 0.0 for row in placed])
+    track = {
+        "name": "trajectory",
+        "duration": max(_SECONDS_A_FRAME * len(poses), _SECONDS_A_FRAME),
+        "frameRate": 1 / _SECONDS_A_FRAME,
+        "loopMode": "none",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": list(range(len(poses))),
+            "values": {
+                "position": [x for pose in poses for x in pose["position"]],
+                "target": [x for pose in poses for x in pose["target"]],
+                "fov": [pose["fov"] for pose in poses],
+            },
+        },
+    }
     return {
         "scenes": [
             {"key": scene.key, "antialias": scene.antialias, "background": scene.background}
@@ -274,35 +246,9 @@ def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dic
         ],
         "start": start * _SECONDS_A_FRAME,
         "settings": {
-            "version": 2,
-            "tonemapping": "none",
-            "highPrecisionRendering": True,
+            **viewer_settings(),
             "background": {"color": list(scenes[-1].background)},
-            "postEffectSettings": {
-                "sharpness": {**off, "amount": 0},
-                "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
-                "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-                "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-                "fringing": {**off, "intensity": 0.5},
-            },
-            "animTracks": [
-                {
-                    "name": "trajectory",
-                    "duration": duration,
-                    "frameRate": 1 / _SECONDS_A_FRAME,
-                    "loopMode": "none",
-                    "interpolation": "spline",
-                    "smoothness": 1,
-                    "keyframes": {
-                        "times": list(range(len(poses))),
-                        "values": {
-                            "position": [x for pose in poses for x in pose["position"]],
-                            "target": [x for pose in poses for x in pose["target"]],
-                            "fov": [pose["fov"] for pose in poses],
-                        },
-                    },
-                }
-            ],
+            "animTracks": [track],
             "cameras": [{"initial": poses[start]}],
             "annotations": [],
             "startMode": "animTrack",

@@ -36,7 +36,7 @@ def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
 
 
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
-    """Whether the report of ``run`` is of these results, and of this version."""
+    """Whether the report of ``run`` is of these results and of this version."""
     return (run / FOLDER / PAGE).is_file() and _record(run).get("made_from") == _made_from(manifests)
 
 
@@ -62,5 +62,5 @@ def noted(run: Path) -> LastRun | None:
 
 def write_record(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
     """Note in the report's ``folder`` what it is made from."""
-    record = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
-    write_json(folder / RECORD, record)
+    note = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
+    write_json(folder / RECORD, note)

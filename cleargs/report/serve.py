@@ -1,66 +1,47 @@
-"""The server of `cleargs watch`: one run's report and its present state, for readers on this machine.
+"""The server of ``cleargs watch``: the report of one run, and its progress, for readers on this machine.
 
-It answers GET and HEAD alone, changes nothing, and hands out no file but those of the report and the youngest
-preview. A page of another site may make a browser ask a server on this machine, under a name that it had
-resolve here (DNS rebinding): whoever asks under such a name gets nothing.
+It changes nothing, and serves no file outside the report but the latest preview. A page of another site may
+make a browser ask a server on this machine under a foreign name (DNS rebinding): that name is refused.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import unquote, urlsplit
+from urllib.parse import urlsplit
 
 from cleargs.errors import InputError
 from cleargs.manifest import plain_json
-from cleargs.report.report_json import FOLDER, PAGE
-from cleargs.report.watched_run import Watched
-from cleargs.untrusted import open_regular
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.live import at_work, preview_of
+from cleargs.pipeline.run_file import Run
+from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 
-_TYPES: Mapping[str, str] = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".json": "application/json",
-    ".txt": "text/plain; charset=utf-8",
-    ".jpg": "image/jpeg",
-    ".png": "image/png",
-    ".svg": "image/svg+xml",
-}
-_FOREIGN = "; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-_LIVE_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'" + _FOREIGN
-)
-_REPORT_POLICY = (  # as in the report itself, whose script and viewer it needs
-    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'self' blob:; worker-src blob:; "
-    "connect-src blob: data:; img-src 'self' blob: data:; style-src 'unsafe-inline'" + _FOREIGN
-)
-_OURS = {f"/{name}": name for name in ("live.css", "live.js")}
+_PAGES: Mapping[str, str] = {"/": "live.html", "/live.css": "live.css", "/live.js": "live.js"}
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``watched`` at ``host`` (a name or an address) and ``port`` (0: one that is free).
+    """Serves ``run`` at ``host`` (a name or an address) and ``port`` (0: one that is free).
 
-    Raises InputError when that cannot be had.
+    Raises InputError when the address is not available.
     """
 
     daemon_threads = True
 
-    def __init__(self, watched: Watched, host: str, port: int) -> None:
+    def __init__(self, dag: Dag, run: Run, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            super().__init__((host, port), partial(_Handler, watched, host))
+            super().__init__((host, port), partial(_Handler, dag, run, host))
         except OSError as error:
             raise InputError(
                 f"cannot serve at {host}:{port}: {error.strerror or error}",
@@ -69,128 +50,106 @@ class Server(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Where a browser on this machine finds it."""
+        """The URL for a browser on this machine."""
         host, port = self.server_address[:2]
         name = f"[{host!s}]" if ":" in str(host) else str(host)
         return f"http://{name}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """One line for what went wrong; a reader that went away is no error."""
+        """Print one line for a failure; a reader that went away is no failure."""
         error = sys.exception()
         if not isinstance(error, ConnectionError | TimeoutError):
             print(f"warning: a request failed: {error!r}", file=sys.stderr)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(SimpleHTTPRequestHandler):
     """One request."""
 
     server_version, sys_version = "cleargs", ""
     timeout = 30
 
-    def __init__(self, watched: Watched, host: str, *arguments: Any) -> None:
-        self._watched, self._host = watched, host
-        self._policy = _LIVE_POLICY
-        super().__init__(*arguments)
+    def __init__(self, dag: Dag, run: Run, host: str, *arguments: Any) -> None:
+        self._dag, self._run, self._host = dag, run, host
+        super().__init__(*arguments, directory=str(run.folder))
 
-    def do_GET(self) -> None:
-        if not self._asked_by_name():
+    def send_head(self) -> BytesIO | BinaryIO | None:
+        """Send the headers; returns the body."""
+        path = urlsplit(self.path).path
+        if not self._has_own_name():
             self.send_error(HTTPStatus.FORBIDDEN, explain="This server answers to its own address only.")
-            return
-        path = unquote(urlsplit(self.path).path)
-        if path == "/":
-            if self._watched.is_done():
-                self._redirect(f"/{FOLDER}/")
-            else:
-                self._send(_static("live.html"), ".html")
-        elif path in _OURS:
-            self._send(_static(_OURS[path]), Path(path).suffix)
-        elif path == "/state.json":
-            self._send(json.dumps(plain_json(self._watched.state())).encode(), ".json")
-        elif path == "/favicon.ico":  # asked for by every browser; we have none
+        elif path == "/favicon.ico":  # every browser asks for it
             self.send_response(HTTPStatus.NO_CONTENT)
             self.end_headers()
-        elif path == "/preview.png":
-            self._send_file(self._watched.preview())
-        elif path == f"/{FOLDER}":
-            self._redirect(f"/{FOLDER}/")
-        elif path.startswith(f"/{FOLDER}/"):
-            self._policy = _REPORT_POLICY
-            self._send_file(self._in_report(path.removeprefix(f"/{FOLDER}/") or PAGE))
+        elif path == "/" and self._state()["done"]:
+            self.send_response(HTTPStatus.FOUND)
+            self.send_header("Location", f"/{FOLDER}/")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+        elif path == "/state.json":
+            body = json.dumps(plain_json(self._state())).encode()
+            self.send_response(HTTPStatus.OK)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            return BytesIO(body)
         else:
-            self.send_error(HTTPStatus.NOT_FOUND)
+            return super().send_head()
+        return None
 
-    do_HEAD = do_GET  # the body is left out by `_send_stream`
+    def translate_path(self, path: str) -> str:
+        """The file for a URL; "" where it is not one of ours."""
+        place = urlsplit(path).path
+        if place in _PAGES:
+            return str(Path(__file__).parent / "static" / _PAGES[place])
+        if place == "/preview.png":
+            work = at_work(self._run.folder, self._run.store)
+            preview = None if work is None else preview_of(work, self._run.store)
+            return "" if preview is None else str(preview.path)
+        report = self._run.folder.resolve() / FOLDER
+        with suppress(OSError, ValueError, RuntimeError):  # a zero byte, a name too long, a loop of links
+            file = Path(super().translate_path(path)).resolve()
+            if file == report or (file.is_relative_to(report) and file.is_file()):
+                return str(file)
+        return ""
 
-    def _refuse(self) -> None:
-        self.send_error(HTTPStatus.METHOD_NOT_ALLOWED)
-
-    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_TRACE = do_CONNECT = _refuse
+    def list_directory(self, path: Any) -> None:
+        """Answer for a report without its page."""
+        self.send_error(HTTPStatus.NOT_FOUND)
 
     def end_headers(self) -> None:
-        self.send_header("Content-Security-Policy", self._policy)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-        self.send_header("Referrer-Policy", "no-referrer")
         self.send_header("Cache-Control", "no-store")
         super().end_headers()
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Requests are of no interest."""
+        """Log nothing."""
 
-    def _asked_by_name(self) -> bool:
-        """Whether the address that the reader asked is one of ours: an IP address, which no other site can
-        have for its name, or the name that the server was given."""
-        named = self.headers.get_all("Host", [])
-        if len(named) != 1:
-            return False
+    def _has_own_name(self) -> bool:
+        """True for a request to an IP address, which no other site can have as its name, or to our name."""
         try:
-            host = urlsplit(f"//{named[0]}").hostname or ""
-            if host in ("localhost", self._host.lower()):
-                return True
-            ip_address(host)
+            name = urlsplit(f"//{self.headers['Host']}").hostname or ""
+            return name in ("localhost", self._host.lower()) or ip_address(name) is not None
         except ValueError:
             return False
-        return True
 
-    def _in_report(self, name: str) -> Path | None:
-        """The file ``name`` of the report; None where there is none, or where it lies elsewhere."""
-        root = self._watched.folder.resolve() / FOLDER
-        try:
-            file = (root / name).resolve()
-        except (OSError, ValueError, RuntimeError):  # a zero byte, a name too long, a loop of links
-            return None
-        return file if file.is_relative_to(root) else None
-
-    def _redirect(self, place: str) -> None:
-        self.send_response(HTTPStatus.FOUND)
-        self.send_header("Location", place)
-        self.send_header("Content-Length", "0")
-        self.end_headers()
-
-    def _send_file(self, path: Path | None) -> None:
-        try:
-            if path is None:
-                raise FileNotFoundError
-            file = open_regular(path)
-        except OSError:
-            self.send_error(HTTPStatus.NOT_FOUND)
-            return
-        with file:
-            size = file.seek(0, 2)
-            file.seek(0)
-            self._send_stream(file, size, path.suffix)
-
-    def _send(self, body: bytes, suffix: str) -> None:
-        self._send_stream(BytesIO(body), len(body), suffix)
-
-    def _send_stream(self, body: BinaryIO, size: int, suffix: str) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", _TYPES.get(suffix, "application/octet-stream"))
-        self.send_header("Content-Length", str(size))
-        self.end_headers()
-        if self.command != "HEAD":
-            shutil.copyfileobj(body, self.wfile)
-
-
-def _static(name: str) -> bytes:
-    return files("cleargs.report").joinpath("static", name).read_bytes()
+    def _state(self) -> dict[str, Any]:
+        """All that the live page shows, as JSON values."""
+        run = self._run
+        work = at_work(run.folder, run.store)
+        manifests = linked_manifests(run.folder, self._dag.names)
+        preview = None if work is None else preview_of(work, run.store)
+        stages = []
+        for name in self._dag.names:
+            working = work is not None and work.stage == name
+            state = "at work" if working else "done" if name in manifests else "to do"
+            seconds = manifests[name].seconds if state == "done" else None
+            stages.append({"name": name, "state": state, "seconds": seconds})
+        return {
+            "name": run.folder.name,
+            "now": None if work is None else work.model_dump(),
+            "stages": stages,
+            "preview": None if preview is None else str(preview.version),
+            "report": page_of(run.folder).is_file(),
+            "done": work is None and is_current(run.folder, manifests),
+        }

@@ -8,12 +8,11 @@ training poses, so it says how well a scene explains what was filmed, and not ho
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
-from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow
+from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow, last_scene
 from cleargs.report.words import count, decibel
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
@@ -29,18 +28,16 @@ SOFT_PX = 6.0
 Tone = Literal["good", "fair", "poor"]
 
 
-@dataclass(frozen=True)
-class Caution:
+class Caution(NamedTuple):
     """Something that keeps the result from being better."""
 
     what: str
     why: str
-    settings: tuple[str, ...]
+    settings: tuple[str, ...] = ()
     """As ``--set`` takes them; empty where no setting helps."""
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """A number that stands for a part of the run."""
 
     value: str
@@ -48,9 +45,8 @@ class Figure:
     note: str
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What the first screen of a report says."""
+class Verdict(NamedTuple):
+    """The first screen of a report."""
 
     tone: Tone
     headline: str
@@ -61,12 +57,14 @@ class Verdict:
 
 def judge(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> Verdict:
     """The verdict on a run that shows these ``manifests``."""
-    warnings = tuple(_warnings(manifests, rows, config))
-    tone, headline = _headline(manifests)
-    return Verdict(tone, headline, _text(manifests, rows), tuple(_figures(manifests, rows)), warnings)
+    run = _Run(manifests, rows, config)
+    warnings = (*run.parts_missing(), *run.capture_warnings(), *run.allocation_warnings())
+    if "g0" in manifests:
+        warnings += (*run.scene_warnings(),)
+    return Verdict(*run.headline(), run.text(), tuple(run.figures()), warnings)
 
 
-def _figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
+def figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
     """A figure that a stage reported; None without the stage or the figure."""
     value: Any = manifests[stage].summary if stage in manifests else None
     for name in path:
@@ -74,219 +72,192 @@ def _figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
     return value
 
 
-def _setting(config: Config, section: str, name: str) -> Any:
-    return getattr(config.sections[section], name)
-
-
-def _headline(manifests: Mapping[str, Manifest]) -> tuple[Tone, str]:
-    if "g0" not in manifests:
-        return "fair", "The capture is prepared; no scene is trained yet."
-    psnr, frames = training_psnr(manifests)
-    if psnr is None:
-        return "fair", "The scene is trained."
-    follows = f"The first scene follows {frames}"
-    if psnr >= CLOSE_DB:
-        return "good", f"{follows} closely."
-    if psnr >= LOOSE_DB:
-        return "fair", f"{follows} fairly closely."
-    return "poor", f"{follows} only loosely."
-
-
 def training_psnr(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]:
     """PSNR of the first scene on the best frames that it was trained on, dB, and what these are called."""
-    strong = _figure(manifests, "g0", "psnr_strong")
+    strong = figure(manifests, "g0", "psnr_strong")
     if strong is not None:
         return strong, "the trusted training frames"
-    return _figure(manifests, "g0", "psnr_active"), "its training frames"
+    return figure(manifests, "g0", "psnr_active"), "its training frames"
 
 
-def _text(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> str:
-    placed = sum(row.frame.registered for row in rows)
-    roles = [row.role for row in rows]
-    parts = [f"{placed} of {count(len(rows), 'frame')} found their place in the scene"]
-    if strong := roles.count("strong"):
-        parts[0] += f", {strong} of them sharp and reliable enough to lead the training"
-    unused = sum(row.weight == 0.0 for row in rows if row.frame.registered)
-    if unused:
-        parts.append(f"{count(unused, 'frame')} took no part in it")
-    held = _harm(manifests)
-    if held is not None:
-        parts.append(held)
-    return ". ".join(part[:1].upper() + part[1:] for part in parts) + "."
+class _Run:
+    """A run under judgement."""
 
+    def __init__(self, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> None:
+        self._manifests, self._rows, self._config = manifests, rows, config
+        self._placed = [row for row in rows if row.frame.registered]
+        self._unused = sum(row.weight == 0.0 for row in self._placed)
 
-def _harm(manifests: Mapping[str, Manifest]) -> str | None:
-    """What the repairs did to frames that no repair was trained on."""
-    stage = "consolidate" if "consolidate" in manifests else "rivr"
-    before, after = (_figure(manifests, stage, "held_back", f"psnr_{when}") for when in ("before", "after"))
-    if before is None or after is None:
-        return None
-    if _figure(manifests, stage, "published") == "G0":
-        return "the repairs did not pay off, so the first scene is also the last"
-    change = after - before
-    kind = "more" if change >= 0 else "less"
-    none = _figure(manifests, "consolidate", "repairs") == 0
-    lead = "no frame needed a repair; trained on" if none else "after the repairs"
-    return (
-        f"{lead}, the scene explains training frames that were kept aside from repairs "
-        f"{abs(change):.1f} dB {kind} exactly ({decibel(before)} before, {decibel(after)} now)"
-    )
+    def _figure(self, stage: str, *path: str) -> Any:
+        return figure(self._manifests, stage, *path)
 
+    def _setting(self, section: str, name: str) -> Any:
+        return getattr(self._config.sections[section], name)
 
-def _figures(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow]) -> Iterator[Figure]:
-    placed = sum(row.frame.registered for row in rows)
-    yield Figure(f"{placed} of {len(rows)}", "frames placed", "with a pose that fits the others")
-    active = sum(bool(row.weight) for row in rows)
-    if "rva" in manifests:
-        effective = _figure(manifests, "rva", "effective_frames")
-        yield Figure(f"{active}", "frames train the scene", f"as much as {effective:.1f} whole ones together")
-    psnr, frames = training_psnr(manifests)
-    if psnr is not None:
-        rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
-        yield Figure(decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}")
-    scenes = [stage for stage in ("consolidate", "rivr", "g0") if stage in manifests]
-    unseen = _figure(manifests, scenes[0], "psnr_unseen") if scenes else None
-    if unseen is not None:
-        yield Figure(
-            decibel(unseen),
-            "on pixels that no training saw",
-            "PSNR of the last scene on a hundredth of every frame; views off the path are worse",
-        )
-    repairs = _figure(manifests, "consolidate", "repairs")
-    if repairs is not None:
-        yield Figure(
-            str(repairs),
-            "repaired views" if repairs != 1 else "repaired view",
-            "carried into the final scene",
+    def headline(self) -> tuple[Tone, str]:
+        """The tone and the first line."""
+        if "g0" not in self._manifests:
+            return "fair", "The capture is prepared; no scene is trained yet."
+        psnr, frames = training_psnr(self._manifests)
+        if psnr is None:
+            return "fair", "The scene is trained."
+        follows = f"The first scene follows {frames}"
+        if psnr >= CLOSE_DB:
+            return "good", f"{follows} closely."
+        return (
+            ("fair", f"{follows} fairly closely.")
+            if psnr >= LOOSE_DB
+            else ("poor", f"{follows} only loosely.")
         )
 
+    def text(self) -> str:
+        """The lines under the headline."""
+        frames = count(len(self._rows), "frame")
+        parts = [f"{len(self._placed)} of {frames} found their place in the scene"]
+        if strong := sum(row.role == "strong" for row in self._rows):
+            parts[0] += f", {strong} of them sharp and reliable enough to lead the training"
+        if self._unused:
+            parts.append(f"{count(self._unused, 'frame')} took no part in it")
+        if harm := self._harm():
+            parts.append(harm)
+        return ". ".join(part[:1].upper() + part[1:] for part in parts) + "."
 
-def _warnings(
-    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
-) -> Iterator[Caution]:
-    for manifest in manifests.values():
-        for missing in manifest.missing:
-            yield Caution(f"{manifest.stage} is done only in part", missing, ())
-    yield from _capture_warnings(manifests, rows, config)
-    yield from _allocation_warnings(manifests, rows, config)
-    if "g0" in manifests:
-        yield from _scene_warnings(manifests, config)
-
-
-def _capture_warnings(
-    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
-) -> Iterator[Caution]:
-    unplaced = sum(row.role == UNPLACED for row in rows)
-    available = _figure(manifests, "ingest", "frames_available") or 0
-    if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
-        yield Caution(
-            f"{count(unplaced, 'frame')} found no place",
-            "They share too few points with their neighbours: too blurred, or too far apart.",
-            tuple(_closer(len(rows), available, config)),
-        )
-    if available > 1.5 * len(rows):
-        yield Caution(
-            f"{len(rows)} of {available} frames were used",
-            "More frames bring more views of every surface, at more time.",
-            tuple(_more_frames(len(rows), available, config)),
-        )
-    if rows and not any(row.role == HELD_OUT for row in rows):
-        yield Caution(
-            "No frame was held out",
-            "All figures here are of frames that the scene has seen; new views may look worse.",
-            ("ingest.holdout=every:8",),
+    def _harm(self) -> str:
+        """What the repairs did to frames that no repair was trained on; "" where it is unknown."""
+        stage = "consolidate" if "consolidate" in self._manifests else "rivr"
+        before, after = (self._figure(stage, "held_back", f"psnr_{when}") for when in ("before", "after"))
+        if before is None or after is None:
+            return ""
+        if self._figure(stage, "published") == "G0":
+            return "the repairs did not pay off, so the first scene is also the last"
+        none = self._figure("consolidate", "repairs") == 0
+        lead = "no frame needed a repair; trained on" if none else "after the repairs"
+        return (
+            f"{lead}, the scene explains training frames that were kept aside from repairs "
+            f"{abs(after - before):.1f} dB {'more' if after >= before else 'less'} exactly "
+            f"({decibel(before)} before, {decibel(after)} now)"
         )
 
+    def figures(self) -> Iterator[Figure]:
+        """The numbers of the first screen."""
+        placed = f"{len(self._placed)} of {len(self._rows)}"
+        yield Figure(placed, "frames placed", "with a pose that fits the others")
+        if "rva" in self._manifests:
+            active = sum(bool(row.weight) for row in self._rows)
+            whole = f"as much as {self._figure('rva', 'effective_frames'):.1f} whole ones together"
+            yield Figure(f"{active}", "frames train the scene", whole)
+        psnr, frames = training_psnr(self._manifests)
+        if psnr is not None:
+            rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
+            yield Figure(decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}")
+        unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
+        if unseen is not None:
+            note = "PSNR of the last scene on a hundredth of every frame; views off the path are worse"
+            yield Figure(decibel(unseen), "on pixels that no training saw", note)
+        repairs = self._figure("consolidate", "repairs")
+        if repairs is not None:
+            views = "repaired views" if repairs != 1 else "repaired view"
+            yield Figure(str(repairs), views, "carried into the final scene")
 
-def _closer(frames: int, available: int, config: Config) -> Iterator[str]:
-    """Settings that bring frames nearer to each other, or compare more of them."""
-    yield from _more_frames(frames, available, config)
-    if frames >= _setting(config, "ingest", "exhaustive_below"):  # below it all pairs are compared
-        yield f"ingest.overlap={2 * _setting(config, 'ingest', 'overlap')}"
+    def parts_missing(self) -> Iterator[Caution]:
+        """Stages that are done only in part."""
+        for manifest in self._manifests.values():
+            for missing in manifest.missing:
+                yield Caution(f"{manifest.stage} is done only in part", missing)
 
-
-def _more_frames(frames: int, available: int, config: Config) -> Iterator[str]:
-    """The setting that limits the frames of a capture, where there are more."""
-    fps, most = _setting(config, "ingest", "fps"), _setting(config, "ingest", "max_frames")
-    if available <= frames:
-        return
-    if fps is not None and frames < most:
-        yield f"ingest.fps={2 * fps:g}"
-    else:
-        yield f"ingest.max_frames={min(available, 2 * frames)}"
-
-
-def _allocation_warnings(
-    manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config
-) -> Iterator[Caution]:
-    if _figure(manifests, "rva", "stand_in"):
-        yield Caution(
-            "No frame counts as reliable",
-            "The best of them are used instead. Thresholds nearer to this capture would separate good frames "
-            "from bad ones.",
-            tuple(
-                f"rva.{name}={min(max(_setting(config, 'rva', name) + step, 0.0), 1.0):.2f}"
-                for name, step in (("tau_R", -0.1), ("tau_B", 0.1))
-            ),
-        )
-    uncovered = _figure(manifests, "rva", "bins_uncovered_before") or 0
-    if uncovered:
-        yield Caution(
-            f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
-            "Weak frames were taken back there, at low weight, and the scene is softer. Film slower there.",
-            (),
-        )
-    placed = [row for row in rows if row.frame.registered and row.weight is not None]
-    unused = sum(row.weight == 0.0 for row in placed)
-    if placed and unused > MANY_UNUSED * len(placed):
-        yield Caution(
-            f"{unused} of {len(placed)} placed frames are unused",
-            "A lower threshold of reliability lets more of them in.",
-            (f"rva.tau_R={max(0.0, _setting(config, 'rva', 'tau_R') - 0.1):.2f}",),
-        )
-    blurred = [row for row in rows if (row.blur_px or 0.0) > SOFT_PX]
-    if len(blurred) > len(rows) / 2:
-        yield Caution(
-            f"{count(len(blurred), 'frame')} moved by more than {SOFT_PX:g} px while exposed",
-            "A shorter exposure or a slower hand gives sharper frames than any repair.",
-            (),
-        )
-
-
-def _scene_warnings(manifests: Mapping[str, Manifest], config: Config) -> Iterator[Caution]:
-    psnr = _figure(manifests, "g0", "psnr_strong")
-    if psnr is not None and psnr < CLOSE_DB:
-        yield Caution(
-            f"The first scene reaches {decibel(psnr)} on the frames it trusts",
-            "A longer training, or larger images, bring out finer detail.",
-            (
-                f"g0.steps={2 * _figure(manifests, 'g0', 'steps')}",
-                f"ingest.max_size={_setting(config, 'ingest', 'max_size') * 3 // 2}",
-            ),
-        )
-    spread = _figure(manifests, "g0", "exposure_spread")
-    threshold = _setting(config, "g0", "exposure_threshold")
-    if spread is not None and spread > threshold and not _figure(manifests, "g0", "exposure"):
-        yield Caution(
-            f"Exposure differs by {100 * spread:.0f} % between frames",
-            "Without compensation the scene takes on their average, with floating haze.",
-            ("g0.exposure=auto",),
-        )
-    for stage in ("rivr", "consolidate"):
-        harm = _figure(manifests, stage, "held_back", "harm")
-        if harm:
-            yield Caution(
-                f"The scene of {stage} was rejected",
-                f"It explains frames kept aside worse than before ({harm}), so the one before it stays.",
-                ("rivr.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
+    def capture_warnings(self) -> Iterator[Caution]:
+        """What the frames and their poses lack."""
+        rows = self._rows
+        unplaced = sum(row.role == UNPLACED for row in rows)
+        available = self._figure("ingest", "frames_available") or 0
+        fps, most = self._setting("ingest", "fps"), self._setting("ingest", "max_frames")
+        more: tuple[str, ...] = ()  # the setting that limits the frames of a capture, where there are more
+        if available > len(rows):
+            by_rate = fps is not None and len(rows) < most
+            more = (
+                f"ingest.fps={2 * fps:g}"
+                if by_rate
+                else f"ingest.max_frames={min(available, 2 * len(rows))}",
             )
-    rounds = _figure(manifests, "rivr", "rounds") or []
-    refused = sum(found["repairs_refused"] for found in rounds)
-    made = sum(sum(found["chosen"].values()) for found in rounds)
-    if made and 2 * refused > made:
-        yield Caution(
-            f"{refused} of {made} repairs were refused",
-            "They agree with neither the frame nor the render: the repair model does not suit this capture. "
-            "`cleargs models list` names others.",
-            ("rivr.expert=NAME",),
-        )
+        if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
+            all_pairs = len(rows) < self._setting("ingest", "exhaustive_below")
+            overlap = () if all_pairs else (f"ingest.overlap={2 * self._setting('ingest', 'overlap')}",)
+            yield Caution(
+                f"{count(unplaced, 'frame')} found no place",
+                "They share too few points with their neighbours: too blurred, or too far apart.",
+                more + overlap,
+            )
+        if available > 1.5 * len(rows):
+            why = "More frames bring more views of every surface, at more time."
+            yield Caution(f"{len(rows)} of {available} frames were used", why, more)
+        if rows and not any(row.role == HELD_OUT for row in rows):
+            why = "All figures here are of frames that the scene has seen; new views may look worse."
+            yield Caution("No frame was held out", why, ("ingest.holdout=every:8",))
+
+    def allocation_warnings(self) -> Iterator[Caution]:
+        """What RVA found wanting."""
+        tau = {name: self._setting("rva", name) for name in ("tau_R", "tau_B")}
+        if self._figure("rva", "stand_in"):
+            yield Caution(
+                "No frame counts as reliable",
+                "The best of them are used instead. Thresholds nearer to this capture would separate good "
+                "frames from bad ones.",
+                (
+                    f"rva.tau_R={max(tau['tau_R'] - 0.1, 0.0):.2f}",
+                    f"rva.tau_B={min(tau['tau_B'] + 0.1, 1.0):.2f}",
+                ),
+            )
+        if uncovered := self._figure("rva", "bins_uncovered_before"):
+            yield Caution(
+                f"{count(uncovered, 'stretch', 'stretches')} of the path had no good frame",
+                "Weak frames were taken back there, at low weight, and the scene is softer. "
+                "Film slower there.",
+            )
+        weighted = sum(row.weight is not None for row in self._placed)
+        if weighted and self._unused > MANY_UNUSED * weighted:
+            yield Caution(
+                f"{self._unused} of {weighted} placed frames are unused",
+                "A lower threshold of reliability lets more of them in.",
+                (f"rva.tau_R={max(0.0, tau['tau_R'] - 0.1):.2f}",),
+            )
+        blurred = sum((row.blur_px or 0.0) > SOFT_PX for row in self._rows)
+        if blurred > len(self._rows) / 2:
+            yield Caution(
+                f"{count(blurred, 'frame')} moved by more than {SOFT_PX:g} px while exposed",
+                "A shorter exposure or a slower hand gives sharper frames than any repair.",
+            )
+
+    def scene_warnings(self) -> Iterator[Caution]:
+        """What the trainings found wanting."""
+        psnr = self._figure("g0", "psnr_strong")
+        if psnr is not None and psnr < CLOSE_DB:
+            size = self._setting("ingest", "max_size") * 3 // 2
+            yield Caution(
+                f"The first scene reaches {decibel(psnr)} on the frames it trusts",
+                "A longer training, or larger images, bring out finer detail.",
+                (f"g0.steps={2 * self._figure('g0', 'steps')}", f"ingest.max_size={size}"),
+            )
+        spread = self._figure("g0", "exposure_spread") or 0.0
+        if spread > self._setting("g0", "exposure_threshold") and not self._figure("g0", "exposure"):
+            yield Caution(
+                f"Exposure differs by {100 * spread:.0f} % between frames",
+                "Without compensation the scene takes on their average, with floating haze.",
+                ("g0.exposure=auto",),
+            )
+        for stage in ("rivr", "consolidate"):
+            if harm := self._figure(stage, "held_back", "harm"):
+                yield Caution(
+                    f"The scene of {stage} was rejected",
+                    f"It explains frames kept aside worse than before ({harm}), so the one before it stays.",
+                    ("rivr.harm.psnr_margin=1.0", f"{stage}.distil.pseudo_share=0.4"),
+                )
+        rounds = self._figure("rivr", "rounds") or []
+        refused = sum(found["repairs_refused"] for found in rounds)
+        made = sum(sum(found["chosen"].values()) for found in rounds)
+        if made and 2 * refused > made:
+            yield Caution(
+                f"{refused} of {made} repairs were refused",
+                "They agree with neither the frame nor the render: the repair model does not suit this "
+                "capture. `cleargs models list` names others.",
+                ("rivr.expert=NAME",),
+            )

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import base64
 import gzip
+import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from cleargs.splat.views import view_of
 BYTES = 10_000_000
 """Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
 
+_VIEWER = Path(__file__).parent / "static" / "viewer"
 _TURN = np.array([-1.0, -1.0, 1.0])
 _INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
 _BASE64, _GZIP = 4 / 3, 0.9  # at worst, of what was measured on trained scenes
@@ -59,11 +60,16 @@ def write_scene(path: Path, name: str, scene: Scene) -> int:
 
 
 def write_viewer(folder: Path) -> str:
-    """Write the vendored viewer as a script, its licence beside it; returns its name and version."""
-    viewer = files("cleargs.report").joinpath("static", "viewer")
-    (folder / "viewer.js").write_bytes(_script("viewer", viewer.joinpath("index.js.gz").read_bytes()))
-    (folder / "viewer-LICENSE.txt").write_bytes(viewer.joinpath("LICENSE").read_bytes())
-    return viewer.joinpath("VERSION").read_text(encoding="utf-8").strip()
+    """Write the vendored viewer as a script, with its licence; returns its name and version."""
+    (folder / "viewer.js").write_bytes(_script("viewer", (_VIEWER / "index.js.gz").read_bytes()))
+    (folder / "viewer-LICENSE.txt").write_bytes((_VIEWER / "LICENSE").read_bytes())
+    return (_VIEWER / "VERSION").read_text(encoding="utf-8").strip()
+
+
+def viewer_settings() -> dict[str, Any]:
+    """The viewer's settings that are the same in all reports."""
+    settings: dict[str, Any] = json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8"))
+    return settings
 
 
 def _script(name: str, packed: bytes) -> bytes:
@@ -99,8 +105,8 @@ def level_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 
 
-def opening(frames: Sequence[Frame], weights: Sequence[float]) -> int:
-    """Which of the registered ``frames`` the viewers open at: of the heaviest, the one halfway along."""
+def opening(weights: Sequence[float]) -> int:
+    """The registered frame that the viewers open at: of the heaviest, the one halfway along."""
     heaviest = [index for index, weight in enumerate(weights) if weight >= 0.95 * max(weights)]
     return heaviest[len(heaviest) // 2]
 

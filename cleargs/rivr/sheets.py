@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import write_rgb
-from cleargs.report.contact import Tile, contact_sheet
 from cleargs.rivr.candidates import CANDIDATES
 from cleargs.rivr.distillation import Snapshot
 from cleargs.rivr.rounds import observation

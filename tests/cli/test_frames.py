@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.frame_reasons import COLUMNS, frame_rows, reason, short_name, worst_cue
-from cleargs.cli.manifest_words import in_words
+from cleargs.cli.show_frame import frame_rows, reason, short_name, worst_cue
+from cleargs.cli.tables import labelled
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.stages.rva import RvaConfig
 
@@ -70,7 +70,8 @@ def test_repairs_stand_beside_their_frames() -> None:
     assert repair(chosen(1, "observed", "explained: motion 3 px", accepted=False)) == "as filmed"
     assert repair(chosen(1, "observed", "every pixel of the frame is masked", accepted=False)) == "as filmed"
     assert "repair" not in frame_rows(frames, SETTINGS, None)[0]
-    assert tuple(frame_rows(frames, SETTINGS, [])[0]) == COLUMNS
+    names = ["frame", "name", "role", "weight", "R", "B", "worst cue", "reason", "repair"]
+    assert list(frame_rows(frames, SETTINGS, [])[0]) == names
 
 
 def test_names_keep_their_end() -> None:
@@ -87,12 +88,12 @@ def test_figures_have_words() -> None:
         "weights": {"0.0": 0, "0.1": 5, "0.9": 7},
         "some_new_figure": 3,
     }
-    assert in_words(summary) == [
-        ("frames by weight", "5 from 0.1, 7 from 0.9"),
+    assert list(labelled(summary)) == [
+        ("held back: frames", "1, 2"),
+        ("held back: PSNR in the first scene, dB", "22.5"),
+        ("held back: harm", "none"),
         ("repairs by round", "11 in round 2"),
-        ("frames held back from repair", "1, 2"),
-        ("their PSNR in the first scene, dB", "22.5"),
-        ("harm done to them", "none"),
-        ("some new figure", "3"),
         ("round 1: chosen", "3 render, 9 restored, 2 as filmed"),
+        ("weights", "5 from 0.1, 7 from 0.9"),
+        ("some new figure", "3"),
     ]

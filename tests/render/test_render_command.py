@@ -18,7 +18,7 @@ from cleargs.media.image import read_rgb
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.render.output import kind_of
 from cleargs.render.paths import framed
-from cleargs.render.pose_files import read_poses
+from cleargs.render.shots import read_poses
 from cleargs.splat.camera import cameras_json
 from cleargs.splat.render import render as render_view
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,14 +13,8 @@ import pytest
 
 from cleargs.capture import tables as ingest
 from cleargs.errors import InputError
-from cleargs.parquet import write_table
-from cleargs.report.allocation_picture import (
-    Allocation,
-    extremes,
-    load_allocation,
-    place_labels,
-    plot_allocation,
-)
+from cleargs.parquet import read_table, write_table
+from cleargs.report.allocation_picture import Row, extremes, plot_allocation
 from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from
 from cleargs.rva.tables import BINS, FRAMES
 from cleargs.stages.rva import RvaConfig
@@ -75,151 +70,69 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.fixture(scope="module")
-def allocation(run: Path) -> Allocation:
-    return load_allocation(run / "rva", run / "ingest")
+def rows_of(run: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
+    return rows
 
 
-def test_it_reads_what_the_stages_left(allocation: Allocation) -> None:
-    ids = allocation.frame_id.tolist()
-    assert ids == [k for k in range(COUNT) if k != HELD_OUT]
-    unplaced = [k for k, placed in zip(ids, allocation.placed, strict=True) if not placed]
-    assert unplaced == [UNREGISTERED, UNSCORED]
-    assert np.isnan(allocation.centres[ids.index(UNREGISTERED)]).all()
-    row = ids.index(UNSCORED)
-    assert np.isnan([allocation.R[row], allocation.G[row]]).all()
-    assert allocation.centres[row].tolist() == [3.5, 0.0, -1.75]  # -R^T t: its pose is known
-    assert allocation.directions[row].tolist() == [0.0, 0.0, 1.0]
-    assert set(allocation.role) == {"strong", "reactivated", "suppressed"}
-    assert not allocation.covered.all()
+def ids(shown: dict[str, list[Row]]) -> dict[str, list[int]]:
+    return {title: [row["frame_id"] for row in rows] for title, rows in shown.items()}
 
 
-def test_time_is_in_seconds_where_all_frames_have_one(allocation: Allocation) -> None:
-    x, label = allocation.along
-    assert label == "time (s)" and x[1] == 0.5
-    x, label = replace(allocation, time_s=np.where(x == 1.0, np.nan, x)).along
-    assert label == "frame" and x.tolist() == allocation.frame_id.tolist()
+def keep(run: Path, folder: Path, count: int, **changes: Any) -> Path:
+    """A copy of ``run``'s tables with its first frames only, and with other values in all rows."""
+    shutil.copytree(run, folder)
+    rows = [row | changes for row in rows_of(run)[:count]]
+    write_table(folder / "rva" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
+    return folder
 
 
-def test_extremes(allocation: Allocation) -> None:
-    shown = {title: allocation.frame_id[rows].tolist() for title, rows in extremes(allocation).items()}
+def plot(path: Path, run: Path, title: str = "twelve") -> None:
+    plot_allocation(path, run / "rva", run / "ingest", title)
+
+
+def test_extremes(run: Path) -> None:
+    rows = rows_of(run)
+    shown = ids(extremes(rows))
     # Ten frames have scores, which fall from frame to frame: the better half, and the others from the end.
     assert shown["best\nby R - B"] == [0, 1, 2, 3, 4]
     assert shown["worst\nby R - B"] == [11, 10, 9, 8, 6]
-    revived = allocation.frame_id[allocation.role == "reactivated"].tolist()
-    assert shown[f"reactivated\n{len(revived)} of {len(revived)}"] == revived
-
-
-def many(count: int) -> Allocation:
-    """A long capture whose frames get better slowly, all reactivated."""
-    nothing = np.zeros((count, 3))
-    R = np.linspace(0.0, 1.0, count)
-    return Allocation(
-        evaluator="hand-1",
-        frame_id=np.arange(count),
-        time_s=np.arange(count) / 30.0,
-        images=[Path("nowhere")] * count,
-        centres=nothing,
-        directions=nothing,
-        R=R,
-        B=1.0 - R,
-        G=R,
-        bin=np.zeros(count, dtype=np.int64),
-        role=np.full(count, "reactivated"),
-        weight=np.full(count, 0.12),
-        stand_in=np.zeros(count, dtype=bool),
-        covered=np.zeros(1, dtype=bool),
-    )
+    revived = [row["frame_id"] for row in rows if row["role"] == "reactivated"]
+    assert revived and shown[f"reactivated\n{len(revived)} of {len(revived)}"] == revived
 
 
 def test_pictures_of_a_long_capture_lie_apart() -> None:
     """The extremes of a slow change are one view over and over, unless they keep a twentieth's distance."""
-    shown = extremes(many(2000), most=3)
-    assert shown == {
+    rows = [{"frame_id": k, "R": k / 2000, "B": 1 - k / 2000, "role": "reactivated"} for k in range(2000)]
+    assert ids(extremes(rows, most=3)) == {
         "best\nby R - B": [1999, 1899, 1799],
         "worst\nby R - B": [0, 100, 200],
         "reactivated\n3 of 2000": [0, 1000, 1999],
     }
 
 
-def test_every_pictured_frame_is_in_the_picture(allocation: Allocation, tmp_path: Path) -> None:
-    plot_allocation(tmp_path / "a.png", allocation, "twelve")
+def test_every_pictured_frame_is_in_the_picture(run: Path, tmp_path: Path) -> None:
+    plot(tmp_path / "a.png", run)
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture is not None
-    pictured = {int(allocation.frame_id[row]) for rows in extremes(allocation).values() for row in rows}
+    pictured = {frame for frames in ids(extremes(rows_of(run))).values() for frame in frames}
     for k in range(COUNT):
         area = np.count_nonzero((picture == colour_of(k)).all(axis=-1))
         assert (area > 20_000) == (k in pictured), f"frame {k}: {area} px"  # a thumbnail has about 40,000
-    plot_allocation(tmp_path / "b.png", allocation, "twelve")
+    plot(tmp_path / "b.png", run)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("rows", [[0], [0, 1], [4, 5]])
-def test_few_frames_are_enough(allocation: Allocation, tmp_path: Path, rows: list[int]) -> None:
-    few = replace(
-        allocation,
-        images=[allocation.images[row] for row in rows],
-        **{
-            name: getattr(allocation, name)[rows]
-            for name in (
-                "frame_id",
-                "time_s",
-                "centres",
-                "directions",
-                "R",
-                "B",
-                "G",
-                "bin",
-                "role",
-                "weight",
-            )
-        },
-        stand_in=np.ones(len(rows), dtype=bool),
-    )
-    plot_allocation(tmp_path / "few.png", few, "$few_{$")  # a name, no formula
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_frames_are_enough(run: Path, tmp_path: Path, count: int) -> None:
+    few = keep(run, tmp_path / "few", count, stand_in=True)
+    plot(tmp_path / "few.png", few, "$few_{$")  # a name, no formula
     assert cv2.imread(str(tmp_path / "few.png")) is not None
 
 
-@pytest.mark.filterwarnings("error")
-def test_a_crowd_that_stands_still(allocation: Allocation, tmp_path: Path) -> None:
-    crowd = replace(many(500), images=[allocation.images[0]] * 500)
-    plot_allocation(tmp_path / "crowd.png", crowd, "crowd")
-    assert cv2.imread(str(tmp_path / "crowd.png")) is not None
-
-
-def test_without_a_trajectory_there_is_no_picture(allocation: Allocation, tmp_path: Path) -> None:
-    lost = replace(allocation, bin=np.full_like(allocation.bin, -1))
+def test_without_a_trajectory_there_is_no_picture(run: Path, tmp_path: Path) -> None:
+    lost = keep(run, tmp_path / "lost", COUNT, bin=None)
     with pytest.raises(InputError, match="no frame has both"):
-        plot_allocation(tmp_path / "lost.png", lost, "lost")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "anchors",
-    [
-        np.full((16, 2), 250.0),
-        np.full((16, 2), 60.0),  # the map leaves 12 % empty on each side
-        np.column_stack([np.linspace(200.0, 300.0, 16), np.full(16, 490.0)]),
-    ],
-    ids=["one place", "a corner", "a short line at the rim"],
-)
-def test_labels_stay_off_each_other_and_inside(anchors: np.ndarray) -> None:
-    sizes = np.tile([[16.0, 14.0], [88.0, 14.0]], (8, 1))
-    middles = place_labels(anchors, sizes, anchors, np.array([0.0, 0.0, 500.0, 500.0]))
-    assert (middles - sizes / 2 >= 0.0).all() and (middles + sizes / 2 <= 500.0).all()
-    for i in range(16):
-        for j in range(i):
-            gap = np.abs(middles[i] - middles[j]) - (sizes[i] + sizes[j]) / 2
-            assert gap.max() >= 2.0, (i, j)
-    again = place_labels(anchors, sizes, anchors, np.array([0.0, 0.0, 500.0, 500.0]))
-    np.testing.assert_array_equal(middles, again)
-
-
-def test_a_label_keeps_off_the_marks_and_near_its_own() -> None:
-    marks = np.column_stack([np.linspace(100.0, 400.0, 61), np.full(61, 250.0)])  # a row from left to right
-    (middle,) = place_labels(
-        marks[30:31], np.array([[24.0, 14.0]]), marks, np.array([0.0, 0.0, 500.0, 500.0])
-    )
-    assert abs(middle[1] - 250.0) > 7.0 + 4.0
-    assert np.linalg.norm(middle - marks[30]) < 40.0
+        plot(tmp_path / "lost.png", lost)
+    assert not (tmp_path / "lost.png").exists()

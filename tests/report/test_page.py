@@ -9,7 +9,8 @@ import shutil
 from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -24,11 +25,13 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
-from cleargs.report import facts, verdict
+from cleargs.report import facts
 from cleargs.report.charts import weight_colour
+from cleargs.report.frame_strip import UNPLACED
 from cleargs.report.html import json_in_html
 from cleargs.report.page import write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
+from cleargs.report.verdict import judge
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
 
 
@@ -217,7 +220,13 @@ def test_weights_run_from_amber_to_teal() -> None:
 
 def test_advice_is_only_what_can_help() -> None:
     def advice(frames: int, available: int, *settings: str) -> list[str]:
-        return list(verdict._closer(frames, available, load_config(installed(), "default", settings)))
+        lost = SimpleNamespace(
+            role=UNPLACED, frame=SimpleNamespace(registered=False), weight=None, blur_px=None
+        )
+        manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
+        rows: Any = [lost] * frames
+        judged = judge(manifests, rows, load_config(installed(), "default", settings))
+        return list(judged.warnings[0].settings)
 
     assert advice(40, 40) == []  # every frame is used, and compared with every other
     assert advice(40, 60) == ["ingest.max_frames=60"]

@@ -88,10 +88,6 @@ def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert f"choose one from 0 to {COUNT - 1}" in capsys.readouterr().err
     assert invoke(["show", str(run), "rva", "--frame", "1"]) == 2
     assert "about all stages" in capsys.readouterr().err
-    (run / "rva" / "manifest.json").unlink()
-    assert invoke(["show", str(run), "rva", "--plot"]) == 2
-    assert f"see cleargs status {run}" in capsys.readouterr().err
-    assert not list(run.glob("*.png"))
 
 
 def test_a_damaged_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,6 @@ from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.report.page import write_report
 from cleargs.report.serve import Server
-from cleargs.report.watched_run import Watched
 
 
 def reported(root: Path) -> FinishedRun:
@@ -33,7 +32,7 @@ def reported(root: Path) -> FinishedRun:
 @contextmanager
 def serving(made: FinishedRun) -> Iterator[int]:
     """The port at which the run is served."""
-    with Server(Watched(made.dag, made.run), "127.0.0.1", 0) as server:
+    with Server(made.dag, made.run, "127.0.0.1", 0) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cleargs.report.contact import Tile, contact_sheet
+from cleargs.media.contact_sheet import Tile, contact_sheet
 
 
 def test_images_lie_in_their_rows_and_columns() -> None:
