@@ -8,7 +8,7 @@ import pytest
 from helpers.splat_toy import gaussians, images, start, views
 
 from cleargs.cli.main import invoke
-from cleargs.pipeline.config import load_config, override
+from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.splat.config import DistilConfig, G0Config, TrainConfig
 from cleargs.splat.effort import (
@@ -58,7 +58,7 @@ def test_a_training_decides_for_itself() -> None:
 
 
 def test_quality_reaches_every_training() -> None:
-    config = override(installed(), load_config(installed(), "default"), quality_settings("high"))
+    config = load_config(installed(), "default", quality_settings("high"))
     found = (config.sections["g0"], config.sections["rivr"].distil, config.sections["consolidate"].distil)
     assert {training.quality for training in found} == {"high"}
     assert invoke(["run", "nowhere.mp4", "-o", "nowhere", "--quality", "best"]) == 2
