@@ -187,8 +187,7 @@ class Planner:
         ]
 
     def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
-        """Rough cost of ``name`` on this machine, from its settings, the finished stages before it, and what the
-        others expect."""
+        """Rough cost of ``name`` on this machine, from its settings and the finished stages before it."""
         return self._estimate(name, done).at_pace(self.pace)
 
     def _estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
