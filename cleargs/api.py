@@ -15,15 +15,9 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.session import (
-    SCENE,
-    DeviceChoice,
-    asked_run,
-    opened_store,
-    usable_cores,
-)
+from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
 from cleargs.progress import LogReporter, Reporter, SilentReporter, SilentTask, Task
-from cleargs.run_results import Prepared, Run, open_prepared
+from cleargs.run_results import SCENE, Prepared, Run, open_prepared
 from cleargs.splat.budget import Quality
 from cleargs.splat.effort import decided
 

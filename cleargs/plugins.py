@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from cleargs.errors import InputError, did_you_mean
 
-Socket = Literal["evaluators", "experts", "scorers", "formats", "layouts", "backends"]
+Socket = Literal["evaluators", "experts", "scorers", "formats", "layouts"]
 
 
 def installed_version(distribution: str) -> str:

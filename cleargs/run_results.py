@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, read_manifest
-from cleargs.pipeline.dag import installed
+from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.run_file import read_run_file
-from cleargs.pipeline.session import SCENE, scene_stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -20,6 +19,24 @@ if TYPE_CHECKING:
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
     from cleargs.splat.views import View
+
+
+SCENE = "scene.ply"
+"""What a stage that trains leaves."""
+
+
+def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
+    """The stage whose scene to take: ``chosen``, or the last that has one.
+
+    Raises InputError when there is no such scene.
+    """
+    done = [name for name in dag.names if (run / name / SCENE).is_file()]
+    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
+    if stage in done:
+        return stage
+    place = f"{stage} has no scene in {run}" if stage else f"there is no scene in {run}"
+    others = f"; the stages with a scene are {', '.join(done)}" if done else ""
+    raise InputError(place, hint=f"see cleargs status {run}{others}")
 
 
 def open_run(folder: str | Path) -> Run:

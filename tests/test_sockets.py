@@ -18,7 +18,6 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import plugin_versions
 from cleargs.plugins import plugins
-from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation
@@ -204,14 +203,3 @@ def test_layout(parts: Path, tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "list.txt").write_text("a.png")
     with pytest.raises(InputError, match="at least 3"):
         open_capture(tmp_path, ingest)
-
-
-def test_backend(parts: Path) -> None:
-    """A device that nobody serves is refused; a package may serve it."""
-    entries = parts / "cleargs_parts.dist-info" / "entry_points.txt"
-    with pytest.raises(InputError, match="no meta back end"):
-        backend_for("meta")
-    entries.write_text("[cleargs.backends]\nmeta = cleargs.splat.kernels.cpu:backend\n")
-    from cleargs.splat.kernels.cpu import backend as cpu
-
-    assert backend_for("meta") is cpu and backend_for("cpu") is cpu

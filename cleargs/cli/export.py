@@ -12,7 +12,7 @@ from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.session import SCENE, scene_stage
+from cleargs.run_results import SCENE, scene_stage
 
 MODEL = "colmap/sparse/0"
 

@@ -19,7 +19,8 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.session import DeviceChoice, resolve_device, scene_stage
+from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.run_results import scene_stage
 
 SECONDS = 10.0
 """Length of a film, unless told otherwise."""

@@ -140,14 +140,6 @@ def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> Document:
     return merged
 
 
-def override(dag: Dag, config: Config, overrides: Sequence[str]) -> Config:
-    """``config`` with ``a.b=value`` on top. Raises ConfigError."""
-    document: Mapping[str, Any] = config.document()
-    for text in overrides:
-        document = merge(document, parse_override(text))
-    return check_document(dag, document) if overrides else config
-
-
 def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     """Check a document against the stages' models and fill in the defaults. Raises ConfigError."""
     seed = document.get("seed", 0)

@@ -49,7 +49,7 @@ def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
             reporter.info(f"{what}: {_holder(path)} works on it; waiting")
             held = stack.enter_context(file_lock(path))
         with suppress(OSError):  # the note only serves messages
-            path.write_text(process_name(os.getpid()), encoding="utf-8")
+            path.write_text(_this_process(), encoding="utf-8")
         yield held is not None
 
 
@@ -65,18 +65,13 @@ def is_locked(path: Path) -> bool:
         os.close(handle)
 
 
-def process_name(pid: int) -> str:
-    """The name of a process of this host in a lock file."""
+def _this_process() -> str:
     job = os.environ.get("SLURM_JOB_ID", "")
-    return f"process {pid} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
-
-
-def is_held_by(path: Path, pid: int) -> bool:
-    """Return True if process ``pid`` of this host took the lock file ``path`` last."""
-    return _holder(path) == process_name(pid)
+    return f"process {os.getpid()} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
 
 
 def _holder(path: Path) -> str:
+    """The process that took the lock file ``path`` last."""
     with suppress(OSError, UnicodeDecodeError):
         return path.read_text(encoding="utf-8") or "another process"
     return "another process"

@@ -84,7 +84,7 @@ class Planner:
     threads: int
     reporter: Reporter
     _pace: float | None = field(default=None, repr=False)
-    _estimates: dict[tuple[str, tuple[str, ...] | None], Estimate] = field(default_factory=dict, repr=False)
+    _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
     def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
         """What ``name`` is made from, given the manifests of the stages before it.
@@ -186,22 +186,19 @@ class Planner:
             for plan in plans
         ]
 
-    def estimate(self, name: str, done: Mapping[str, Manifest] | None = None) -> Estimate:
-        """Rough cost of ``name`` on this machine, from its settings, the finished stages before it (without
-        ``done``: those that the run shows), and what the others expect."""
+    def estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
+        """Rough cost of ``name`` on this machine, from its settings and the finished stages before it."""
         return self._estimate(name, done).at_pace(self.pace)
 
-    def _estimate(self, name: str, done: Mapping[str, Manifest] | None) -> Estimate:
-        known = (name, None if done is None else tuple(done))
+    def _estimate(self, name: str, done: Mapping[str, Manifest]) -> Estimate:
+        known = (name, *done)
         if known in self._estimates:
             return self._estimates[known]
         stage = self.dag.load(name)
         inputs, expected = {}, {}
         for upstream in stage.INPUTS:
-            if done is not None and upstream in done:
+            if upstream in done:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
-            elif done is None and linked_manifest(self.run.folder, upstream) is not None:
-                inputs[upstream] = (self.run.folder / upstream).resolve()
             else:
                 expected[upstream] = self._estimate(upstream, done)
         nowhere = self.store.root / "work" / "estimate"

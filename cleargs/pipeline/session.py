@@ -18,9 +18,6 @@ from cleargs.pipeline.keys import settings as settings_in
 from cleargs.pipeline.run_file import RUN_FILE, Device, Run, kept_settings, noted_place
 from cleargs.pipeline.store import STORE_FOLDER, Store
 
-SCENE = "scene.ply"
-"""What a stage that trains leaves."""
-
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
@@ -66,21 +63,6 @@ def opened_store(root: Path) -> Iterator[Store]:
     root = root.absolute()
     with DigestMemo(root / "digests.sqlite") as memo:
         yield Store(root, memo)
-
-
-def scene_stage(dag: Dag, run: Path, chosen: str | None) -> str:
-    """The stage whose scene to take: ``chosen``, or the last that has one.
-
-    Raises InputError when there is no such scene.
-    """
-    done = [name for name in dag.names if (run / name / SCENE).is_file()]
-    stage = done[-1] if done and chosen is None else chosen and dag.check(chosen)
-    if stage is None:
-        raise InputError(f"there is no scene in {run}", hint=f"see cleargs status {run}")
-    if stage not in done:
-        there = f"the stages with a scene are {', '.join(done)}" if done else f"see cleargs status {run}"
-        raise InputError(f"{stage} has no scene in {run}", hint=there)
-    return stage
 
 
 def asked_run(

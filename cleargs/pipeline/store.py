@@ -35,7 +35,7 @@ from cleargs.manifest import (
     read_manifest,
     write_manifest,
 )
-from cleargs.pipeline.lock import file_lock, is_held_by, is_locked, only_one
+from cleargs.pipeline.lock import file_lock, is_locked, only_one
 from cleargs.progress import Reporter
 from cleargs.untrusted import FAULTS, read_text
 
@@ -353,20 +353,6 @@ class Garbage:
     folder: Path
     kind: Literal["finished", "unfinished", "kept", "rubbish"]
     bytes: int
-
-
-def last_saved(root: Path, pid: int) -> int:
-    """Time of the youngest whole file in the work folders of process ``pid`` of this host, ns; 0 for none.
-
-    A growing number says that a checkpoint was written in the store ``root``.
-    """
-    keys = [lock.stem for lock in (root / "locks").glob("*.lock") if is_held_by(lock, pid)]
-    youngest = 0
-    for file in (file for key in keys for file in (root / "work").glob(f"{key}*/**/*")):
-        with suppress(FileNotFoundError):
-            if file.is_file() and not is_partial(file):
-                youngest = max(youngest, file.stat().st_mtime_ns)
-    return youngest
 
 
 def writer_lives(work: Path) -> bool:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.errors import InputError
-from cleargs.plugins import plugin
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.rasteriser import Rasteriser
@@ -178,9 +177,6 @@ def backend_for(device: torch.device | str) -> Backend:
         from cleargs.splat.kernels.cpu import backend as cpu
 
         return cpu
-    if (found := plugin("backends", device.type)) is not None:
-        backend: Backend = found.load()
-        return backend
     raise InputError(f"there is no {device.type} back end for the splatting kernels", hint="use --device cpu")
 
 

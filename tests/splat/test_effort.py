@@ -8,7 +8,7 @@ import pytest
 from helpers.splat_toy import gaussians, images, start, views
 
 from cleargs.cli.main import invoke
-from cleargs.pipeline.config import load_config, override
+from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.splat.budget import Quality, budget_from_pixels, steps_from_frames
 from cleargs.splat.config import TrainConfig
@@ -53,7 +53,7 @@ def test_a_training_decides_for_itself() -> None:
 
 
 def test_quality_reaches_every_training() -> None:
-    config = override(installed(), load_config(installed(), "default"), ["g0.quality=high"])
+    config = load_config(installed(), "default", ["g0.quality=high"])
     g0: Any = config.sections["g0"]
     later: list[Any] = [config.sections["rivr"], config.sections["consolidate"]]
     assert [stage.distil.applied_to(g0, 3).length * 16 for stage in later] == [
