@@ -16,7 +16,7 @@ from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE
-from cleargs.pipeline.session import SCENE, scene_stage
+from cleargs.run_results import SCENE, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
