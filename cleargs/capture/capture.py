@@ -1,5 +1,4 @@
-"""What a capture consists of, its frames in order with the cameras and poses that the input brings, and how
-an input of some layout is read."""
+"""Types of a capture: its frames in order, the cameras and poses that the input brings, and its layout."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from cleargs.capture.model import SparseModel
 
 External: TypeAlias = Path | Mapping[str, Path]
-"""What is read of an input: one file, all of a folder that are not hidden, or single ones by name."""
+"""Files that are read of an input: one file, all of a folder that are not hidden, or single ones by name."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Capture:
 
 
 class Layout(Protocol):
-    """How an input is read; a module, say.
+    """Reader of one kind of input; a module, say.
 
     Another package's layout is taken by name and needs no ``detect``.
     """

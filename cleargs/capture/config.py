@@ -13,7 +13,7 @@ SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPEN
 
 
 class CaptureConfig(Record):
-    """How an input is read, and which of its frames are taken."""
+    """Reading of an input, and choice of its frames."""
 
     fps: float | None = Field(
         None,
@@ -43,7 +43,7 @@ class CaptureConfig(Record):
 
 
 class SfmConfig(Record):
-    """How poses and sparse points are found."""
+    """Search for poses and sparse points."""
 
     refine_above: float = Field(
         0.6,

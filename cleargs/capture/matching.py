@@ -1,4 +1,4 @@
-"""Which frames are matched with which, and how: by processes of one thread each.
+"""Pairs of frames to match, and their matching by processes of one thread each.
 
 Pairs are all with all, or neighbours and distant frames that look alike. That needs no vocabulary from
 elsewhere: the words are clustered from the capture's own descriptors.

@@ -44,7 +44,7 @@ _ADVICE = (
 
 
 class Outcome(Record):
-    """How a model came about."""
+    """Origin of a model, as COLMAP's process notes it."""
 
     placed: dict[str, str]
     """How SfM placed each working image, or why it did not; empty where the input brought poses."""

@@ -93,7 +93,7 @@ class QwenConfig(Settings):
 
 
 class EvaluatorConfig(Record):
-    """Who judges the appearance of frames."""
+    """Choice of the evaluator that judges the appearance of frames."""
 
     evaluator: str = Field(
         "statistics",
@@ -132,7 +132,7 @@ class EvaluatorConfig(Record):
 
 
 class ScoreConfig(Settings):
-    """How cues become scores, and which frames are reliable."""
+    """Scores from cues, and the reliable set."""
 
     stand_in_share: ClassVar[float] = 0.10
     """When no frame is reliable, this share of the registered frames (at least one), best by R - B, stands in
@@ -159,7 +159,7 @@ class ScoreConfig(Settings):
 
 
 class GeometryConfig(Record):
-    """How poses and observations become geometric evidence."""
+    """Geometric evidence from poses and observations."""
 
     frames_per_bin: int = Field(
         8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
@@ -183,7 +183,7 @@ class GeometryConfig(Record):
 
 
 class AllocationConfig(ScoreConfig):
-    """How scores and geometry become roles and weights."""
+    """Roles and weights from scores and geometry."""
 
     enabled: bool = Field(
         True,
