@@ -1,0 +1,129 @@
+"""Imports point downwards: a module imports from its own package or from lower layers, and no import cycle exists."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("cleargs",),  # root modules: types, errors, io, logging
+    ("cleargs.media",),
+    ("cleargs.capture", "cleargs.models", "cleargs.splat"),
+    ("cleargs.formation", "cleargs.rva"),
+    ("cleargs.rivr", "cleargs.evaluate", "cleargs.synth"),
+    ("cleargs.pipeline",),
+    ("cleargs.run_results",),  # what a finished run holds, read back
+    ("cleargs.report", "cleargs.render"),
+    ("cleargs.api",),
+    ("cleargs.stages", "cleargs.workflows"),
+    ("cleargs.batch",),
+    ("cleargs.cli",),
+)
+"""Packages from the bottom up. A module belongs to the longest name that it starts with."""
+
+PIPELINE = "cleargs.pipeline"
+"""It knows stages by a protocol alone, so it imports root modules only."""
+
+
+def modules() -> dict[str, Path]:
+    """Dotted name -> file of every module that is installed."""
+    found = {}
+    for package, folder in (("cleargs", ROOT / "cleargs"), ("cleargs.stages", ROOT / "stages")):
+        for path in sorted(folder.rglob("*.py")):
+            parts = path.relative_to(folder).with_suffix("").parts
+            parts = parts[:-1] if parts[-1] == "__init__" else parts
+            found[".".join((package, *parts))] = path
+    return found
+
+
+def imports(path: Path, known: Mapping[str, Path]) -> set[str]:
+    """Modules of ours that a file imports, also inside functions and for type checking."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                names.add(inner if inner in known else node.module)
+    return names & known.keys()
+
+
+def package_of(module: str) -> str:
+    """The package of `LAYERS` that holds a module."""
+    packages = [name for layer in LAYERS for name in layer]
+    return max((name for name in packages if f"{module}.".startswith(f"{name}.")), key=len)
+
+
+def upward(graph: Mapping[str, set[str]]) -> Iterator[str]:
+    """One line for each import that does not point to the own package or to a lower layer."""
+    level = {name: number for number, layer in enumerate(LAYERS) for name in layer}
+    for module, targets in sorted(graph.items()):
+        for target in sorted(targets):
+            here, there = package_of(module), package_of(target)
+            into_domain = here == PIPELINE and there not in (PIPELINE, "cleargs")
+            if here != there and (level[there] >= level[here] or into_domain):
+                yield f"{module} imports {target}"
+
+
+def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that import each other (strongly connected components of more than one module)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(module: str) -> None:
+        index[module] = low[module] = len(index)
+        stack.append(module)
+        for target in graph[module]:
+            if target not in index:
+                visit(target)
+                low[module] = min(low[module], low[target])
+            elif target in stack:
+                low[module] = min(low[module], index[target])
+        if low[module] == index[module]:
+            group = []
+            while not group or group[-1] != module:
+                group.append(stack.pop())
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for module in graph:
+        if module not in index:
+            visit(module)
+    return found
+
+
+def graph() -> dict[str, set[str]]:
+    """Module -> modules that it imports."""
+    known = modules()
+    return {name: imports(path, known) - {name} for name, path in known.items()}
+
+
+def test_imports_point_downwards() -> None:
+    assert not list(upward(graph()))
+
+
+def test_no_import_cycle() -> None:
+    assert not cycles(graph())
+
+
+def test_a_cycle_is_named() -> None:
+    """The check itself: a circle of three and an import that climbs are found."""
+    circle = {"cleargs.splat.a": {"cleargs.splat.b"}, "cleargs.splat.b": {"cleargs.splat.c"}}
+    circle |= {"cleargs.splat.c": {"cleargs.splat.a"}, "cleargs.media.d": {"cleargs.splat.a"}}
+    assert cycles(circle) == [["cleargs.splat.a", "cleargs.splat.b", "cleargs.splat.c"]]
+    assert list(upward(circle)) == ["cleargs.media.d imports cleargs.splat.a"]
+
+
+def test_the_pipeline_loads_without_the_domain() -> None:
+    """Importing the runner imports neither torch nor a stage."""
+    code = "import sys, cleargs.pipeline.runner; print(*[n for n in ('torch', 'cleargs.splat') if n in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not loaded.split()
