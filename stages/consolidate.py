@@ -138,8 +138,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         supervision.held_back,
         g0.fidelity(supervision.judges, scorer, threads),
         consolidated.fidelity(supervision.judges, scorer, threads),
-        psnr_margin=harm.psnr_margin,
-        score_margin=harm.score_margin,
+        harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)
     if rejected is not None:

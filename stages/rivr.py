@@ -245,13 +245,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
 
     before = g0.fidelity(supervision.judges, rules.primary, threads)
     after = current.fidelity(supervision.judges, rules.primary, threads)
-    verdict = judge_harm(
-        supervision.held_back,
-        before,
-        after,
-        psnr_margin=config.harm.psnr_margin,
-        score_margin=config.harm.score_margin,
-    )
+    verdict = judge_harm(supervision.held_back, before, after, config.harm)
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
     final, rejected = (current, None) if verdict.harm is None else (g0, current)

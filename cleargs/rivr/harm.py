@@ -67,9 +67,7 @@ class Verdict:
         return asdict(self) | {"frames": list(self.frames)}
 
 
-def judge_harm(
-    frames: Sequence[int], before: Fidelity, after: Fidelity, *, psnr_margin: float, score_margin: float
-) -> Verdict:
+def judge_harm(frames: Sequence[int], before: Fidelity, after: Fidelity, limits: HarmConfig) -> Verdict:
     """Compare a distilled scene with G0 on the held-back ``frames``.
 
     Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
@@ -79,9 +77,9 @@ def judge_harm(
     if not frames:
         return Verdict((), None, None, None, None, harm=None)
     worse = []
-    if after.mean_psnr < before.mean_psnr - psnr_margin:
+    if after.mean_psnr < before.mean_psnr - limits.psnr_margin:
         worse.append(f"PSNR fell by {before.mean_psnr - after.mean_psnr:.2f} dB")
-    if after.mean_score < before.mean_score - score_margin:
+    if after.mean_score < before.mean_score - limits.score_margin:
         worse.append(f"primary score fell by {before.mean_score - after.mean_score:.2f}")
     return Verdict(
         frames=tuple(frames),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from cleargs.rivr.harm import Fidelity, Verdict, judge_harm
+from cleargs.rivr.harm import Fidelity, HarmConfig, Verdict, judge_harm
 
 
 def verdict(psnr: float, score: float) -> Verdict:
     before = Fidelity((30.0, 20.0), (60.0, 70.0))
     after = Fidelity((30.0 + psnr, 20.0 + psnr), (60.0 + score, 70.0 + score))
-    return judge_harm([3, 9], before, after, psnr_margin=0.5, score_margin=1.0)
+    return judge_harm([3, 9], before, after, HarmConfig(psnr_margin=0.5, score_margin=1.0))
 
 
 def test_small_losses_are_no_harm() -> None:
