@@ -92,8 +92,8 @@ class _OpenRasteriser(CpuRasteriser):
 
     @property
     def frame(self) -> Frame:
-        assert self._frame is not None
-        return self._frame
+        frame: Frame = self._frame
+        return frame
 
 
 def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
