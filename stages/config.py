@@ -61,7 +61,8 @@ class DistilConfig(Settings):
         None,
         ge=1,
         le=1_000_000,
-        description="optimisation steps, one view each; unset = a sixteenth of a first scene's",
+        description="optimisation steps, one view each; unset = a sixteenth of a first scene's. What this "
+        "table does not name is as in [g0]",
     )
     begin: float = Field(0.0, ge=0, lt=1, description="share of the schedule that lies behind when it begins")
     end: float = Field(1.0, gt=0, le=1, description="share of the schedule that lies behind when it ends")

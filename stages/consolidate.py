@@ -32,7 +32,7 @@ class ConsolidateConfig(Settings):
 
     scorer: str = Field(
         "clarity-net",
-        description="measures harm: the name of a scorer, or the path of an ONNX file",
+        description="measures harm, whose limits are in [rivr.harm]: the name of a scorer, or an ONNX file",
         json_schema_extra={"key": False, "plugin": "scorers"},  # its content is in the key
     )
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
