@@ -48,7 +48,7 @@ print(*(digest(threads) for threads in (1, 2, 16, 16)))
 
 
 def run() -> list[str]:
-    here = Path(__file__).parent
+    here = Path(__file__).parents[1]
     environment = os.environ | {"NUMBA_NUM_THREADS": "16", "PYTHONPATH": str(here)}
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False
@@ -76,7 +76,8 @@ print(hashlib.sha256(project(make_gaussians(camera, 200), camera)[0].tobytes()).
 @pytest.mark.slow
 def test_a_kernel_compiled_just_now_rounds_like_one_from_the_cache(tmp_path: Path):
     here = Path(__file__).parent
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here)}
+    paths = f"{here}{os.pathsep}{here.parent}"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": paths}
     compiled, loaded = (
         subprocess.run(
             [sys.executable, "-c", PROJECTION], env=environment, capture_output=True, text=True, check=True

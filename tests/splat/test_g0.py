@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -241,5 +242,7 @@ def test_nothing_is_compiled_once_the_time_left_is_told(capture: Path, tmp_path:
         "print(sorted(watch.found))\n"
     )
     command = [sys.executable, "-c", program, str(capture), str(tmp_path)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=Path(__file__).parent)
+    here = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     assert done.stdout == "[]\n"
