@@ -14,7 +14,10 @@ from types import FrameType
 from cleargs.text import printable
 
 GRACE_S = 1.0
-"""Time that the ordinary way out may take after a signal."""
+"""Time that the ordinary way out may take after Ctrl-C."""
+
+SAVING_S = 20.0
+"""Time that it may take after SIGTERM: a training ends its step and saves a checkpoint."""
 
 INTERRUPTED = "interrupted; finished work is kept, and the same command resumes from there"
 
@@ -26,8 +29,8 @@ def answer_signals() -> None:
     """Turn SIGINT and SIGTERM into KeyboardInterrupt, with a way out for when Python cannot raise it.
 
     Python raises it only between two of its instructions, so a long call into compiled code would delay
-    it. A waiting thread then ends the process after `GRACE_S`. That is safe for the results: they survive
-    kill -9 at any moment.
+    it. A waiting thread then ends the process after `GRACE_S` or `SAVING_S`. That is safe for the results:
+    they survive kill -9 at any moment.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -40,8 +43,8 @@ def answer_signals() -> None:
 
     def end_after_signal() -> None:
         while True:
-            if not set(_SIGNALS).isdisjoint(os.read(reader, 16)):
-                time.sleep(GRACE_S)
+            if received := set(_SIGNALS).intersection(os.read(reader, 16)):
+                time.sleep(GRACE_S if signal.SIGINT in received else SAVING_S)
                 os.write(2, f"{INTERRUPTED}\n".encode())
                 os._exit(130)
 

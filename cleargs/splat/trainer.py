@@ -36,6 +36,7 @@ from cleargs.splat.strategy.mcmc import MCMC
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
 from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, View, require_views
+from cleargs.termination import deferred_sigterm
 
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
@@ -80,7 +81,7 @@ def train(
     one, to the same result bit for bit. Beside each checkpoint lies a preview.
 
     Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
-    loss ceases to be finite.
+    loss ceases to be finite, KeyboardInterrupt behind a checkpoint after a SIGTERM that the program answers.
     """
     trainer = Trainer(
         scene,
@@ -100,11 +101,18 @@ def train(
         trainer.restore(saved)
         reporter.info(f"{label}: resuming from step {trainer.done} of {trainer.length}")
     backend_for(device).warm_up()  # before the bar, or half a minute of compiling would count as pace
-    with support.memory_errors(), reporter.task(label, total=trainer.length) as task:
+    with (
+        support.memory_errors(),
+        deferred_sigterm() as terminated,
+        reporter.task(label, total=trainer.length) as task,
+    ):
         progress = _Progress(task, trainer)
         while trainer.done < trainer.length:
             trainer.step()
-            due = trainer.done % config.checkpoint_interval == 0 and trainer.done < trainer.length
+            stopped = terminated()
+            due = stopped or (
+                trainer.done % config.checkpoint_interval == 0 and trainer.done < trainer.length
+            )
             if trainer.done % _NOTE_INTERVAL == 0:
                 progress.show()
             if due or trainer.done % _CHECK_INTERVAL == 0:
@@ -112,6 +120,8 @@ def train(
             if due:
                 save_state(checkpoint, trainer.state())
                 write_preview(checkpoint.with_name(PREVIEW), trainer.preview())
+            if stopped:
+                raise KeyboardInterrupt
         trainer.check_finite()
         progress.show()
     state = {name: tensor.cpu() for name, tensor in trainer.state().items()}

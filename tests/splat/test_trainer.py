@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -259,6 +261,35 @@ def test_resumed_equals_undisturbed(
     assert saved is not None
     assert int(saved["step"]) == 21  # the last multiple of the interval
     assert_same(whole, run(pictures, tmp_path / "cut", formation=affines()))
+
+
+def test_sigterm_leads_to_a_checkpoint(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Step 10 is no multiple of the interval: the checkpoint is there because of the signal."""
+    whole = run(pictures, tmp_path / "whole")
+    take = Trainer.step
+
+    def step(trainer: Trainer) -> None:
+        take(trainer)
+        if trainer.done == 10:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def answer(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Trainer, "step", step)
+    before = signal.signal(signal.SIGTERM, answer)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(pictures, tmp_path / "cut")
+        assert signal.getsignal(signal.SIGTERM) is answer
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    monkeypatch.undo()
+    saved = load_state(tmp_path / "cut" / "state.safetensors", SilentReporter())
+    assert saved is not None and int(saved["step"]) == 10
+    assert_same(whole, run(pictures, tmp_path / "cut"))
 
 
 def test_a_damaged_checkpoint_is_ignored(pictures: list[np.ndarray], tmp_path: Path) -> None:
