@@ -137,8 +137,9 @@ def _copy_before(stage: str, finished: Path, run: Path) -> None:
 
 
 def _times(run: Path) -> dict[Path, int]:
-    """When each file was last written; the memo of digests is a cache that reading may fill."""
-    files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith("digests.sqlite"))
+    """When each file was last written; a lock names its holder, and reading may fill the memo of digests."""
+    passing = (".lock", "digests.sqlite")
+    files = (path for path in run.rglob("*") if path.is_file() and not path.name.startswith(passing))
     return {path: path.stat().st_mtime_ns for path in files}
 
 

@@ -170,15 +170,13 @@ class _Run:
         rows = self._rows
         unplaced = sum(row.role == UNPLACED for row in rows)
         available = self._figure("ingest", "frames_available") or 0
-        fps, most = self._setting("ingest", "fps"), self._setting("ingest", "max_frames")
         more: tuple[str, ...] = ()  # the setting that limits the frames of a capture, where there are more
         if available > len(rows):
-            by_rate = fps is not None and len(rows) < most
-            more = (
-                f"ingest.fps={2 * fps:g}"
-                if by_rate
-                else f"ingest.max_frames={min(available, 2 * len(rows))}",
-            )
+            fps = self._setting("ingest", "fps")
+            if fps is not None and len(rows) < self._setting("ingest", "max_frames"):
+                more = (f"ingest.fps={2 * fps:g}",)
+            else:
+                more = (f"ingest.max_frames={min(available, 2 * len(rows))}",)
         if rows and unplaced > (1.0 - FEW_PLACED) * len(rows):
             all_pairs = len(rows) < self._setting("ingest", "exhaustive_below")
             overlap = () if all_pairs else (f"ingest.overlap={2 * self._setting('ingest', 'overlap')}",)
