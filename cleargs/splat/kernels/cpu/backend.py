@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import adam, affine_colour, frame_warp, launch, loss, position_noise
+from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
 from cleargs.splat.kernels.cpu.jit import Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
@@ -112,7 +112,7 @@ def adam_step(step: AdamStep) -> None:
     corrected = np.broadcast_to(rates / (1.0 - beta1**number), (columns,)).astype(np.float32)
     parameter, gradient, first, second = (tensor.detach().view(-1).numpy() for tensor in step.tensors)
     with launch.exclusive():
-        adam.adam(
+        elementwise.adam(
             parameter,
             gradient,
             first,
@@ -173,7 +173,7 @@ def add_position_noise(
 ) -> None:
     key = np.random.SeedSequence([*seed]).generate_state(1, np.uint64)[0]
     with launch.exclusive():
-        position_noise.add_noise(
+        elementwise.add_noise(
             gaussians.means.numpy(),
             gaussians.log_scales.numpy(),
             gaussians.rotations.numpy(),
@@ -191,7 +191,7 @@ def add_position_noise(
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     output = torch.empty(image.shape)
     with launch.exclusive():
-        affine_colour.apply_affine(
+        elementwise.apply_affine(
             image.detach().contiguous().numpy(), affine.detach().float().contiguous().numpy(), output.numpy()
         )
     return output
@@ -201,7 +201,7 @@ def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple
     grad_image = torch.empty(image.shape)
     row_sums = np.empty((image.shape[0], 3, 4), np.float64)
     with launch.exclusive():
-        affine_colour.affine_backward(
+        elementwise.affine_backward(
             image.detach().contiguous().numpy(),
             affine.detach().float().contiguous().numpy(),
             grad_output.detach().contiguous().numpy(),
