@@ -40,9 +40,9 @@ from cleargs.splat.kernels.cpu.pixel import (
     plus_scaled,
     scaled,
     shares,
-    store,
     sum_of,
 )
+from cleargs.splat.kernels.cpu.simd import store
 from cleargs.splat.kernels.warp_layout import CHANNELS
 
 BAND = 32

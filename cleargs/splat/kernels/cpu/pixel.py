@@ -12,13 +12,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import types
 
-from cleargs.splat.kernels.cpu.simd import (
-    _FLAGS,
-    _broadcast_to,
-    _element_address,
-    _intrinsic,
-    _register_type,
-)
+from cleargs.splat.kernels.cpu.simd import _FLAGS, _broadcast_to, _intrinsic, _load, _register_type
 from cleargs.splat.kernels.warp_layout import CHANNELS
 
 _PIXEL = ir.VectorType(ir.FloatType(), CHANNELS)
@@ -53,20 +47,6 @@ def _plus(builder: Any, x: Any, y: Any) -> Any:
     return builder.fadd(x, y, flags=_FLAGS)
 
 
-def _at(context: Any, builder: Any, sig: Any, args: Any, vector: Any) -> Any:
-    address = _element_address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-    return builder.bitcast(address, vector.as_pointer())
-
-
-def _load(vector: Any) -> Any:
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = builder.load(_at(context, builder, sig, args, vector))
-        value.align = 4
-        return value
-
-    return generate
-
-
 @_intrinsic
 def black(typing_context: Any) -> Any:
     """A pixel of zeros."""
@@ -89,17 +69,6 @@ def load_pixel(typing_context: Any, array: Any, offset: Any) -> Any:
 def load_pair(typing_context: Any, array: Any, offset: Any) -> Any:
     """The pixel at ``offset`` and the one right of it."""
     return pair(array, offset), _load(_PAIR)
-
-
-@_intrinsic
-def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write a pixel or a pair at ``offset``."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _at(context, builder, sig, args, args[2].type)).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, offset, value), generate
 
 
 @_intrinsic

@@ -144,37 +144,34 @@ def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
-def _element_address(
-    context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any
-) -> Any:
-    offset = context.cast(builder, index, index_type, types.intp)
-    return builder.gep(_make_array(array_type)(context, builder, array).data, [offset])
+def _address(context: Any, builder: Any, sig: Any, args: Any, to: Any = _VECTOR) -> Any:
+    """Where element ``args[1]`` of the array ``args[0]`` lies, as an address of a ``to``."""
+    offset = context.cast(builder, args[1], sig.args[1], types.intp)
+    data = _make_array(sig.args[0])(context, builder, args[0]).data
+    return builder.bitcast(builder.gep(data, [offset]), to.as_pointer())
 
 
-def _address(context: Any, builder: Any, array_type: Any, array: Any, index_type: Any, index: Any) -> Any:
-    address = _element_address(context, builder, array_type, array, index_type, index)
-    return builder.bitcast(address, _VECTOR.as_pointer())
+def _load(vector: Any) -> Callable[..., Any]:
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = builder.load(_address(context, builder, sig, args, vector))
+        value.align = 4
+        return value
+
+    return generate
 
 
 @_intrinsic
 def load(typing_context: Any, array: Any, offset: Any) -> Any:
     """LANES consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = builder.load(_address(context, builder, sig.args[0], args[0], sig.args[1], args[1]))
-        value.align = 4
-        return value
-
-    return lanes(array, offset), generate
+    return lanes(array, offset), _load(_VECTOR)
 
 
 @_intrinsic
 def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write all lanes to consecutive elements of a float32 array."""
+    """Write lanes (or what `pixel` has) to consecutive elements of a float32 array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-        builder.store(args[2], address).align = 4
+        builder.store(args[2], _address(context, builder, sig, args, args[2].type)).align = 4
         return context.get_dummy_value()
 
     return types.void(array, offset, value), generate
@@ -182,8 +179,7 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 
 def _prefetch(write: int) -> Callable[..., Any]:
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = _address(context, builder, sig.args[0], args[0], sig.args[1], args[1])
-        address = builder.bitcast(address, _BYTES)
+        address = builder.bitcast(_address(context, builder, sig, args), _BYTES)
         function_type = ir.FunctionType(ir.VoidType(), [_BYTES, _I32, _I32, _I32])
         function = _declare(builder.module, function_type, "llvm.prefetch.p0")
         keep, data = ir.Constant(_I32, 3), ir.Constant(_I32, 1)
@@ -350,9 +346,7 @@ def store_lane_sums(
         total = rows[0]
         if block == 2:
             total = _add_picked(builder, total, total, list(range(0, LANES, 2)), list(range(1, LANES, 2)))
-        offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        data = _make_array(sig.args[0])(context, builder, args[0]).data
-        address = builder.bitcast(builder.gep(data, [offset]), ir.VectorType(_F32, SUMS).as_pointer())
+        address = _address(context, builder, sig, args, ir.VectorType(_F32, SUMS))
         builder.store(total, address).align = 4
         return context.get_dummy_value()
 
