@@ -12,6 +12,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
 from cleargs.splat.kernels.cpu import binning, projection
+from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.kernels.splat_layout import SPLAT_COLUMNS, TILE
 from cleargs.splat.render import render
 
@@ -68,7 +69,7 @@ def project(gaussians, camera, antialias=False):
         np.empty(n, np.float32),
     )
     arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
-    view = projection.view_of(camera)
+    view = projection.View(*view_numbers(camera))
     projection.project(*arrays, 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
     return splats, tiles, radii
 

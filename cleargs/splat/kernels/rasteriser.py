@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cleargs.errors import InputError, StageError
 from cleargs.splat.camera import Camera
-from cleargs.splat.constants import SH_DEGREES
+from cleargs.splat.constants import SH_DEGREES, VIEW_CLAMP
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.support import available_memory
 from cleargs.splat.kernels.splat_layout import MAX_PAIRS, TILE
@@ -42,6 +42,25 @@ def sh_count(gaussians: Gaussians, sh_degree: int | None) -> int:
 def tiles_of(camera: Camera) -> int:
     """Number of tiles of an image."""
     return -(-camera.width // TILE) * -(-camera.height // TILE)
+
+
+def view_numbers(camera: Camera) -> list[float]:
+    """A camera as the kernels read it: rotation rows and translation from the world to it, centre,
+    intrinsics, and gsplat's bounds of x/z and y/z in the Jacobian (left, right, top, bottom)."""
+    pose = camera.world_to_camera
+    beyond_x = VIEW_CLAMP * 0.5 * camera.width / camera.fx
+    beyond_y = VIEW_CLAMP * 0.5 * camera.height / camera.fy
+    numbers = [
+        *pose[:3, :3].ravel().tolist(),
+        *pose[:3, 3].tolist(),
+        *camera.centre.tolist(),
+        *(camera.fx, camera.fy, camera.cx, camera.cy),
+        -camera.cx / camera.fx - beyond_x,
+        (camera.width - camera.cx) / camera.fx + beyond_x,
+        -camera.cy / camera.fy - beyond_y,
+        (camera.height - camera.cy) / camera.fy + beyond_y,
+    ]
+    return [float(number) for number in numbers]
 
 
 class Buffers:

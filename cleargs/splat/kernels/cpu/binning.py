@@ -17,19 +17,8 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat import constants
+from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.jit import Array, Floats, exact, kernel, serial_kernel
-from cleargs.splat.kernels.splat_layout import (
-    BEND_X,
-    BEND_Y,
-    DEPTH,
-    EXTENT_X_AT,
-    EXTENT_Y,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    SKEW,
-    TILE,
-)
 
 REACH_MARGIN = 2e-3
 """Ellipses are taken larger by this much in log2(alpha); the rasteriser decides pixel by pixel."""
@@ -46,20 +35,20 @@ RADIX_PASSES = 3
 def tile_range(low: float, high: float, tiles: int) -> tuple[int, int]:
     """Tiles [begin, end) that hold a pixel centre of the interval [low, high] px; empty when begin == end."""
     # Bounded as floats first: the conversion of huge numbers to integers is undefined.
-    limit = np.float64(tiles * TILE)
+    limit = np.float64(tiles * layout.TILE)
     first = min(max(np.ceil(low - PIXEL_CENTRE), 0.0), limit)
     last = min(max(np.floor(high - PIXEL_CENTRE), -1.0), limit - 1.0)
     if not first <= last:
         return 0, 0
-    return int(first) // TILE, int(last) // TILE + 1
+    return int(first) // layout.TILE, int(last) // layout.TILE + 1
 
 
 @exact
 def tile_rows(splat: Floats, height: int) -> tuple[int, int]:
     """Rows of tiles that the ellipse alpha >= 1/255 may touch."""
-    mean = np.float64(splat[MEAN_Y])
-    extent = np.float64(splat[EXTENT_Y]) * 1.001 + 0.001
-    return tile_range(mean - extent, mean + extent, (height + TILE - 1) // TILE)
+    mean = np.float64(splat[layout.MEAN_Y])
+    extent = np.float64(splat[layout.EXTENT_Y]) * 1.001 + 0.001
+    return tile_range(mean - extent, mean + extent, (height + layout.TILE - 1) // layout.TILE)
 
 
 @exact
@@ -70,20 +59,20 @@ def tile_columns(splat: Floats, row: int, width: int) -> tuple[int, int]:
     it is largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge
     is its mirror image.
     """
-    extent = np.float64(splat[EXTENT_Y]) * 1.001 + 0.001
-    at = np.float64(splat[EXTENT_X_AT])
-    low = max(row * TILE + PIXEL_CENTRE - np.float64(splat[MEAN_Y]), -extent)
-    high = min((row + 1) * TILE - PIXEL_CENTRE - np.float64(splat[MEAN_Y]), extent)
+    extent = np.float64(splat[layout.EXTENT_Y]) * 1.001 + 0.001
+    at = np.float64(splat[layout.EXTENT_X_AT])
+    low = max(row * layout.TILE + PIXEL_CENTRE - np.float64(splat[layout.MEAN_Y]), -extent)
+    high = min((row + 1) * layout.TILE - PIXEL_CENTRE - np.float64(splat[layout.MEAN_Y]), extent)
     right_at = min(max(at, low), high)
     left_at = min(max(-at, low), high)
-    bend_x = max(np.float64(splat[BEND_X]), 1e-30)
-    bend_y = np.float64(splat[BEND_Y])
-    reach = np.float64(splat[LOG2_OPACITY]) - LOG2_ALPHA_CUT
-    skew = np.float64(splat[SKEW])
+    bend_x = max(np.float64(splat[layout.BEND_X]), 1e-30)
+    bend_y = np.float64(splat[layout.BEND_Y])
+    reach = np.float64(splat[layout.LOG2_OPACITY]) - LOG2_ALPHA_CUT
+    skew = np.float64(splat[layout.SKEW])
     right = skew * right_at + math.sqrt(max(reach - bend_y * right_at * right_at, 0.0) / bend_x)
     left = skew * left_at - math.sqrt(max(reach - bend_y * left_at * left_at, 0.0) / bend_x)
-    mean = np.float64(splat[MEAN_X])
-    return tile_range(mean + left - 1e-3, mean + right + 1e-3, (width + TILE - 1) // TILE)
+    mean = np.float64(splat[layout.MEAN_X])
+    return tile_range(mean + left - 1e-3, mean + right + 1e-3, (width + layout.TILE - 1) // layout.TILE)
 
 
 @exact
@@ -122,7 +111,7 @@ def depth_order(splats: Floats, tile_counts: Array, keys: Array, ids: Array) -> 
     n = 0
     for g in range(tile_counts.shape[0]):
         if tile_counts[g] > 0:
-            key = splats[g, DEPTH : DEPTH + 1].view(np.uint32)[0]
+            key = splats[g, layout.DEPTH : layout.DEPTH + 1].view(np.uint32)[0]
             keys[0, n] = key
             ids[0, n] = g
             n += 1
@@ -152,7 +141,7 @@ def depth_order(splats: Floats, tile_counts: Array, keys: Array, ids: Array) -> 
 def list_pairs(splats: Floats, pair_offsets: Array, width: int, height: int, pair_tiles: Array) -> None:
     """The tile of every pair [P], Gaussian-major, row by row."""
     n = splats.shape[0]
-    tiles_x = (width + TILE - 1) // TILE
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
     for block in prange((n + BLOCK - 1) // BLOCK):
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             pair = pair_offsets[g]

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
+from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.harmonics import sh_basis, sh_direction_gradient
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
 from cleargs.splat.kernels.cpu.projection import (
@@ -25,22 +26,6 @@ from cleargs.splat.kernels.cpu.projection import (
     residual,
     scaled_axes,
     unit_quaternion,
-)
-from cleargs.splat.kernels.splat_layout import (
-    BLUE,
-    GREEN,
-    PAIR_COLUMNS,
-    RED,
-    SUM_BLUE,
-    SUM_DEPTH,
-    SUM_GREEN,
-    SUM_RED,
-    SUM_V,
-    SUM_VU,
-    SUM_VUU,
-    SUM_VUY,
-    SUM_VY,
-    SUM_VYY,
 )
 
 
@@ -76,9 +61,9 @@ def colour_gradient(
     weights: Floats,
 ) -> tuple[float, float, float]:
     """Write dL/dSH of one Gaussian and return dL/d(direction). No gradient where the colour is clamped."""
-    red = np.float32(sums[SUM_RED]) if splat[RED] > ZERO else ZERO
-    green = np.float32(sums[SUM_GREEN]) if splat[GREEN] > ZERO else ZERO
-    blue = np.float32(sums[SUM_BLUE]) if splat[BLUE] > ZERO else ZERO
+    red = np.float32(sums[layout.SUM_RED]) if splat[layout.RED] > ZERO else ZERO
+    green = np.float32(sums[layout.SUM_GREEN]) if splat[layout.GREEN] > ZERO else ZERO
+    blue = np.float32(sums[layout.SUM_BLUE]) if splat[layout.BLUE] > ZERO else ZERO
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     sh_basis(sh_count, x, y, z, basis)
     for k in range(sh_count):
@@ -130,24 +115,24 @@ def backpropagate_one(
     a = 1.0 / (dot(w, w) + DILATION * (1.0 + k * k))
 
     # ln alpha = ln opacity - ½ a u² - ½ e dy²,  u = dx - k dy
-    grad_mean_x = a * sums[SUM_VU]
-    grad_mean_y = e * sums[SUM_VY] - k * grad_mean_x
-    grad_logits[g] = sums[SUM_V] / (1.0 + math.exp(np.float64(logits[g])))
+    grad_mean_x = a * sums[layout.SUM_VU]
+    grad_mean_y = e * sums[layout.SUM_VY] - k * grad_mean_x
+    grad_logits[g] = sums[layout.SUM_V] / (1.0 + math.exp(np.float64(logits[g])))
     # d(ln alpha)/dk = a u dy,   dk = e [u1 · du0 + (w - k u1) · du1]
-    by_k = e * a * sums[SUM_VUY]
+    by_k = e * a * sums[layout.SUM_VUY]
     # d(ln alpha)/ds = ½ a² u²,  ds = 2 w · (du0 - k du1)
-    by_w = a * a * sums[SUM_VUU]
+    by_w = a * a * sums[layout.SUM_VUU]
     # d(ln alpha)/de = -½ dy²,   de = -2 e² u1 · du1
-    by_yy = e * e * sums[SUM_VYY]
+    by_yy = e * e * sums[layout.SUM_VYY]
     normal = (0.0, 0.0, 0.0)
     by_area = 0.0
     if antialias:
         # ln rho = ½ (ln |n|² - ln s - ln Σyy),  n = w x u1 = u0 x u1,
         # d ln |n|² = 2 [(u1 x n) · du0 + (n x u0) · du1] / |n|²
-        by_w -= a * sums[SUM_V]
-        by_yy -= e * sums[SUM_V]
+        by_w -= a * sums[layout.SUM_V]
+        by_yy -= e * sums[layout.SUM_V]
         normal = cross(w, u1)
-        by_area = sums[SUM_V] / dot(normal, normal)
+        by_area = sums[layout.SUM_V] / dot(normal, normal)
     side0, side1 = cross(u1, normal), cross(normal, u0)
     v0 = (
         by_w * w[0] + by_k * u1[0] + by_area * side0[0],
@@ -216,7 +201,7 @@ def backpropagate_one(
     grad_tangent_x = grad_mean_x * view.fx - (grad_jxz * jx if bounded_x == tangent_x else 0.0)
     grad_tangent_y = grad_mean_y * view.fy - (grad_jyz * jy if bounded_y == tangent_y else 0.0)
     grad_z = (
-        sums[SUM_DEPTH]
+        sums[layout.SUM_DEPTH]
         - (grad_tangent_x * tangent_x + grad_tangent_y * tangent_y) / z
         - (grad_jx - grad_jxz * bounded_x) * jx / z
         - (grad_jy - grad_jyz * bounded_y) * jy / z
@@ -289,7 +274,7 @@ def backpropagate(
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis = np.empty(16, np.float32)
         weights = np.empty(16, np.float32)
-        sums = np.empty(PAIR_COLUMNS, np.float64)
+        sums = np.empty(layout.PAIR_COLUMNS, np.float64)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             begin, end = pair_offsets[g], pair_offsets[g + 1]
             if begin == end:

@@ -64,7 +64,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
     def _bin(self, asked: rasteriser.Frame, background: tuple[float, float, float], depth: bool) -> Frame:
         gaussians, camera = asked.gaussians, asked.camera
         n, width, height = gaussians.num, camera.width, camera.height
-        view = projection.view_of(camera)
+        view = projection.View(*rasteriser.view_numbers(camera))
         splats = self._floats("splats", n, SPLAT_COLUMNS)
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)

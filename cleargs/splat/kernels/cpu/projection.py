@@ -29,25 +29,10 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat import constants
-from cleargs.splat.camera import Camera
+from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import sh_basis
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
-from cleargs.splat.kernels.splat_layout import (
-    BEND_X,
-    BEND_Y,
-    BLUE,
-    DEPTH,
-    EXTENT_X,
-    EXTENT_X_AT,
-    EXTENT_Y,
-    GREEN,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    SKEW,
-)
 
 DILATION = constants.DILATION
 NEAR = constants.NEAR
@@ -89,25 +74,6 @@ class View(NamedTuple):
     right: float
     top: float
     bottom: float
-
-
-def view_of(camera: Camera) -> View:
-    """The kernel's view of a camera, with gsplat's bounds for the Jacobian."""
-    pose = camera.world_to_camera
-    beyond_x = constants.VIEW_CLAMP * 0.5 * camera.width / camera.fx
-    beyond_y = constants.VIEW_CLAMP * 0.5 * camera.height / camera.fy
-    return View._make(
-        [
-            *pose[:3, :3].ravel().tolist(),
-            *pose[:3, 3].tolist(),
-            *camera.centre.tolist(),
-            *(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)),
-            float(-camera.cx / camera.fx - beyond_x),
-            float((camera.width - camera.cx) / camera.fx + beyond_x),
-            float(-camera.cy / camera.fy - beyond_y),
-            float((camera.height - camera.cy) / camera.fy + beyond_y),
-        ]
-    )
 
 
 @device
@@ -234,19 +200,19 @@ def project_one(
         return False
 
     splat = splats[g]
-    splat[MEAN_X] = mean_x
-    splat[MEAN_Y] = mean_y
-    splat[BEND_X] = HALF_LOG2E / variance
-    splat[SKEW] = skew
-    splat[BEND_Y] = HALF_LOG2E / yy
-    splat[LOG2_OPACITY] = log2_opacity
-    splat[RED] = max(red + SH_OFFSET, ZERO)
-    splat[GREEN] = max(green + SH_OFFSET, ZERO)
-    splat[BLUE] = max(blue + SH_OFFSET, ZERO)
-    splat[DEPTH] = z
-    splat[EXTENT_X] = math.sqrt(reach * xx)
-    splat[EXTENT_Y] = math.sqrt(reach * yy)
-    splat[EXTENT_X_AT] = xy * math.sqrt(reach / xx)
+    splat[layout.MEAN_X] = mean_x
+    splat[layout.MEAN_Y] = mean_y
+    splat[layout.BEND_X] = HALF_LOG2E / variance
+    splat[layout.SKEW] = skew
+    splat[layout.BEND_Y] = HALF_LOG2E / yy
+    splat[layout.LOG2_OPACITY] = log2_opacity
+    splat[layout.RED] = max(red + SH_OFFSET, ZERO)
+    splat[layout.GREEN] = max(green + SH_OFFSET, ZERO)
+    splat[layout.BLUE] = max(blue + SH_OFFSET, ZERO)
+    splat[layout.DEPTH] = z
+    splat[layout.EXTENT_X] = math.sqrt(reach * xx)
+    splat[layout.EXTENT_Y] = math.sqrt(reach * yy)
+    splat[layout.EXTENT_X_AT] = xy * math.sqrt(reach / xx)
     return True
 
 
@@ -280,4 +246,4 @@ def project(
             ):
                 tiles = count_tiles(splats[g], width, height)
             tile_counts[g] = tiles
-            radii[g] = max(splats[g, EXTENT_X], splats[g, EXTENT_Y]) if tiles > 0 else ZERO
+            radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y]) if tiles > 0 else ZERO

@@ -33,6 +33,7 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat import constants
+from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.jit import Array, Floats, device, inlined, kernel
 from cleargs.splat.kernels.cpu.simd import (
     LANES,
@@ -52,23 +53,6 @@ from cleargs.splat.kernels.cpu.simd import (
     store,
     store_lane_sums,
 )
-from cleargs.splat.kernels.splat_layout import (
-    BEND_X,
-    BEND_Y,
-    BLUE,
-    DEPTH,
-    GREEN,
-    LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    SKEW,
-    SPLAT_COLUMNS,
-    SUM_BLUE,
-    SUM_DEPTH,
-    TILE,
-    TILE_PIXELS,
-)
 
 ZERO, ONE, HALF = (np.float32(x) for x in (0, 1, 0.5))
 ALPHA_MAX = np.float32(constants.ALPHA_MAX)
@@ -80,7 +64,7 @@ TOUCH_CUT = np.float32(constants.LOG2_ALPHA_CUT - 2e-3)
 BATCH = 16
 """So many splats are set up before they are blended. Then pieces with no live pixel are dropped."""
 
-PIECES = TILE_PIXELS // LANES
+PIECES = layout.TILE_PIXELS // LANES
 ALL_PIECES = np.int64(2**PIECES - 1)
 LAST_LANE = np.float32(LANES - 1)
 
@@ -146,43 +130,43 @@ def set_up_splat(
     splats: Floats, g: Any, left: np.float32, top: np.float32, buffer: Floats, geometry: int
 ) -> Any:
     """Write the splat's geometry in this tile and return the bit mask of the pieces that it touches."""
-    bend_x, bend_y, skew = splats[g, BEND_X], splats[g, BEND_Y], splats[g, SKEW]
-    dx, dy0 = left + HALF - splats[g, MEAN_X], top + HALF - splats[g, MEAN_Y]
+    bend_x, bend_y, skew = splats[g, layout.BEND_X], splats[g, layout.BEND_Y], splats[g, layout.SKEW]
+    dx, dy0 = left + HALF - splats[g, layout.MEAN_X], top + HALF - splats[g, layout.MEAN_Y]
     touched = np.int64(0)
-    for first in range(0, TILE, LANES):
+    for first in range(0, layout.TILE, LANES):
         offset = np.float32(first)
         dy = lane_numbers() + (dy0 + offset)
         ridge = dy * skew
-        row_log2 = splats[g, LOG2_OPACITY] - dy * dy * bend_y
+        row_log2 = splats[g, layout.LOG2_OPACITY] - dy * dy * bend_y
         store(buffer, geometry + ROW_LOG2 + first, row_log2)
         store(buffer, geometry + ROW_RIDGE + first, ridge)
         store(buffer, geometry + ROW_DY + first, dy)
         store(buffer, geometry + COLUMN_DX + first, lane_numbers() + (dx + offset))
-        for column in range(0, TILE, LANES):
+        for column in range(0, layout.TILE, LANES):
             # Which of the rows reach alpha >= 1/255 between the centres of the block's outer pixels.
             outer = dx + np.float32(column)
             nearest = minimum(maximum(ridge, broadcast(outer)), broadcast(outer + LAST_LANE)) - ridge
             rows = mask_bits(row_log2 - nearest * nearest * bend_x >= TOUCH_CUT)
-            touched |= rows << np.int64(column // LANES * TILE + first)
+            touched |= rows << np.int64(column // LANES * layout.TILE + first)
     return touched
 
 
 @inlined
 def row_of(piece: Any) -> Any:
     """Row of the tile in which a piece lies."""
-    return np.uint64(piece & (TILE - 1))
+    return np.uint64(piece & (layout.TILE - 1))
 
 
 @inlined
 def first_column(piece: Any) -> Any:
     """Column of the tile at which a piece starts."""
-    return np.uint64((piece // TILE) * LANES)
+    return np.uint64((piece // layout.TILE) * LANES)
 
 
 @inlined
 def splat_offset(pair_ids: Array, pair: Any) -> Any:
     """Place of a pair's splat in the array of splats."""
-    return np.uint64(pair_ids[np.uint64(pair)]) * np.uint64(SPLAT_COLUMNS)
+    return np.uint64(pair_ids[np.uint64(pair)]) * np.uint64(layout.SPLAT_COLUMNS)
 
 
 @device
@@ -213,8 +197,9 @@ def forward_tile(
             g = pair_ids[np.uint64(pair)]
             geometry = GEOMETRY_FORWARD + (pair - start) * GEOMETRY_SIZE
             touched = touches[np.uint64(pair - start)]
-            bend_x = splats[g, BEND_X]
-            red, green, blue, z = splats[g, RED], splats[g, GREEN], splats[g, BLUE], splats[g, DEPTH]
+            bend_x = splats[g, layout.BEND_X]
+            red, green, blue = splats[g, layout.RED], splats[g, layout.GREEN], splats[g, layout.BLUE]
+            z = splats[g, layout.DEPTH]
             number = broadcast(np.float32(pair - begin + 1))
             while touched != 0:
                 piece = lowest_bit(touched)
@@ -249,7 +234,7 @@ def forward_tile(
 @inlined
 def pixel_offset(row: int, column: int) -> Any:
     """Place of a tile's pixel in a buffer."""
-    return np.uint64((column // LANES) * (TILE * LANES) + row * LANES + column % LANES)
+    return np.uint64((column // LANES) * (layout.TILE * LANES) + row * LANES + column % LANES)
 
 
 @kernel
@@ -266,16 +251,16 @@ def forward(
     depth: Floats | None,
 ) -> None:
     """Image [H, W, 3], final transmittance [H, W], last contributor [H, W], and depth [H, W] or None."""
-    tiles_x = (width + TILE - 1) // TILE
-    tiles_y = (height + TILE - 1) // TILE
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    tiles_y = (height + layout.TILE - 1) // layout.TILE
     for tile in prange(tiles_x * tiles_y):
         buffer = np.empty(FORWARD_SIZE, np.float32)
         touches = np.empty(BATCH, np.int64)
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        left, top = (tile % tiles_x) * layout.TILE, (tile // tiles_x) * layout.TILE
+        columns, rows = min(layout.TILE, width - left), min(layout.TILE, height - top)
         for i in range(GEOMETRY_FORWARD):
             buffer[i] = ZERO
-        for i in range(TILE_PIXELS):
+        for i in range(layout.TILE_PIXELS):
             buffer[T_FORWARD + i] = -ONE
         for row in range(rows):
             for column in range(columns):
@@ -343,8 +328,9 @@ def backward_tile(
             g = pair_ids[np.uint64(pair)]
             geometry = GEOMETRY_BACKWARD + (pair - start) * GEOMETRY_SIZE
             touched = touches[np.uint64(pair - start)]
-            bend_x = splats[g, BEND_X]
-            red, green, blue, z = splats[g, RED], splats[g, GREEN], splats[g, BLUE], splats[g, DEPTH]
+            bend_x = splats[g, layout.BEND_X]
+            red, green, blue = splats[g, layout.RED], splats[g, layout.GREEN], splats[g, layout.BLUE]
+            z = splats[g, layout.DEPTH]
             number = np.float32(pair - begin + 1)
             sum_v = sum_vu = sum_vy = sum_vuu = sum_vuy = sum_vyy = zero
             sum_red = sum_green = sum_blue = sum_depth = zero
@@ -400,9 +386,9 @@ def backward_tile(
                 sum_red,
                 sum_green,
             )
-            pair_sums[slot, SUM_BLUE] = lane_sum(sum_blue)
+            pair_sums[slot, layout.SUM_BLUE] = lane_sum(sum_blue)
             if grad_depth is not None:
-                pair_sums[slot, SUM_DEPTH] = lane_sum(sum_depth)
+                pair_sums[slot, layout.SUM_DEPTH] = lane_sum(sum_depth)
         stop = start
 
 
@@ -423,13 +409,13 @@ def backward(
     pair_sums: Floats,
 ) -> None:
     """Sums of every (tile, splat) pair, Gaussian-major: [P, 10] with depth, else [P, 9]."""
-    tiles_x = (width + TILE - 1) // TILE
-    tiles_y = (height + TILE - 1) // TILE
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    tiles_y = (height + layout.TILE - 1) // layout.TILE
     for tile in prange(tiles_x * tiles_y):
         buffer = np.empty(BACKWARD_SIZE, np.float32)
         touches = np.empty(BATCH, np.int64)
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        left, top = (tile % tiles_x) * layout.TILE, (tile // tiles_x) * layout.TILE
+        columns, rows = min(layout.TILE, width - left), min(layout.TILE, height - top)
         for i in range(GEOMETRY_BACKWARD):
             buffer[i] = ZERO
         for row in range(rows):

@@ -183,7 +183,8 @@ class CudaRasteriser(rasteriser.Rasteriser):
         gaussians, camera = asked.gaussians, asked.camera
         take, device = self._buffers.take, self._buffers.device
         n, width, height, tiles = gaussians.num, camera.width, camera.height, tiles_of(camera)
-        view = projection.view_of(camera, device)
+        numbers = rasteriser.view_numbers(camera)
+        view = torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
         splats = take("splats", n, layout.SPLAT_COLUMNS)
         depth_keys, self.radii = take("depth_keys", n), take("radii", n)
         tile_counts = take("tile_counts", n, dtype=torch.int32)

@@ -7,35 +7,14 @@ cancels. Geometry is computed in float64, colours in float32. A lane is a Gaussi
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from cleargs.splat import constants
-from cleargs.splat.camera import Camera
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.binning import count_tiles
 from cleargs.splat.kernels.cuda.harmonics import sh_basis
-
-
-def view_of(camera: Camera, device: torch.device) -> Tensor:
-    """The kernels' view of a camera: float64 [23], in the order of ``layout.VIEW_*``."""
-    pose = camera.world_to_camera
-    beyond_x = constants.VIEW_CLAMP * 0.5 * camera.width / camera.fx
-    beyond_y = constants.VIEW_CLAMP * 0.5 * camera.height / camera.fy
-    numbers = [
-        *pose[:3, :3].ravel().tolist(),
-        *pose[:3, 3].tolist(),
-        *camera.centre.tolist(),
-        *(camera.fx, camera.fy, camera.cx, camera.cy),
-        -camera.cx / camera.fx - beyond_x,
-        (camera.width - camera.cx) / camera.fx + beyond_x,
-        -camera.cy / camera.fy - beyond_y,
-        (camera.height - camera.cy) / camera.fy + beyond_y,
-    ]
-    return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
 
 
 @triton.jit
