@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
-from cleargs.splat.backend import SearchKernels, search_kernels
 from cleargs.splat.camera import Camera
+from cleargs.splat.kernels.cpu import backend as kernels
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
@@ -103,8 +103,7 @@ def scales(sight: Sight) -> list[float]:
 class Level:
     """The problem at one size."""
 
-    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels | None) -> None:
-        self._kernels = kernels or search_kernels()
+    def __init__(self, sight: Sight, scale: float) -> None:
         margin = sight.margin
         height, width = sight.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
@@ -155,7 +154,7 @@ class Level:
 
     def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
         fields = self.fields(motion)
-        return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
+        return kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
     def fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
         """Offset, sweep and radius: see `DisplacementFields`."""
@@ -173,7 +172,7 @@ class Level:
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[Vector, Vector]:
         """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         offset, sweep, _ = self.fields(motion)
-        return self._kernels.normal_equations(
+        return kernels.normal_equations(
             self._stack,
             self._observed,
             self._fitting,

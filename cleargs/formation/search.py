@@ -22,7 +22,6 @@ from cleargs.formation.comparison import (
     scales,
 )
 from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
-from cleargs.splat.backend import SearchKernels
 
 WARM_STEPS = 2
 """Gauss-Newton steps of a fit that starts from the last one."""
@@ -53,16 +52,13 @@ _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "bo
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
 
-def search(
-    sight: Sight, *, skew: bool = True, pose: bool = False, kernels: SearchKernels | None = None
-) -> list[Explanation]:
+def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Explanation]:
     """Every model at its best, from scratch. The first is ``none``.
 
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
-    kernels: what it computes with; None: the CPU's.
     """
-    levels = [Level(sight, scale, kernels) for scale in scales(sight)]
+    levels = [Level(sight, scale) for scale in scales(sight)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -86,10 +82,9 @@ def refine(
     motion: FrameMotion,
     *,
     pose: bool = False,
-    kernels: SearchKernels | None = None,
 ) -> list[Explanation]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = Level(sight, scales(sight)[-1], kernels)
+    level = Level(sight, scales(sight)[-1])
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":

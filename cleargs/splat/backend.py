@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.errors import InputError
@@ -16,9 +14,6 @@ from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import DisplacementFields
 from cleargs.splat.types import AdamStep, Moments, PhotometricLoss, Reading
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 
 class Meter(Protocol):
@@ -131,38 +126,6 @@ class Backend(Protocol):
     def times_slope(self, light: Tensor, slope: Tensor, channels: int) -> Tensor: ...
 
 
-class SearchKernels(Protocol):
-    """What the search for a frame's motion computes with, on arrays of the CPU; the CPU's back end is one."""
-
-    def misfit(
-        self,
-        image: Floats,
-        observed: Floats,
-        weight: Floats,
-        fields: tuple[Floats, Floats, Floats],
-        samples: Floats,
-        limit: float,
-    ) -> float:
-        """The sum of weight * min(|observed - photographed image|, limit), by offset, sweep and radius."""
-        ...
-
-    def normal_equations(
-        self,
-        stack: Floats,
-        observed: Floats,
-        weight: Floats,
-        basis: Floats,
-        down: Floats,
-        offset: Floats,
-        sweep: Floats,
-        times: Floats,
-        outlier: float,
-        active: NDArray[np.int64],
-    ) -> tuple[Doubles, Doubles]:
-        """Matrix [A, A] and right side [A] of the Gauss-Newton equations: see the kernel of the CPU."""
-        ...
-
-
 def backend_for(device: torch.device | str) -> Backend:
     """The kernels for a device. Raises InputError where there are none."""
     device = torch.device(device)
@@ -178,13 +141,6 @@ def backend_for(device: torch.device | str) -> Backend:
 
         return cpu
     raise InputError(f"there is no {device.type} back end for the splatting kernels", hint="use --device cpu")
-
-
-def search_kernels() -> SearchKernels:
-    """The kernels of the CPU for a search."""
-    from cleargs.splat.kernels.cpu import backend as cpu
-
-    return cpu
 
 
 def rasteriser_for(device: torch.device | str = "cpu") -> Rasteriser:
