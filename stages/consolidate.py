@@ -104,7 +104,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         write_repairs,
     )
     from cleargs.rivr.targets import load_supervision
-    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.backend import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm

@@ -114,7 +114,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.splat.effort import decided
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
-    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.backend import set_threads
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
     from cleargs.splat.state import save_state

@@ -207,7 +207,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
-    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.backend import set_threads
 
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)

@@ -65,7 +65,7 @@ def splat(
     from benchmarks.speed.markdown import markdown
     from benchmarks.speed.plots import plot_scaling, plot_speed_error
     from cleargs.files import write_bytes, write_json
-    from cleargs.splat.kernels.runtime import warm_up
+    from cleargs.splat.kernels.cpu.backend import warm_up
 
     counts = tuple(sorted({1, threads_or_all(threads)}))
     plan = (quick_plan if quick else full_plan)(counts)
@@ -174,7 +174,7 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
     from benchmarks.speed.formation_cost import plan_of, run
     from benchmarks.speed.formation_report import formation_markdown, plot_formation
     from cleargs.files import write_bytes, write_json
-    from cleargs.splat.kernels.runtime import warm_up
+    from cleargs.splat.kernels.cpu.backend import warm_up
 
     warm_up()
     benchmark = run(plan_of(quick=quick, threads=threads_or_all(threads)), make_reporter(quiet))
@@ -238,7 +238,7 @@ def quality(
     from benchmarks.speed.quality_report import plot_quality, quality_markdown
     from cleargs.files import write_bytes, write_json
     from cleargs.pipeline.config import named_value
-    from cleargs.splat.kernels.runtime import warm_up
+    from cleargs.splat.kernels.cpu.backend import warm_up
 
     plan = QualityPlan(captures, qualities, dict(map(named_value, overrides)), until, threads_or_all(threads))
     warm_up()

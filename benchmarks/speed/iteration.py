@@ -8,11 +8,10 @@ from torch import Tensor
 from benchmarks.speed.probe import timed_kernels
 from benchmarks.speed.random_scenes import random_image
 from benchmarks.speed.timing import Clock
-from cleargs.splat.backend import photometric_loss, rasteriser_for, step_gaussians
+from cleargs.splat.backend import photometric_loss, rasteriser_for, set_threads, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
-from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.types import Moments
 
 PARTS = ("forward", "loss", "backward", "adam")

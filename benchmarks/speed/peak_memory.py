@@ -39,7 +39,7 @@ def _resident(field: str) -> int:
 def _measure(count: int, width: int, height: int, sigma: float) -> int | None:
     from benchmarks.speed.iteration import Iteration
     from benchmarks.speed.timing import Clock
-    from cleargs.splat.kernels.runtime import warm_up
+    from cleargs.splat.kernels.cpu.backend import warm_up
     from cleargs.splat.pace import random_scene
 
     warm_up()

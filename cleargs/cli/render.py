@@ -164,7 +164,7 @@ def render(
     require_free(output, force=force)
     stage = scene_stage(dag, run, chosen)
     from cleargs.render.shots import CaptureShots
-    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.backend import set_threads
     from cleargs.splat.ply import read_ply
 
     reporter = make_reporter(quiet)

@@ -38,9 +38,8 @@ from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
 from cleargs.models.onnx import installed_runtimes
 from cleargs.progress import Reporter
-from cleargs.splat.backend import rasteriser_for
+from cleargs.splat.backend import rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 

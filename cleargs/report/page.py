@@ -26,7 +26,7 @@ from cleargs.report.web_scene import (
     write_scene,
     write_viewer,
 )
-from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 
 RENDERED = 40

@@ -143,6 +143,20 @@ def backend_for(device: torch.device | str) -> Backend:
     raise InputError(f"there is no {device.type} back end for the splatting kernels", hint="use --device cpu")
 
 
+def set_threads(n: int) -> None:
+    """Run the CPU's kernels on ``n`` threads from now on (for the calling Python thread).
+
+    At most as many as Numba started, which is the number of cores or ``NUMBA_NUM_THREADS``. Results do
+    not depend on it. torch's threads are set on their own, by ``torch.set_num_threads``.
+
+    Raises:
+        ValueError: when ``n`` is less than 1.
+    """
+    from cleargs.splat.kernels.cpu import launch
+
+    launch.set_threads(n)
+
+
 def rasteriser_for(device: torch.device | str = "cpu") -> Rasteriser:
     """A rasteriser on a device. Raises InputError where there is none."""
     return backend_for(device).rasteriser(torch.device(device))

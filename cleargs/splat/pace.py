@@ -141,8 +141,7 @@ def _measure() -> float:
     """
     import torch
 
-    from cleargs.splat.backend import photometric_loss, rasteriser_for, step_gaussians
-    from cleargs.splat.kernels.runtime import set_threads
+    from cleargs.splat.backend import photometric_loss, rasteriser_for, set_threads, step_gaussians
     from cleargs.splat.types import Moments
 
     set_threads(1)

@@ -16,7 +16,8 @@ from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
 from benchmarks.speed.work import Work, size_of, work_of
 from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference, runtime
+from cleargs.splat.kernels import reference
+from cleargs.splat.kernels.cpu.backend import warm_up
 from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.pace import random_scene
 
@@ -125,5 +126,5 @@ def test_straight_lines():
 def test_warm_up_runs_every_kernel_of_an_iteration():
     clock = Clock()
     with clock.repetition(), timed_kernels(clock):
-        runtime.warm_up()
+        warm_up()
     assert set(clock.quartiles()) == set(KERNELS)

@@ -25,8 +25,8 @@ from helpers.photographs import (
 
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
 from cleargs.formation.search import preferred, refine, search
+from cleargs.splat.backend import set_threads
 from cleargs.splat.kernels.cpu import frame_warp as kernels
-from cleargs.splat.kernels.runtime import set_threads
 
 BLUR = FrameMotion(blur=twist(0, 0, 0, 3, 6, 0), median_depth=MEDIAN)
 LONG = FrameMotion(blur=twist(0, 0, 0, -9, 12, 4), median_depth=MEDIAN)

@@ -34,8 +34,8 @@ from cleargs.formation.warp import (
     times_slope,
 )
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.splat.backend import set_threads
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST, MAX_NEARNESS, DisplacementFields
 
 Doubles = npt.NDArray[np.float64]

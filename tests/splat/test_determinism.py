@@ -15,7 +15,7 @@ import torch
 from helpers.splat_scenes import make_camera, make_gaussians
 from cleargs.splat.backend import adam_step, photometric_loss, psnr, rasteriser_for
 from cleargs.formation.exposure import affine_backward
-from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.backend import set_threads
 from cleargs.splat.types import AdamStep
 
 def digest(threads):

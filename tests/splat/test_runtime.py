@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from numba import config
 
-from cleargs.splat.kernels import runtime
+from cleargs.splat.backend import set_threads
 from cleargs.splat.kernels.cpu import jit
 
 
@@ -36,14 +36,14 @@ def test_set_threads():
 
     before = launch.threads()
     try:
-        runtime.set_threads(1)
+        set_threads(1)
         assert launch.threads() == 1
-        runtime.set_threads(10_000)
+        set_threads(10_000)
         assert launch.threads() >= 1
         with pytest.raises(ValueError, match="0 threads"):
-            runtime.set_threads(0)
+            set_threads(0)
     finally:
-        runtime.set_threads(before)
+        set_threads(before)
 
 
 def test_importing_the_core_imports_neither_numba_nor_media_libraries():

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cleargs.splat.backend import set_threads
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.backend import add_position_noise
-from cleargs.splat.kernels.runtime import set_threads
 from cleargs.splat.strategy.rules import (
     refine,
     rotation_matrices,

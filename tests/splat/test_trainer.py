@@ -26,7 +26,7 @@ from cleargs.splat import trainer
 from cleargs.splat.backend import photometric_loss
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.runtime import set_threads
+from cleargs.splat.backend import set_threads
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
