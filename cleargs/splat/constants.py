@@ -59,6 +59,9 @@ SH_C3 = (
 SH_OFFSET = 0.5
 """Colour = max(SH sum + 0.5, 0)."""
 
+ADAM_BETAS = (0.9, 0.999)
+ADAM_EPSILON = 1e-15
+
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2

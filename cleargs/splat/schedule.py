@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
 from cleargs.splat.config import TrainConfig
+from cleargs.splat.types import Rate
 
 SH_REST_DIVISOR = 5.0
 """The SH terms above the constant learn this much slower. (Inria: 20, at which highlights take more steps
@@ -40,7 +40,7 @@ class Schedule:
         self._factor = factor
         sh = torch.full((coefficients * 3,), factor * config.lr_sh / SH_REST_DIVISOR, device=device)
         sh[:3] = factor * config.lr_sh
-        self._first: dict[str, float | Tensor] = {
+        self._first: dict[str, Rate] = {
             "log_scales": factor * config.lr_scales,
             "rotations": factor * config.lr_rotations,
             "logit_opacities": config.lr_opacities,
@@ -55,7 +55,7 @@ class Schedule:
             * float(self._config.lr_means_final ** (step / self._config.planned))
         )
 
-    def rates(self, step: int) -> dict[str, float | Tensor]:
+    def rates(self, step: int) -> dict[str, Rate]:
         """Return every learning rate by parameter name."""
         left = float(self._config.lr_final ** (step / self._config.planned))
         return {

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cleargs.errors import InputError
 from cleargs.splat.gaussians import Gaussians
 
 
@@ -18,6 +17,10 @@ class Render(NamedTuple):
     image: Tensor  # [H, W, 3] sRGB; not clamped above
     alpha: Tensor  # [H, W] 1 - final transmittance
     depth: Tensor | None  # [H, W] accumulated: the sum of weight * camera z, not divided by alpha
+
+
+Rate = float | Tensor
+"""One learning rate, or one per column of a parameter."""
 
 
 class PhotometricLoss(NamedTuple):
@@ -78,55 +81,3 @@ class Moments:
             for group in (self.first, self.second)
         )
         return Moments(first, second)
-
-
-@dataclass(frozen=True, eq=False)
-class AdamStep:
-    """One dense step of Adam (Kingma and Ba 2015); parameter and moments are updated in place.
-
-    The same arithmetic as ``torch.optim.Adam`` without weight decay:
-    p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
-
-    Raises InputError when the tensors do not fit together.
-    """
-
-    parameter: Tensor
-    gradient: Tensor
-    first: Tensor
-    second: Tensor
-    """Contiguous float32, all four of one shape and on one device."""
-    number: int
-    """The step t, counted from 1."""
-    rate: float | Tensor
-    """One rate, or a tensor with one rate per column of ``parameter.reshape(len(parameter), -1)``."""
-    betas: tuple[float, float] = (0.9, 0.999)
-    epsilon: float = 1e-15
-
-    def __post_init__(self) -> None:
-        tensors, parameter = self.tensors, self.parameter
-        for tensor in tensors:
-            if (
-                tensor.shape != parameter.shape
-                or not tensor.is_contiguous()
-                or tensor.device != parameter.device
-            ):
-                raise InputError(
-                    f"Adam got tensors of the shapes {[tuple(t.shape) for t in tensors]} "
-                    f"on {sorted({str(t.device) for t in tensors})}",
-                    hint="give four contiguous tensors of one shape, all on the CPU or all on one GPU",
-                )
-        given = self.rate.numel() if isinstance(self.rate, Tensor) else 1
-        if parameter.numel() and given not in (1, self.columns):
-            raise InputError(
-                f"{given} learning rates for {self.columns} columns", hint="give one, or one per column"
-            )
-
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Parameter, gradient and both moments."""
-        return self.parameter, self.gradient, self.first, self.second
-
-    @property
-    def columns(self) -> int:
-        """Numbers per row of the parameter, which has rows."""
-        return self.parameter.numel() // len(self.parameter)

@@ -21,10 +21,9 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from cleargs.splat.kernels.cuda import (
-    adam,
-    affine_colour,
     binning,
     densify,
+    elementwise,
     frame_warp,
     gradients,
     loss,
@@ -68,28 +67,28 @@ def cases() -> list[tuple[Any, dict[str, str], dict[str, Any], dict[str, Any]]]:
             {},
         ),
         (
-            adam.adam,
+            elementwise.adam,
             {
                 **dict.fromkeys(("parameter", "gradient", "first", "second", "rates"), F32),
                 **{"size": "i32", "columns": "i32"},
                 **dict.fromkeys(("beta1", "beta2", "epsilon", "correction", "root_correction"), "fp32"),
             },
-            {"BLOCK": adam.BLOCK},
+            {"BLOCK": elementwise.BLOCK},
             {},
         ),
         (
-            affine_colour.map_pixels,
+            elementwise.map_pixels,
             {"image": F32, "affine": F32, "output": F32, "pixels": "i32"},
-            {"BLOCK": affine_colour.BLOCK},
+            {"BLOCK": elementwise.BLOCK},
             {},
         ),
         (
-            affine_colour.map_backward,
+            elementwise.map_backward,
             {
                 **dict.fromkeys(("image", "affine", "grad_output", "grad_image"), F32),
                 **{"partials": F64, "pixels": "i32"},
             },
-            {"BLOCK": affine_colour.BLOCK},
+            {"BLOCK": elementwise.BLOCK},
             {},
         ),
         (

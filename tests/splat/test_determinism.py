@@ -16,7 +16,6 @@ from helpers.splat_scenes import make_camera, make_gaussians
 from cleargs.splat.backend import adam_step, photometric_loss, psnr, rasteriser_for
 from cleargs.formation.exposure import affine_backward
 from cleargs.splat.backend import set_threads
-from cleargs.splat.types import AdamStep
 
 def digest(threads):
     set_threads(threads)
@@ -37,7 +36,7 @@ def digest(threads):
             result.update(tensor.numpy().tobytes())
         result.update(repr((loss.loss, loss.l1, loss.ssim, psnr(view.image, target))).encode())
         for name, tensor in scene.tensors().items():
-            adam_step(AdamStep(tensor, getattr(gradients, name), *moments[name], step, 0.01))
+            adam_step(tensor, getattr(gradients, name), *moments[name], step, 0.01)
     for tensor in scene.tensors().values():
         assert tensor.isfinite().all()
         result.update(tensor.numpy().tobytes())

@@ -23,7 +23,6 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
 from cleargs.splat.render import render
-from cleargs.splat.types import AdamStep
 
 
 def join(*parts: Gaussians) -> Gaussians:
@@ -174,7 +173,7 @@ def test_training_on_every_hard_case_at_once_stays_finite(device):
         assert np.isfinite(loss.loss)
         for name, gradient in engine.backward(loss.grad_image).tensors().items():
             assert gradient.isfinite().all(), (step, name)
-            adam_step(AdamStep(getattr(scene, name), gradient, *moments[name], step, 1e-2))
+            adam_step(getattr(scene, name), gradient, *moments[name], step, 1e-2)
             assert getattr(scene, name).isfinite().all(), (step, name)
 
 

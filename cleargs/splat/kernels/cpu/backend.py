@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from cleargs.splat.camera import Camera
+from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
 from cleargs.splat.kernels.cpu.jit import Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
 from cleargs.splat.strategy import rules
-from cleargs.splat.types import AdamStep, Moments, PhotometricLoss
+from cleargs.splat.types import Moments, PhotometricLoss, Rate
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -105,23 +106,25 @@ def _measure(padded: _Padded) -> tuple[float, float, float, Floats]:
 # -- optimiser ---------------------------------------------------------------------------------------------
 
 
-def adam_step(step: AdamStep) -> None:
-    columns, number = step.columns, step.number
-    rates = np.asarray(step.rate, np.float64).reshape(-1)
-    beta1, beta2 = step.betas
-    corrected = np.broadcast_to(rates / (1.0 - beta1**number), (columns,)).astype(np.float32)
-    parameter, gradient, first, second = (tensor.detach().view(-1).numpy() for tensor in step.tensors)
+def adam_step(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate
+) -> None:
+    columns = parameter.numel() // len(parameter)
+    rates = np.asarray(rate, np.float64).reshape(-1)
+    beta1, beta2 = ADAM_BETAS
+    corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
+    value, slope, m, v = (tensor.detach().view(-1).numpy() for tensor in (parameter, gradient, first, second))
     with launch.exclusive():
         elementwise.adam(
-            parameter,
-            gradient,
-            first,
-            second,
+            value,
+            slope,
+            m,
+            v,
             np.tile(corrected, max(1, ADAM_BLOCK // columns)),
             np.float32(beta1),
             np.float32(beta2),
-            np.float32(step.epsilon),
-            np.float32(math.sqrt(1.0 - beta2**number)),
+            np.float32(ADAM_EPSILON),
+            np.float32(math.sqrt(1.0 - beta2**step)),
         )
 
 
@@ -344,7 +347,7 @@ def warm_up() -> None:
     for counted in (None, mask):
         photometric_loss(image, image, ssim_lambda=0.2, weight=1.0, mask=counted, gradient=image.clone())
         psnr(image, image, counted)
-    adam_step(AdamStep(row, row.clone(), row.clone(), row.clone(), number=1, rate=0.0))
+    adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)
     affine_backward(image, affine, image)

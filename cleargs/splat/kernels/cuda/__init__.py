@@ -2,7 +2,7 @@
 
 The modules follow the data as in the CPU back end: ``projection`` (parameters to packed splats), ``binning``
 (splats to tiles), ``rasterise`` (tiles to pixels and back), ``gradients`` (back to the parameters), ``loss``,
-``affine_colour``, ``adam`` and ``densify``; ``pipeline`` runs them over reusable buffers, ``device_layout``
+``elementwise`` and ``densify``; ``pipeline`` runs them over reusable buffers, ``device_layout``
 names what they hand on, ``support`` says whether all this can run here. ``docs/gpu.md`` counts operations
 and bytes.
 

@@ -9,9 +9,6 @@ from torch import Tensor
 
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
-from cleargs.splat.kernels.cuda.adam import adam_step as adam_step
-from cleargs.splat.kernels.cuda.affine_colour import affine_backward as affine_backward
-from cleargs.splat.kernels.cuda.affine_colour import apply_affine as apply_affine
 from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
 from cleargs.splat.kernels.cuda.densify import refine as refine
 from cleargs.splat.kernels.cuda.frame_warp import displacements as displacements

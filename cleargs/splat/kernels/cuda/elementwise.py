@@ -1,13 +1,76 @@
-"""Per-frame affine colour and its gradient."""
+"""Kernels of one pass over numbers or pixels: Adam and affine colour."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
+from cleargs.splat.types import Rate
+
 BLOCK = 1024
+
+
+@triton.jit(do_not_specialize=["size", "columns"])
+def adam(
+    parameter,
+    gradient,
+    first,
+    second,
+    rates,
+    size,
+    columns,
+    beta1,
+    beta2,
+    epsilon,
+    correction,
+    root_correction,
+    BLOCK: tl.constexpr,
+):
+    """Update ``parameter`` [size] and its moments in place; element i has the rate ``rates[i % columns]``.
+
+    ``correction`` is 1 - beta1^t, ``root_correction`` sqrt(1 - beta2^t).
+    """
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    mask = i < size
+    g = tl.load(gradient + i, mask=mask, other=0.0)
+    m = beta1 * tl.load(first + i, mask=mask, other=0.0) + (1.0 - beta1) * g
+    v = beta2 * tl.load(second + i, mask=mask, other=0.0) + (1.0 - beta2) * g * g
+    tl.store(first + i, m, mask=mask)
+    tl.store(second + i, v, mask=mask)
+    rate = tl.load(rates + i % columns, mask=mask, other=0.0) / correction
+    value = tl.load(parameter + i, mask=mask, other=0.0)
+    value -= rate * m / (tl.sqrt(v) / root_correction + epsilon)
+    tl.store(parameter + i, value, mask=mask)
+
+
+def adam_step(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate
+) -> None:
+    """See ``cleargs.splat.backend.adam_step``."""
+    size, (beta1, beta2) = parameter.numel(), ADAM_BETAS
+    rates = rate if isinstance(rate, Tensor) else torch.full((1,), rate, device=parameter.device)
+    rates = rates.to(parameter.device, torch.float32).reshape(-1)
+    adam[(-(-size // BLOCK),)](
+        parameter,
+        gradient,
+        first,
+        second,
+        rates,
+        size,
+        len(rates),
+        beta1,
+        beta2,
+        ADAM_EPSILON,
+        1.0 - beta1**step,
+        math.sqrt(1.0 - beta2**step),
+        BLOCK=BLOCK,
+        num_warps=4,
+    )
 
 
 @triton.jit(do_not_specialize=["pixels"])
