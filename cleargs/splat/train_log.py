@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,23 +14,17 @@ from torch import Tensor
 from cleargs.files import write_bytes
 from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
+from cleargs.splat.types import Reading
 from cleargs.splat.views import View
 
 _ROW = np.dtype(
     [
-        ("frame_id", np.int32),
-        ("pseudo", np.bool_),
-        ("weight", np.float32),
-        ("width", np.int32),
-        ("height", np.int32),
-        ("loss", np.float64),
-        ("l1", np.float64),
-        ("ssim", np.float64),
-        ("psnr", np.float64),
-        ("n_gaussians", np.int32),
-        ("sh_degree", np.int32),
+        (field.name, np.bool_ if field.name == "kind" else field.type.to_pandas_dtype())
+        for field in TRAIN
+        if field.name not in ("round", "step")
     ]
 )
+"""A step; ``kind`` is true for a pseudo view."""
 
 _RECENT = 50
 """Steps that a running mean looks back."""
@@ -61,9 +54,9 @@ class TrainLog:
             sh_degree,
         )
 
-    def measured(self, step: int, *, loss: float, l1: float, ssim: float, psnr: float) -> None:
+    def measured(self, step: int, reading: Reading) -> None:
         """Write what a step measured, which from a GPU is known some steps later."""
-        self._rows[["loss", "l1", "ssim", "psnr"]][step] = (loss, l1, ssim, psnr)
+        self._rows[["loss", "l1", "ssim", "psnr"]][step] = reading
 
     def recent_psnr(self, done: int) -> float:
         """Mean PSNR in dB of the last steps before ``done``; NaN before the first.
@@ -86,12 +79,12 @@ class TrainLog:
     def table(self, done: int, round: int) -> pa.Table:
         """The first ``done`` rows, schema `cleargs.splat.tables.TRAIN`."""
         rows = self._rows[:done]
-        columns: dict[str, Any] = {
+        columns = {name: rows[name] for name in _ROW.names or ()}
+        columns |= {
             "round": np.full(done, round),
             "step": np.arange(1, done + 1),
-            "kind": np.where(rows["pseudo"], "pseudo", "real"),
+            "kind": np.where(rows["kind"], "pseudo", "real"),
         }
-        columns |= {name: rows[name] for name in _ROW.names or () if name != "pseudo"}
         return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)
 
 

@@ -128,6 +128,38 @@ def train(
     return Trained(trainer.scene.to("cpu"), trainer.rows(round), state)
 
 
+    def run(
+        self, *, checkpoint: Path, reporter: Reporter, label: str = "training", round: int = 0
+    ) -> Trained:
+        """Train to the end. Resumes from ``checkpoint`` where there is one, to the same result bit for bit.
+        Beside each checkpoint lies a preview.
+
+        Raises StageError when a parameter or the loss ceases to be finite.
+        """
+        saved = load_state(checkpoint, reporter)
+        if saved is not None and not self.wrote(saved):
+            reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
+        elif saved is not None:
+            self.restore(saved)
+            reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
+        self._backend.warm_up()  # before the bar, or half a minute of compiling would count as pace
+        with support.memory_errors(), reporter.task(label, total=self.length) as task:
+            progress = _Progress(task, self)
+            while self.done < self.length:
+                self.step()
+                due = self.done % self._config.checkpoint_interval == 0 and self.done < self.length
+                if self.done % _NOTE_INTERVAL == 0:
+                    progress.show()
+                if due or self.done % _CHECK_INTERVAL == 0:
+                    self.check_finite()
+                if due:
+                    save_state(checkpoint, self.state())
+                    write_preview(checkpoint.with_name(PREVIEW), self.preview())
+            self.check_finite()
+            progress.show()
+        state = {name: tensor.cpu() for name, tensor in self.state().items()}
+        return Trained(self.scene.to("cpu"), self.rows(round), state)
+
 class Trainer:
     """The state of one training; `step` is one iteration. Use `train` unless you need to look inside."""
 
@@ -281,7 +313,7 @@ class Trainer:
         self._log.restore(state["log"])
         self._gaussians = Gaussians(**group("parameter")).to(self._device)
         self._moments = Moments.of_state(state).to(self._device)
-        self._strategy.restore(self._on_device(group("strategy")))
+        self._strategy.restore({name: t.to(self._device) for name, t in group("strategy").items()})
         if self._formation is not None:
             self._formation.restore(group("formation"))
 
@@ -298,7 +330,7 @@ class Trainer:
         else:
             views, stream, count = self._real, Stream.REAL_VIEWS, step - before
         epoch, position = divmod(count, len(views))
-        order = self._rng(stream, epoch).permutation(len(views))
+        order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
     def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
@@ -322,17 +354,14 @@ class Trainer:
 
     def _measure(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
         """The gradient of the loss by the image; its value goes into the log, from a GPU with some delay."""
-        slope = self._slope(target)
-        if self._meter is not None:
-            self._meter.add(self.done, image, target, mask, weight=weight, gradient=slope)
-            if len(self._meter) >= _NOTE_INTERVAL:
-                self._read_meter()
-            return slope
-        loss = photometric_loss(
-            image, target, ssim_lambda=self._config.ssim_lambda, weight=weight, mask=mask, gradient=slope
-        )
-        self._note(self.done, loss.loss, loss.l1, loss.ssim, psnr(image, target, mask))
-        return loss.grad_image
+        size = (target.shape[0], target.shape[1])
+        if size not in self._slopes:
+            self._slopes[size] = torch.empty_like(target)
+        slope = self._slopes[size]
+        self._meter.add(self.done, image, target, mask, weight=weight, gradient=slope)
+        if not support.on_gpu(self._device) or len(self._meter) >= _NOTE_INTERVAL:
+            self._read_meter()
+        return slope
 
     def _shares_of_error(
         self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float, formed: Formed | None
@@ -349,14 +378,11 @@ class Trainer:
 
     def _read_meter(self) -> None:
         """Bring the log up to date. Waits for the GPU."""
-        for step, read in self._meter.take() if self._meter is not None else ():
-            self._note(step, read.loss, read.l1, read.ssim, read.psnr)
-
-    def _note(self, step: int, loss: float, l1: float, ssim: float, psnr: float) -> None:
-        self._log.measured(step, loss=loss, l1=l1, ssim=ssim, psnr=psnr)
-        if not math.isfinite(loss):
-            self.check_finite()
-            raise self._stopped("the loss is not finite")
+        for step, read in self._meter.take():
+            self._log.measured(step, read)
+            if not math.isfinite(read.loss):
+                self.check_finite()
+                raise self._stopped("the loss is not finite")
 
     def _densify(self) -> None:
         """What the strategy does, and its refinement where one is due."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +14,11 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
-from cleargs.splat.kernels.cpu.jit import Floats
+from cleargs.splat.kernels.cpu.jit import Array, Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
 from cleargs.splat.strategy import rules
-from cleargs.splat.types import Moments, PhotometricLoss, Rate
+from cleargs.splat.types import Moments, Rate, Reading
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -32,51 +31,68 @@ def rasteriser(device: torch.device) -> CpuRasteriser:
 # -- loss --------------------------------------------------------------------------------------------------
 
 
-def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    *,
-    ssim_lambda: float,
-    weight: float,
-    mask: Tensor | None,
-    gradient: Tensor,
-) -> PhotometricLoss:
-    with launch.exclusive():
-        padded = _pad(image, target, mask)
-        l1, similarity, count, maps = _measure(padded)
-        if weight == 0.0 or count == 0:
-            gradient.zero_()
-        else:
-            loss.differentiate(
-                padded.image,
-                padded.target,
-                padded.counted,
-                loss.ssim_window(),
-                maps,
-                np.float32(weight * (1.0 - ssim_lambda) / count),
-                np.float32(-weight * ssim_lambda / count),
-                gradient.numpy(),
-            )
-    value = weight * ((1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - similarity)) if count else 0.0
-    return PhotometricLoss(value, gradient, l1, similarity)
+class Meter:
+    """The losses of some steps, known at once."""
+
+    def __init__(self, ssim_lambda: float) -> None:
+        self._lambda = ssim_lambda
+        self._readings: list[tuple[int, Reading]] = []
+
+    def __len__(self) -> int:
+        return len(self._readings)
+
+    def add(
+        self,
+        step: int,
+        image: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        *,
+        weight: float,
+        gradient: Tensor,
+    ) -> None:
+        shape = (image.shape[0], loss.padded_length(image.shape[1]))
+        padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
+        # The kernels read maps between the padding only, so what is there need not be set.
+        maps = np.empty((3, *shape), np.float32)
+        row_sums = np.empty((shape[0], 3), np.float64)
+        window = loss.ssim_window()
+        with launch.exclusive():
+            loss.pad_images(*_compared(image, target, mask), padded, padded_target, counted)
+            loss.measure(padded, padded_target, counted, window, maps, row_sums)
+            l1, similarity, count = (math.fsum(column) for column in row_sums.T)
+            l1, similarity = (l1 / count, similarity / count) if count else (0.0, 1.0)
+            if weight == 0.0 or count == 0:
+                gradient.zero_()
+            else:
+                loss.differentiate(
+                    padded,
+                    padded_target,
+                    counted,
+                    window,
+                    maps,
+                    np.float32(weight * (1.0 - self._lambda) / count),
+                    np.float32(-weight * self._lambda / count),
+                    gradient.numpy(),
+                )
+        value = weight * ((1.0 - self._lambda) * l1 + self._lambda * (1.0 - similarity)) if count else 0.0
+        self._readings.append((step, Reading(value, l1, similarity, psnr(image, target, mask))))
+
+    def take(self) -> list[tuple[int, Reading]]:
+        taken, self._readings = self._readings, []
+        return taken
+
+
+def meter(ssim_lambda: float) -> Meter:
+    return Meter(ssim_lambda)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
     row_sums = np.empty((image.shape[0], 2), np.float64)
     with launch.exclusive():
-        loss.squared_errors(_read(image), _read(target), None if mask is None else _read(mask), row_sums)
+        loss.squared_errors(*_compared(image, target, mask), row_sums)
     total, count = math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
     return 10.0 * math.log10(count / total) if total > 0.0 else math.inf
-
-
-def meter(ssim_lambda: float) -> None:
-    """Losses are known at once."""
-
-
-class _Padded(NamedTuple):
-    image: Floats  # [H, padded length]
-    target: Floats
-    counted: Floats
 
 
 def _read(tensor: Tensor) -> Floats:
@@ -84,23 +100,8 @@ def _read(tensor: Tensor) -> Floats:
     return array
 
 
-def _pad(image: Tensor, target: Tensor, mask: Tensor | None) -> _Padded:
-    shape = (image.shape[0], loss.padded_length(image.shape[1]))
-    padded = _Padded(*(np.empty(shape, np.float32) for _ in range(3)))
-    loss.pad_images(_read(image), _read(target), None if mask is None else _read(mask), *padded)
-    return padded
-
-
-def _measure(padded: _Padded) -> tuple[float, float, float, Floats]:
-    """Mean |x - y|, mean SSIM, the number of values that count, and the derivative maps of SSIM."""
-    # The kernels read maps between the padding only, so what is there need not be set.
-    maps = np.empty((3, *padded.image.shape), np.float32)
-    row_sums = np.empty((len(padded.image), 3), np.float64)
-    loss.measure(*padded, loss.ssim_window(), maps, row_sums)
-    l1, similarity, count = (math.fsum(column) for column in row_sums.T)
-    if count == 0:
-        return 0.0, 1.0, 0.0, maps
-    return l1 / count, similarity / count, count, maps
+def _compared(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Floats, Floats, Array | None]:
+    return _read(image), _read(target), None if mask is None else _read(mask)
 
 
 # -- optimiser ---------------------------------------------------------------------------------------------
@@ -194,9 +195,7 @@ def add_position_noise(
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     output = torch.empty(image.shape)
     with launch.exclusive():
-        elementwise.apply_affine(
-            image.detach().contiguous().numpy(), affine.detach().float().contiguous().numpy(), output.numpy()
-        )
+        elementwise.apply_affine(_read(image), _read(affine.float()), output.numpy())
     return output
 
 
@@ -205,11 +204,7 @@ def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple
     row_sums = np.empty((image.shape[0], 3, 4), np.float64)
     with launch.exclusive():
         elementwise.affine_backward(
-            image.detach().contiguous().numpy(),
-            affine.detach().float().contiguous().numpy(),
-            grad_output.detach().contiguous().numpy(),
-            grad_image.numpy(),
-            row_sums,
+            _read(image), _read(affine.float()), _read(grad_output), grad_image.numpy(), row_sums
         )
     sums = [math.fsum(column) for column in row_sums.reshape(len(row_sums), 12).T]
     return grad_image, torch.tensor(sums, dtype=torch.float64).reshape(3, 4)
@@ -317,21 +312,16 @@ SIZE = 16
 """Of the tiny images on which `warm_up` runs the kernels."""
 
 
-def _scene() -> Gaussians:
-    """One grey Gaussian in front of the camera."""
-    return Gaussians(
+def warm_up() -> None:
+    """Run every kernel with the types that a training has, in the order of its steps; the backward pass with
+    and without alpha and depth."""
+    scene = Gaussians(  # one that is grey, in front of the camera
         means=torch.tensor([[0.0, 0.0, 2.0]]),
         log_scales=torch.full((1, 3), -2.0),
         rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         logit_opacities=torch.zeros(1),
         sh=torch.zeros(1, 16, 3),
     )
-
-
-def warm_up() -> None:
-    """Run every kernel with the types that a training has, in the order of its steps; the backward pass with
-    and without alpha and depth."""
-    scene = _scene()
     camera = Camera(SIZE, SIZE, float(SIZE), float(SIZE), SIZE / 2, SIZE / 2, np.eye(4))
     pipeline = CpuRasteriser()
     image = torch.zeros(SIZE, SIZE, 3)
@@ -345,8 +335,7 @@ def warm_up() -> None:
     pipeline.backward(image, plane)
     pipeline.backward(image, plane, plane)
     for counted in (None, mask):
-        photometric_loss(image, image, ssim_lambda=0.2, weight=1.0, mask=counted, gradient=image.clone())
-        psnr(image, image, counted)
+        Meter(0.2).add(0, image, image, counted, weight=1.0, gradient=image.clone())
     adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)

@@ -11,6 +11,9 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.cuda.densify import add_position_noise as add_position_noise
 from cleargs.splat.kernels.cuda.densify import refine as refine
+from cleargs.splat.kernels.cuda.elementwise import adam_step as adam_step
+from cleargs.splat.kernels.cuda.elementwise import affine_backward as affine_backward
+from cleargs.splat.kernels.cuda.elementwise import apply_affine as apply_affine
 from cleargs.splat.kernels.cuda.frame_warp import displacements as displacements
 from cleargs.splat.kernels.cuda.frame_warp import expose as expose
 from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
@@ -18,7 +21,6 @@ from cleargs.splat.kernels.cuda.frame_warp import through_curve as through_curve
 from cleargs.splat.kernels.cuda.frame_warp import times_slope as times_slope
 from cleargs.splat.kernels.cuda.loss import Meter
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
-from cleargs.splat.types import PhotometricLoss
 
 
 def rasteriser(device: torch.device) -> CudaRasteriser:
@@ -29,21 +31,6 @@ def rasteriser(device: torch.device) -> CudaRasteriser:
 
 def warm_up() -> None:
     """Nothing: Triton compiles a kernel for the types and sizes of its first call."""
-
-
-def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    *,
-    ssim_lambda: float,
-    weight: float,
-    mask: Tensor | None,
-    gradient: Tensor,
-) -> PhotometricLoss:
-    meter = Meter(ssim_lambda)
-    meter.add(0, image, target, mask, weight=weight, gradient=gradient)
-    ((_, read),) = meter.take()
-    return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:

@@ -30,17 +30,6 @@ COLUMNS = 128
 """Rows and values of a row that a program treats."""
 
 
-def reading(totals: Sequence[float], *, ssim_lambda: float, weight: float) -> Reading:
-    """The loss and its parts from the sums of a `Photometer`."""
-    l1, similarity, squared, count = totals
-    if not count > 0:
-        return Reading(0.0, 0.0, 1.0, math.inf) if count == 0 else Reading(*(math.nan,) * 4)
-    l1, similarity = l1 / count, similarity / count
-    loss = weight * ((1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - similarity))
-    psnr = math.inf if squared == 0.0 else 10.0 * math.log10(count / squared)
-    return Reading(loss, l1, similarity, psnr)
-
-
 @triton.jit
 def kept(values, mask, y, j, inside, length, HAS_MASK: tl.constexpr):
     """Values at row y, place j, zero outside the image and where masked."""
@@ -223,70 +212,27 @@ class Meter:
     """The losses of some steps, kept on the device until they are read together: one wait for all of them."""
 
     def __init__(self, ssim_lambda: float) -> None:
-        self._photometer = Photometer()
         self._lambda = ssim_lambda
         self._pending: list[tuple[int, float, Tensor]] = []
+        self._memory: Tensor | None = None
 
     def __len__(self) -> int:
         """Number of steps that wait to be read."""
         return len(self._pending)
 
+    @memory_errors()
     def add(
         self,
         step: int,
-        image: Tensor,
-        target: Tensor,
-        mask: Tensor | None,
-        *,
-        weight: float,
-        gradient: Tensor,
-    ) -> None:
-        """Write the gradient of a step's loss (see ``backend.photometric_loss``) and keep its sums."""
-        totals = self._photometer(
-            image,
-            target,
-            mask,
-            l1_weight=weight * (1.0 - self._lambda),
-            ssim_weight=-weight * self._lambda,
-            gradient=gradient,
-        )
-        self._pending.append((step, weight, totals))
-
-    def take(self) -> list[tuple[int, Reading]]:
-        """What waits, by step, and forget it."""
-        if not self._pending:
-            return []
-        rows = torch.stack([totals for _, _, totals in self._pending]).tolist()
-        readings = [
-            (step, reading(row, ssim_lambda=self._lambda, weight=weight))
-            for (step, weight, _), row in zip(self._pending, rows, strict=True)
-        ]
-        self._pending.clear()
-        return readings
-
-
-class Photometer:
-    """L1, SSIM and squared error of image pairs on one device, with buffers kept from call to call."""
-
-    def __init__(self) -> None:
-        self._memory: Tensor | None = None
-
-    @memory_errors()
-    def __call__(
-        self,
         image: Tensor,  # [H, W, 3]
         target: Tensor,  # [H, W, 3]
         mask: Tensor | None,  # [H, W] bool, True = counts
         *,
-        l1_weight: float,
-        ssim_weight: float,
+        weight: float,
         gradient: Tensor,  # [H, W, 3] to write into
-    ) -> Tensor:  # [4] float64
-        """Write the gradient of l1_weight * mean |x - y| + ssim_weight * mean SSIM.
-
-        Returns the sums of |x - y|, SSIM and (x - y)² over the values that count, and their number: on the
-        device, so that reading them can wait.
-        """
+    ) -> None:
+        """Write the gradient of a step's loss (see ``backend.photometric_loss``) and keep its sums: those of
+        |x - y|, SSIM and (x - y)² over the values that count, and their number, [4] float64."""
         height, length = image.shape[0], 3 * image.shape[1]
         size = height * length
         if self._memory is None or len(self._memory) < 8 * size or self._memory.device != image.device:
@@ -310,11 +256,33 @@ class Photometer:
             sums,
             totals,
             gradient,
-            l1_weight,
-            ssim_weight,
+            weight * (1.0 - self._lambda),
+            -weight * self._lambda,
             height,
             length,
             HAS_MASK=has_mask,
             **block,
         )
-        return totals
+        self._pending.append((step, weight, totals))
+
+    def take(self) -> list[tuple[int, Reading]]:
+        """What waits, by step, and forget it."""
+        if not self._pending:
+            return []
+        rows = torch.stack([totals for _, _, totals in self._pending]).tolist()
+        readings = [
+            (step, self._reading(row, weight))
+            for (step, weight, _), row in zip(self._pending, rows, strict=True)
+        ]
+        self._pending.clear()
+        return readings
+
+    def _reading(self, totals: Sequence[float], weight: float) -> Reading:
+        """The loss and its parts from the sums of a step."""
+        l1, similarity, squared, count = totals
+        if not count > 0:
+            return Reading(0.0, 0.0, 1.0, math.inf) if count == 0 else Reading(*(math.nan,) * 4)
+        l1, similarity = l1 / count, similarity / count
+        loss = weight * ((1.0 - self._lambda) * l1 + self._lambda * (1.0 - similarity))
+        psnr = math.inf if squared == 0.0 else 10.0 * math.log10(count / squared)
+        return Reading(loss, l1, similarity, psnr)
