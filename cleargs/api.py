@@ -144,21 +144,16 @@ def train(
     depends on the arguments alone, not on threads. Raises InputError without a weighted view.
     """
     from cleargs.splat.config import TrainConfig
-    from cleargs.splat.trainer import train as train_scene
+    from cleargs.splat.trainer import Trainer
 
     config = config or TrainConfig()
     with tempfile.TemporaryDirectory() as nowhere:
         if checkpoint is None:  # never written then
             config = config.model_copy(update={"checkpoint_interval": 1_000_000})
-        return train_scene(
-            scene,
-            views,
-            config,
-            seed=(seed,),
-            formation=formation,
+        trainer = Trainer(scene, views, config, seed=(seed,), formation=formation, device=device)
+        return trainer.run(
             checkpoint=Path(nowhere) / "none" if checkpoint is None else Path(checkpoint),
             reporter=_reporter(progress),
-            device=device,
         )
 
 

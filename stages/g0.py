@@ -112,14 +112,14 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
+    from cleargs.splat.backend import set_threads
     from cleargs.splat.effort import decided
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
-    from cleargs.splat.backend import set_threads
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
-    from cleargs.splat.trainer import train
+    from cleargs.splat.trainer import Trainer
     from cleargs.splat.views import real_views, require_views
 
     config, ingest = context.config, context.inputs["ingest"]
@@ -146,17 +146,16 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
     exposure, spread = _exposure(config, views, sparse)
     formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)
-    trained = train(
+    trainer = Trainer(
         Scene(gaussians, config.antialias, config.background),
         views,
         config,
         seed=(context.seed,),
         formation=formation,
-        checkpoint=context.checkpoints / "g0.safetensors",
-        reporter=context.reporter,
-        label="G0",
         device=context.device,
     )
+    checkpoint = context.checkpoints / "g0.safetensors"
+    trained = trainer.run(checkpoint=checkpoint, reporter=context.reporter, label="G0")
     write_ply(context.out / "scene.ply", trained.scene)
     write_table(context.out / "train.parquet", trained.rows, TRAIN)
     learned = formation.exposure or Exposure.identity([view.frame_id for view in views])

@@ -30,7 +30,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.ply import read_ply, write_ply
 from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import train
+from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Render
 from cleargs.splat.views import View
 
@@ -168,7 +168,7 @@ class Snapshot:
                 lr_exposure=config.lr_exposure,
                 known=self.formations,
             )
-            result = train(
+            trainer = Trainer(
                 self.scene,
                 views,
                 config,
@@ -177,12 +177,9 @@ class Snapshot:
                 moments=read_moments(self.folder / STATE, self.scene.gaussians),
                 pseudo_share=_pseudo_share(pseudo_share, views, repaired),
                 pseudo_weight=pseudo_weight,
-                checkpoint=folder / CHECKPOINT,
-                reporter=reporter,
-                label=label,
-                round=round,
                 device=self._device,
             )
+            result = trainer.run(checkpoint=folder / CHECKPOINT, reporter=reporter, label=label, round=round)
             write_table(folder / LOG, result.rows, TRAIN)
             save_state(folder / STATE, result.state)
             write_exposure(folder / EXPOSURE, formation.exposure or self._written_exposure)

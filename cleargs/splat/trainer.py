@@ -22,7 +22,7 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.backend import backend_for, photometric_loss, psnr, step_gaussians
+from cleargs.splat.backend import backend_for, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.effort import decided, seconds_by_step
@@ -56,112 +56,16 @@ class Trained:
     """All that a continuation needs, for ``state.safetensors``."""
 
 
-def train(
-    scene: Scene,
-    views: Sequence[View],
-    config: TrainConfig,
-    *,
-    seed: Sequence[int],
-    formation: Formation | None = None,
-    moments: Moments | None = None,
-    pseudo_share: float = 0.0,
-    pseudo_weight: float = 1.0,
-    checkpoint: Path,
-    reporter: Reporter,
-    label: str = "training",
-    round: int = 0,
-    device: str = "cpu",
-) -> Trained:
-    """Train ``scene`` on ``views`` for as many steps as ``config`` says.
+class Trainer:
+    """A training of ``scene`` on ``views`` for as many steps as ``config`` says: `run` does all of them.
 
     ``seed`` is the only source of randomness. ``formation`` None compares the views with the render as it is;
     otherwise with what the formation makes of it, which keeps learning in place. ``moments`` are Adam's, from
     the part of the schedule before this one; None: fresh ones. A share ``pseudo_share`` of the steps draws a
-    pseudo view, whose loss is multiplied by ``pseudo_weight``. Resumes from ``checkpoint`` where there is
-    one, to the same result bit for bit. Beside each checkpoint lies a preview.
+    pseudo view, whose loss is multiplied by ``pseudo_weight``.
 
-    Raises InputError when no view has a weight or the scene is not finite, StageError when a parameter or the
-    loss ceases to be finite, KeyboardInterrupt behind a checkpoint after a SIGTERM that the program answers.
+    Raises InputError when no view has a weight or the scene is not finite.
     """
-    trainer = Trainer(
-        scene,
-        views,
-        config,
-        seed=seed,
-        formation=formation,
-        moments=moments,
-        pseudo_share=pseudo_share,
-        pseudo_weight=pseudo_weight,
-        device=device,
-    )
-    saved = load_state(checkpoint, reporter)
-    if saved is not None and not trainer.wrote(saved):
-        reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
-    elif saved is not None:
-        trainer.restore(saved)
-        reporter.info(f"{label}: resuming from step {trainer.done} of {trainer.length}")
-    backend_for(device).warm_up()  # before the bar, or half a minute of compiling would count as pace
-    with (
-        support.memory_errors(),
-        deferred_sigterm() as terminated,
-        reporter.task(label, total=trainer.length) as task,
-    ):
-        progress = _Progress(task, trainer)
-        while trainer.done < trainer.length:
-            trainer.step()
-            stopped = terminated()
-            due = stopped or (
-                trainer.done % config.checkpoint_interval == 0 and trainer.done < trainer.length
-            )
-            if trainer.done % _NOTE_INTERVAL == 0:
-                progress.show()
-            if due or trainer.done % _CHECK_INTERVAL == 0:
-                trainer.check_finite()
-            if due:
-                save_state(checkpoint, trainer.state())
-                write_preview(checkpoint.with_name(PREVIEW), trainer.preview())
-            if stopped:
-                raise KeyboardInterrupt
-        trainer.check_finite()
-        progress.show()
-    state = {name: tensor.cpu() for name, tensor in trainer.state().items()}
-    return Trained(trainer.scene.to("cpu"), trainer.rows(round), state)
-
-
-    def run(
-        self, *, checkpoint: Path, reporter: Reporter, label: str = "training", round: int = 0
-    ) -> Trained:
-        """Train to the end. Resumes from ``checkpoint`` where there is one, to the same result bit for bit.
-        Beside each checkpoint lies a preview.
-
-        Raises StageError when a parameter or the loss ceases to be finite.
-        """
-        saved = load_state(checkpoint, reporter)
-        if saved is not None and not self.wrote(saved):
-            reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
-        elif saved is not None:
-            self.restore(saved)
-            reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
-        self._backend.warm_up()  # before the bar, or half a minute of compiling would count as pace
-        with support.memory_errors(), reporter.task(label, total=self.length) as task:
-            progress = _Progress(task, self)
-            while self.done < self.length:
-                self.step()
-                due = self.done % self._config.checkpoint_interval == 0 and self.done < self.length
-                if self.done % _NOTE_INTERVAL == 0:
-                    progress.show()
-                if due or self.done % _CHECK_INTERVAL == 0:
-                    self.check_finite()
-                if due:
-                    save_state(checkpoint, self.state())
-                    write_preview(checkpoint.with_name(PREVIEW), self.preview())
-            self.check_finite()
-            progress.show()
-        state = {name: tensor.cpu() for name, tensor in self.state().items()}
-        return Trained(self.scene.to("cpu"), self.rows(round), state)
-
-class Trainer:
-    """The state of one training; `step` is one iteration. Use `train` unless you need to look inside."""
 
     def __init__(
         self,
@@ -214,6 +118,48 @@ class Trainer:
         ]
         self._fingerprint = _fingerprint(scene, weighted, config, starts)
         self.done = 0
+
+    def run(
+        self, *, checkpoint: Path, reporter: Reporter, label: str = "training", round: int = 0
+    ) -> Trained:
+        """Train to the end. Resumes from ``checkpoint`` where there is one, to the same result bit for bit.
+        Beside each checkpoint lies a preview.
+
+        Raises StageError when a parameter or the loss ceases to be finite, KeyboardInterrupt behind a
+        checkpoint after a SIGTERM that the program answers.
+        """
+        saved = load_state(checkpoint, reporter)
+        if saved is not None and not self.wrote(saved):
+            reporter.warn(f"ignoring {checkpoint.name}: it belongs to another training")
+        elif saved is not None:
+            self.restore(saved)
+            reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
+        self._backend.warm_up()  # before the bar, or half a minute of compiling would count as pace
+        with (
+            support.memory_errors(),
+            deferred_sigterm() as terminated,
+            reporter.task(label, total=self.length) as task,
+        ):
+            progress = _Progress(task, self)
+            while self.done < self.length:
+                self.step()
+                stopped = terminated()
+                due = stopped or (
+                    self.done % self._config.checkpoint_interval == 0 and self.done < self.length
+                )
+                if self.done % _NOTE_INTERVAL == 0:
+                    progress.show()
+                if due or self.done % _CHECK_INTERVAL == 0:
+                    self.check_finite()
+                if due:
+                    save_state(checkpoint, self.state())
+                    write_preview(checkpoint.with_name(PREVIEW), self.preview())
+                if stopped:
+                    raise KeyboardInterrupt
+            self.check_finite()
+            progress.show()
+        state = {name: tensor.cpu() for name, tensor in self.state().items()}
+        return Trained(self.scene.to("cpu"), self.rows(round), state)
 
     @property
     def scene(self) -> Scene:
@@ -391,19 +337,6 @@ class Trainer:
             self.check_finite()  # a refinement takes one whose opacity is NaN for dead, and hides it
             self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, at)
         self._strategy.after_step(self._gaussians, self._schedule.rate_of_means(at), at)
-
-    def _on_device(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {name: tensor.to(self._device) for name, tensor in tensors.items()}
-
-    def _slope(self, target: Tensor) -> Tensor:
-        """A buffer for the gradient of the loss with respect to the image."""
-        size = (target.shape[0], target.shape[1])
-        if size not in self._slopes:
-            self._slopes[size] = torch.empty_like(target)
-        return self._slopes[size]
-
-    def _rng(self, stream: Stream, count: int) -> np.random.Generator:
-        return np.random.default_rng([*self._seed, stream, count])
 
     def _stopped(self, fault: str) -> StageError:
         return StageError(

@@ -26,7 +26,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.trainer import Trained, Trainer, train
+from cleargs.splat.trainer import Trained, Trainer
 from cleargs.splat.views import View
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 5
@@ -89,15 +89,8 @@ def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> 
 
 def run(folder: Path, seen: list[View], formation: CaptureFormation | None) -> Trained:
     folder.mkdir(exist_ok=True)
-    return train(
-        scene(),
-        seen,
-        CONFIG,
-        seed=(3,),
-        formation=formation,
-        checkpoint=folder / "state.safetensors",
-        reporter=SilentReporter(),
-    )
+    trainer = Trainer(scene(), seen, CONFIG, seed=(3,), formation=formation)
+    return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
 
 
 def test_a_blurred_frame_is_found_and_the_sharp_ones_are_left_alone(tmp_path: Path) -> None:

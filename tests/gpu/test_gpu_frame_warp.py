@@ -30,7 +30,7 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_LAST
-from cleargs.splat.trainer import Trained, train
+from cleargs.splat.trainer import Trained, Trainer
 
 Both = Callable[..., tuple[Any, Any]]
 
@@ -123,16 +123,8 @@ def test_a_training_through_the_warp_follows_the_cpu(
     def trained(where: str) -> Trained:
         formation = CaptureFormation(views, FormationConfig(start=0.0), known=known)
         assert [frame.model for frame in formation.frames.values()] == list(motions)
-        return train(
-            splat_toy.start(6),
-            views,
-            config,
-            seed=(7,),
-            formation=formation,
-            checkpoint=tmp_path / "state.safetensors",
-            reporter=SilentReporter(),
-            device=where,
-        )
+        trainer = Trainer(splat_toy.start(6), views, config, seed=(7,), formation=formation, device=where)
+        return trainer.run(checkpoint=tmp_path / "state.safetensors", reporter=SilentReporter())
 
     on_gpu = trained(str(device))
     with monkeypatch.context() as patch:

@@ -20,7 +20,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.state import load_state
 from cleargs.splat.strategy import rules
-from cleargs.splat.trainer import Trainer, train
+from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Moments
 from cleargs.splat.views import ImageCache
 
@@ -126,16 +126,9 @@ def toy(monkeypatch):
 
 
 def trained_on(device, views, folder, *, config=CONFIG, formation=None):
-    return train(
-        splat_toy.start(12, sh_degree=1),
-        views,
-        config,
-        seed=(7,),
-        formation=formation,
-        checkpoint=folder / "state.safetensors",
-        reporter=SilentReporter(),
-        device=str(device),
-    )
+    scene = splat_toy.start(12, sh_degree=1)
+    trainer = Trainer(scene, views, config, seed=(7,), formation=formation, device=str(device))
+    return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
 
 
 def test_training_repeats_itself_and_resumes_to_the_same_bits(toy, device, tmp_path):

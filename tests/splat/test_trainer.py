@@ -22,17 +22,16 @@ from cleargs.formation.exposure import Exposure, centred
 from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
-from cleargs.splat import trainer
-from cleargs.splat.backend import photometric_loss
+from cleargs.splat.backend import set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.backend import set_threads
+from cleargs.splat.kernels.cpu.backend import Meter
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.trainer import Trained, Trainer, train
-from cleargs.splat.types import Moments, PhotometricLoss
+from cleargs.splat.trainer import Trained, Trainer
+from cleargs.splat.types import Moments
 from cleargs.splat.views import ImageCache, View, unseen_pixels
 
 CONFIG = TrainConfig(
@@ -67,8 +66,9 @@ def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **op
     made = pictures_or_views if isinstance(pictures_or_views[0], View) else views(pictures_or_views)
     folder.mkdir(exist_ok=True)
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
-    scene = arguments.pop("scene")
-    return train(scene, made, config, checkpoint=folder / "state.safetensors", **arguments)
+    scene, reporter, round = arguments.pop("scene"), arguments.pop("reporter"), arguments.pop("round", 0)
+    trainer = Trainer(scene, made, config, **arguments)
+    return trainer.run(checkpoint=folder / "state.safetensors", reporter=reporter, round=round)
 
 
 def affines(weights: list[float] | None = None, rate: float = CONFIG.lr_exposure) -> CaptureFormation:
@@ -147,10 +147,11 @@ def test_weights_of_one_change_no_bit(
 ) -> None:
     weighted = run(views(pictures, weights=[1.0] * 6), tmp_path / "a")
 
-    def without_weight(*images: Any, weight: float, **options: Any) -> PhotometricLoss:
-        return photometric_loss(*images, **options)
+    def without_weight(meter: Meter, *images: Any, weight: float, **options: Any) -> None:
+        add(meter, *images, weight=1.0, **options)
 
-    monkeypatch.setattr(trainer, "photometric_loss", without_weight)
+    add = Meter.add
+    monkeypatch.setattr(Meter, "add", without_weight)
     assert_same(weighted, run(pictures, tmp_path / "b"))
     for row in weighted.rows.to_pylist():
         unweighted = (1.0 - CONFIG.ssim_lambda) * row["l1"] + CONFIG.ssim_lambda * (1.0 - row["ssim"])
