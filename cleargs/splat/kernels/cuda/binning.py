@@ -50,24 +50,16 @@ def tile_rows(mean_y, extent_y, height):
 
 
 @triton.jit
-def tile_columns(
-    mean_x,
-    mean_y,
-    bend_x,
-    skew,
-    bend_y,
-    log2_opacity,
-    extent_y,
-    extent_x_at,
-    row,
-    width,
-):
+def tile_columns(ellipse, row, width):
     """Tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
+
+    ``ellipse`` holds MEAN_X, MEAN_Y, BEND_X, SKEW, BEND_Y, LOG2_OPACITY, EXTENT_Y and EXTENT_X_AT.
 
     Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so it is
     largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge is its
     mirror.
     """
+    mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at = ellipse
     mean = mean_y.to(tl.float64)
     extent = reach_of_rows(extent_y)
     line = (row * layout.TILE).to(tl.float64)
@@ -91,28 +83,14 @@ def tile_columns(
 
 
 @triton.jit
-def count_tiles(
-    mean_x,
-    mean_y,
-    bend_x,
-    skew,
-    bend_y,
-    log2_opacity,
-    extent_y,
-    extent_x_at,
-    visible,
-    width,
-    height,
-):
+def count_tiles(ellipse, visible, width, height):
     """Number of tiles that each splat touches, int32; as many as ``list_pairs`` will write."""
-    rows = tile_rows(mean_y, extent_y, height)
+    rows = tile_rows(ellipse[1], ellipse[6], height)
     top, bottom = tl.where(visible, rows[0], 0), tl.where(visible, rows[1], 0)
     count = tl.zeros_like(top)
     for step in range(0, tl.max(bottom - top, axis=0)):
         row = top + step
-        columns = tile_columns(
-            mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at, row, width
-        )
+        columns = tile_columns(ellipse, row, width)
         count += tl.where(row < bottom, columns[1] - columns[0], 0)
     return count
 
@@ -152,14 +130,13 @@ def list_pairs(
     log2_opacity = tl.load(row + layout.LOG2_OPACITY, mask=some, other=0.0)
     extent_y = tl.load(row + layout.EXTENT_Y, mask=some, other=0.0)
     extent_x_at = tl.load(row + layout.EXTENT_X_AT, mask=some, other=0.0)
+    ellipse = (mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at)
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     rows = tile_rows(mean_y, extent_y, height)
     top, bottom = tl.where(some, rows[0], 0), tl.where(some, rows[1], 0)
     for step in range(0, tl.max(bottom - top, axis=0)):
         tile_row = top + step
-        columns = tile_columns(
-            mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at, tile_row, width
-        )
+        columns = tile_columns(ellipse, tile_row, width)
         length = tl.where(tile_row < bottom, columns[1] - columns[0], 0)
         tile = tile_row * tiles_x + columns[0]
         for column in range(0, tl.max(length, axis=0)):

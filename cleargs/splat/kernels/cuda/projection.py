@@ -212,9 +212,8 @@ def project(
     tl.store(row + layout.EXTENT_Y, extent_y, mask=visible)
     tl.store(row + layout.EXTENT_X_AT, extent_x_at, mask=visible)
 
-    tiles = count_tiles(
-        mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at, visible, width, height
-    )
+    ellipse = (mean_x, mean_y, bend_x, skew, bend_y, log2_opacity, extent_y, extent_x_at)
+    tiles = count_tiles(ellipse, visible, width, height)
     touches = tiles > 0
     tl.store(tile_counts + g, tiles, mask=mask)
     tl.store(depth_keys + g, tl.where(touches, z.to(tl.float32), float("inf")), mask=mask)
