@@ -8,6 +8,8 @@ spherical harmonics above degree 0 are 8 bits from -4 to 4. Source: the writer o
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -128,7 +130,7 @@ def _pack_rotation(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [
 
 
 def smaller_parts(
-    quaternions: NDArray[np.float32],  # [N, 4]
+    quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Which part of each unit quaternion is largest [N], and the others in their order [N, 3], with the sign
     that makes the largest positive: all that is needed to find it again."""

@@ -18,16 +18,14 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.splat.compressed_ply import smaller_parts
 from cleargs.splat.scene import Scene
 
 _MAGIC = 0x5053474E
 _HEADER_BYTES = 32  # of version 4; the table of sizes follows
 _ANTIALIASED = 1
 _COLOUR_SCALE = 0.15  # SH of degree 0 from -1/0.3 to 1/0.3 over the 8 bits
-_SH_STEPS = {
-    1: 8,
-    2: 16,
-}  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4, as the original does
+_SH_STEPS = (8, 16)  # coefficients of degree 1 are rounded to 5 bits, higher ones to 4, as the original does
 _POSITION_BITS_MAX = 12
 _ZSTD_LEVEL = 12  # the original's
 
@@ -55,13 +53,8 @@ def spz(scene: Scene, version: int = 3) -> bytes:
     alphas = _byte(torch.sigmoid(gaussians.logit_opacities).numpy() * 255.0)
     colours = _byte(gaussians.sh.numpy()[:, 0] * (_COLOUR_SCALE * 255.0) + 0.5 * 255.0)
     scales = _byte((gaussians.log_scales.numpy() + 10.0) * 16.0)
-    columns: list[NDArray[Any]] = [
-        positions,
-        alphas,
-        colours,
-        scales,
-        _rotations(gaussians.rotations.numpy()),
-    ]
+    rotations = _rotations(gaussians.rotations.numpy())
+    columns: list[NDArray[Any]] = [positions, alphas, colours, scales, rotations]
     if coefficients > 1:
         columns.append(_harmonics(gaussians.sh.numpy()[:, 1:]))
     contents = [column.tobytes() for column in columns]
@@ -82,27 +75,17 @@ def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 
 def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] w x y z -> [N]
     """Of x, y, z, w: which is largest (2 bits), then of the others sign and magnitude, times sqrt(2)."""
-    unit = quaternions[:, [1, 2, 3, 0]].astype(np.float64)
-    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
-    largest = np.abs(unit).argmax(axis=1)
-    turned = np.take_along_axis(unit, largest[:, None], axis=1)[:, 0] < 0
+    # + 0.0, so that no zero has a sign of its own.
+    largest, smaller = smaller_parts(quaternions[:, [1, 2, 3, 0]].astype(np.float64) + 0.0)
     packed: NDArray[np.uint32] = largest.astype(np.uint32)
-    for part in range(4):
-        magnitude = np.clip(np.floor(511.0 * np.sqrt(2.0) * np.abs(unit[:, part]) + 0.5), 0, 511)
-        negative = (unit[:, part] < 0) ^ turned
-        added = (
-            (packed << np.uint32(10))
-            | (negative.astype(np.uint32) << np.uint32(9))
-            | magnitude.astype(np.uint32)
-        )
-        packed = np.where(largest == part, packed, added)
+    for part in smaller.T:
+        magnitude = np.clip(np.floor(511.0 * np.sqrt(2.0) * np.abs(part) + 0.5), 0, 511).astype(np.uint32)
+        packed = (packed << np.uint32(10)) | (np.signbit(part).astype(np.uint32) << np.uint32(9)) | magnitude
     return packed
 
 
 def _harmonics(sh: NDArray[np.float32]) -> NDArray[np.uint8]:  # [N, K - 1, 3]
     """128 + 128 times the coefficient, rounded to the middle of a step."""
-    steps = np.full(sh.shape[1], _SH_STEPS[2])
-    steps[:3] = _SH_STEPS[1]
-    steps = steps[:, None]
+    steps = np.where(np.arange(sh.shape[1]) < 3, *_SH_STEPS)[:, None]
     raw = np.rint(sh * 128.0) + 128.0
     return _byte(np.floor((raw + steps / 2) / steps) * steps)
