@@ -51,13 +51,8 @@ class Camera:
     @classmethod
     def from_quaternion(
         cls,
-        qw: float,
-        qx: float,
-        qy: float,
-        qz: float,
-        tx: float,
-        ty: float,
-        tz: float,
+        quaternion: Sequence[float],
+        translation: Sequence[float],
         *,
         width: int,
         height: int,
@@ -66,15 +61,15 @@ class Camera:
         cx: float,
         cy: float,
     ) -> Camera:
-        """Camera from COLMAP's world-to-camera quaternion (normalised here) and translation."""
-        w, x, y, z = np.array([qw, qx, qy, qz], np.float64) / np.linalg.norm([qw, qx, qy, qz])
+        """Camera from COLMAP's world-to-camera quaternion w x y z (normalised here) and translation."""
+        w, x, y, z = np.array(quaternion, np.float64) / np.linalg.norm(quaternion)
         pose = np.eye(4)
         pose[:3, :3] = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
-        pose[:3, 3] = tx, ty, tz
+        pose[:3, 3] = translation
         return cls(width, height, fx, fy, cx, cy, pose)
 
     @property

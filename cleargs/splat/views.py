@@ -84,11 +84,13 @@ class View:
 
 def view_of(frame: Frame, folder: Path, weight: float) -> View:
     """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
-    pose = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-    if not frame.registered or any(value is None for value in pose):
+    numbers = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
+    pose = [float(value) for value in numbers if value is not None]
+    if not frame.registered or len(pose) < len(numbers):
         raise ValueError(f"frame {frame.frame_id} has no pose")
     camera = Camera.from_quaternion(
-        *(float(value) for value in pose if value is not None),
+        pose[:4],
+        pose[4:],
         width=frame.width,
         height=frame.height,
         fx=frame.fx,

@@ -125,7 +125,7 @@ def test_order_is_by_depth_then_index():
 
 def test_camera():
     camera = Camera.from_quaternion(
-        2 * np.cos(0.3), 0, 2 * np.sin(0.3), 0, 1, 2, 3, width=100, height=50, fx=80, fy=70, cx=51, cy=24
+        [2 * np.cos(0.3), 0, 2 * np.sin(0.3), 0], [1, 2, 3], width=100, height=50, fx=80, fy=70, cx=51, cy=24
     )
     # A turn by 0.6 about y takes z to x = sin 0.6.
     np.testing.assert_allclose(camera.world_to_camera[:3, 2], [np.sin(0.6), 0, np.cos(0.6)], atol=1e-15)
