@@ -32,7 +32,7 @@ from cleargs.pipeline.run_file import RUN_FILE, Device, Run, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
-from cleargs.splat.ply import ply_size
+from cleargs.splat.ply import read_ply
 from cleargs.untrusted import read_bytes, read_json
 
 EVALUATION_VERSION = 3
@@ -190,7 +190,7 @@ def _work_of(
 def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporter) -> list[Cell]:
     """The cells of one scene, one a set of views. Raises InputError when there is nothing to compare with."""
     cells = []
-    gaussians, sh_degree = ply_size(made.scene)
+    gaussians = read_ply(made.scene).gaussians
     for view_set in view_sets(made):
         evaluation, folder = evaluated(out, made, view_set, recipe, store, reporter)
         cells.append(
@@ -204,9 +204,9 @@ def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporte
                 trained_on=_trained_on(made, view_set),
                 seconds=made.seconds,
                 shared_seconds=made.shared_seconds,
-                gaussians=gaussians,
+                gaussians=gaussians.num,
                 steps=trained_steps(made),
-                sh_degree=sh_degree,
+                sh_degree=gaussians.sh_degree,
                 cpu_seconds=_all_noted(sum, [manifest.cpu_seconds for manifest in made.manifests]),
                 peak_memory_gb=_all_noted(max, [manifest.peak_memory_gb for manifest in made.manifests]),
                 evaluation=folder.relative_to(out).as_posix(),

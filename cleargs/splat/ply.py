@@ -14,7 +14,6 @@ import torch
 
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path
-from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.untrusted import FAULTS, cause, open_regular
@@ -95,24 +94,10 @@ def read_ply(path: Path) -> Scene:
             background=background,
         )
     except FAULTS as error:
-        raise _unreadable(path, error) from error
-
-
-def ply_size(path: Path) -> tuple[int, int]:
-    """Return the number of Gaussians of a scene and their SH degree, from its header. Raises StoreError."""
-    try:
-        with open_regular(path) as file:
-            count, names, _ = _read_header(file)
-        return count, SH_DEGREES[1 + sum(name.startswith("f_rest_") for name in names) // 3]
-    except FAULTS as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> StoreError:
-    return StoreError(
-        f"cannot read the scene {path}: {cause(error)}",
-        hint="run the stage that wrote it again with --force",
-    )
+        raise StoreError(
+            f"cannot read the scene {path}: {cause(error)}",
+            hint="run the stage that wrote it again with --force",
+        ) from error
 
 
 def _properties(coefficients: int) -> list[str]:
