@@ -76,7 +76,7 @@ def starting_gaussians(
         sparse = add_points(sparse, views, missing, seed=seed)
     if sh_degree is None:
         sh_degree = sh_degree_from_views(len(views))
-    return from_points(sparse, sh_degree=sh_degree, init_scale=INIT_SCALE, init_opacity=INIT_OPACITY)
+    return from_points(sparse, sh_degree)
 
 
 def sh_degree_from_views(count: int) -> int:
@@ -87,10 +87,10 @@ def sh_degree_from_views(count: int) -> int:
     return 0 if count < 12 else 1 if count < 40 else 2 if count < 100 else 3
 
 
-def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init_opacity: float) -> Gaussians:
+def from_points(sparse: SparsePoints, sh_degree: int) -> Gaussians:
     """One isotropic Gaussian a point.
 
-    Its scale is ``init_scale`` times the mean distance to the three nearest points; its colour fills the SH
+    Its scale is `INIT_SCALE` times the mean distance to the three nearest points; its colour fills the SH
     constant.
     """
     xyz, rgb = sparse.xyz, sparse.rgb
@@ -100,7 +100,7 @@ def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init
     if near > 0:
         distances, _ = cKDTree(xyz).query(xyz, k=near + 1)
         spacing = distances[:, 1:].mean(axis=1)
-    log_scales = np.log(np.maximum(spacing * init_scale, 1e-7))
+    log_scales = np.log(np.maximum(spacing * INIT_SCALE, 1e-7))
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = torch.from_numpy(((rgb / 255.0 - 0.5) / SH_C0).astype(np.float32))
     rotations = torch.zeros(count, 4)
@@ -109,7 +109,7 @@ def from_points(sparse: SparsePoints, *, sh_degree: int, init_scale: float, init
         means=torch.from_numpy(xyz.astype(np.float32)),
         log_scales=torch.from_numpy(np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32)),
         rotations=rotations,
-        logit_opacities=torch.full((count,), float(np.log(init_opacity / (1.0 - init_opacity)))),
+        logit_opacities=torch.full((count,), float(np.log(INIT_OPACITY / (1.0 - INIT_OPACITY)))),
         sh=sh,
     )
 
