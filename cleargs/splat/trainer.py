@@ -140,7 +140,7 @@ class Trainer:
             deferred_sigterm() as terminated,
             reporter.task(label, total=self.length) as task,
         ):
-            progress = _Progress(task, self)
+            shares, rate = self.shares_of_work(), Rate()
             while self.done < self.length:
                 self.step()
                 stopped = terminated()
@@ -148,7 +148,7 @@ class Trainer:
                     self.done % self._config.checkpoint_interval == 0 and self.done < self.length
                 )
                 if self.done % _NOTE_INTERVAL == 0:
-                    progress.show()
+                    self._show(task, shares, rate)
                 if due or self.done % _CHECK_INTERVAL == 0:
                     self.check_finite()
                 if due:
@@ -157,7 +157,7 @@ class Trainer:
                 if stopped:
                     raise KeyboardInterrupt
             self.check_finite()
-            progress.show()
+            self._show(task, shares, rate)
         state = {name: tensor.cpu() for name, tensor in self.state().items()}
         return Trained(self.scene.to("cpu"), self.rows(round), state)
 
@@ -221,6 +221,16 @@ class Trainer:
         megapixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / 1e6
         seconds = seconds_by_step(self._config, len(views), megapixels, self._scene.gaussians.num)
         return [0.0, *(np.cumsum(seconds) / seconds.sum()).tolist()]
+
+    def _show(self, task: Task, shares: Sequence[float], rate: Rate) -> None:
+        """Tell the progress bar iterations per second, PSNR and Gaussians.
+
+        The rate counts from the first call on: the steps before may have waited for kernels to be compiled.
+        """
+        words = [f"training PSNR {self.last_psnr:.2f} dB", f"{self._gaussians.num} Gaussians"]
+        if (steps := rate.a_second(self.done)) is not None:
+            words.insert(0, f"{steps:.1f} it/s")
+        task.update(done=self.done, note=", ".join(words), share=shares[self.done])
 
     def check_finite(self) -> None:
         """Raise StageError, naming the step and the group, when a parameter is NaN or infinite."""
@@ -362,25 +372,6 @@ def _all_finite(tensors: Collection[Tensor]) -> bool:
     if not any(tensor.is_cuda for tensor in tensors):
         return all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors)
     return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
-
-
-class _Progress:
-    """Iterations a second, PSNR and Gaussians, for the progress bar alone (which adds the time left).
-
-    The rate counts from the first call on: the steps before it may have waited for kernels to be compiled.
-    """
-
-    def __init__(self, task: Task, trainer: Trainer) -> None:
-        self._task, self._trainer = task, trainer
-        self._share = trainer.shares_of_work()
-        self._rate = Rate()
-
-    def show(self) -> None:
-        trainer = self._trainer
-        words = [f"training PSNR {trainer.last_psnr:.2f} dB", f"{trainer.scene.gaussians.num} Gaussians"]
-        if (rate := self._rate.a_second(trainer.done)) is not None:
-            words.insert(0, f"{rate:.1f} it/s")
-        self._task.update(done=trainer.done, note=", ".join(words), share=self._share[trainer.done])
 
 
 def _numbers(camera: Camera) -> list[float]:
