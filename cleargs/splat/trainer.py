@@ -32,7 +32,6 @@ from cleargs.splat.kernels.cuda import support
 from cleargs.splat.scene import Scene
 from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.strategy.mcmc import MCMC
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
 from cleargs.splat.types import Moments, Render
 from cleargs.splat.views import ImageCache, View, require_views
@@ -102,8 +101,7 @@ class Trainer:
         self._moments = Moments.zeros(self._gaussians) if moments is None else moments.to(self._device)
         self._before = 0 if moments is None else config.first
         self._schedule = Schedule(config, self._gaussians.sh.shape[1], self._device)
-        assert config.budget is not None  # decided above
-        self._strategy = MCMC(config, config.budget, seed)
+        self._errors: Tensor | None = None  # [N] since the last refinement
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
         self._meter = self._backend.meter(config.ssim_lambda)
@@ -191,7 +189,8 @@ class Trainer:
         self._log.seen(self.done, view, weight, target, self._gaussians.num, self._sh_degree())
         slope = self._measure(image, target, mask, weight)
         if config.densify and self._schedule.wants_errors(at):
-            self._strategy.add_errors(self._shares_of_error(image, target, mask, weight, formed))
+            errors = self._shares_of_error(image, target, mask, weight, formed)
+            self._errors = errors if self._errors is None else self._errors + errors
         gradients = self._rasteriser.backward(slope if formed is None else formed.backward(slope))
         self._backend.regularise(
             self._gaussians, gradients, opacity=config.opacity_reg, scale=config.scale_reg
@@ -249,7 +248,8 @@ class Trainer:
         }
         state |= {f"parameter.{name}": tensor for name, tensor in self._gaussians.tensors().items()}
         state |= self._moments.state()
-        state |= {f"strategy.{name}": tensor for name, tensor in self._strategy.state().items()}
+        if self._errors is not None:
+            state["strategy.errors"] = self._errors
         if self._formation is not None:
             state |= {f"formation.{name}": tensor for name, tensor in self._formation.state().items()}
         return state
@@ -269,7 +269,8 @@ class Trainer:
         self._log.restore(state["log"])
         self._gaussians = Gaussians(**group("parameter")).to(self._device)
         self._moments = Moments.of_state(state).to(self._device)
-        self._strategy.restore({name: t.to(self._device) for name, t in group("strategy").items()})
+        errors = state.get("strategy.errors")
+        self._errors = None if errors is None else errors.to(self._device)
         if self._formation is not None:
             self._formation.restore(group("formation"))
 
@@ -341,12 +342,29 @@ class Trainer:
                 raise self._stopped("the loss is not finite")
 
     def _densify(self) -> None:
-        """What the strategy does, and its refinement where one is due."""
-        at = self._at
+        """Add the noise of a step, behind a refinement where one is due and errors say where."""
+        config, at = self._config, self._at
         if self._schedule.refines(at):
             self.check_finite()  # a refinement takes one whose opacity is NaN for dead, and hides it
-            self._gaussians, self._moments = self._strategy.refine(self._gaussians, self._moments, at)
-        self._strategy.after_step(self._gaussians, self._schedule.rate_of_means(at), at)
+            if self._errors is not None:
+                assert config.budget is not None  # decided at the start
+                self._gaussians, self._moments = self._backend.refine(
+                    self._gaussians,
+                    self._moments,
+                    errors=self._errors,
+                    rate=config.growth,
+                    budget=config.budget,
+                    min_opacity=config.min_opacity,
+                    seed=(*self._seed, Stream.REFINEMENT, at),
+                )
+                self._errors = None
+        if config.noise > 0.0:
+            self._backend.add_position_noise(
+                self._gaussians,
+                amount=config.noise * self._schedule.rate_of_means(at),
+                min_opacity=config.min_opacity,
+                seed=(*self._seed, Stream.POSITION_NOISE, at),
+            )
 
     def _stopped(self, fault: str) -> StageError:
         return StageError(

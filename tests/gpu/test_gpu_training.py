@@ -16,10 +16,10 @@ from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.photograph import evaluate_views
 from cleargs.progress import SilentReporter
+from cleargs.splat import densification
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.state import load_state
-from cleargs.splat.strategy import rules
 from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Moments
 from cleargs.splat.views import ImageCache
@@ -52,7 +52,7 @@ def test_a_refinement_is_that_of_the_cpu(device, densify):
     settings = {"rate": 0.5, "budget": 57, "min_opacity": 0.01}
     grown, moments = densify.refine(gaussians, Moments(first, second), errors=errors, seed=(1,), **settings)
     reset = moments.first
-    expected, (emptied,) = rules.refine(
+    expected, (emptied,) = densification.refine(
         arrays, running, errors=errors.double().cpu().numpy(), rng=np.random.default_rng(1), **settings
     )
     assert grown.num == len(expected["means"]) == 57
@@ -89,7 +89,7 @@ def test_noise_has_the_covariance_and_spares_the_opaque(device, densify):
     densify.add_position_noise(gaussians, amount=2.0, min_opacity=0.005, seed=(11,))
     offsets = (gaussians.means - start).double().cpu()
     assert not offsets[:10].any()
-    rotation = rules.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
+    rotation = densification.rotation_matrices(one.rotations.numpy())[0].astype(np.float64)
     covariance = rotation @ np.diag(np.exp(2.0 * one.log_scales[0].double().numpy())) @ rotation.T
     # offset = 2 fade Σ draw, so its covariance is 4 fade² Σ²; a sample's entries are good to some per cent.
     fade = 1.0 / (1.0 + math.exp(-100.0 * (0.005 - 1.0 / (1.0 + math.exp(9.0)))))

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cleargs.splat.backend import set_threads
-from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu.backend import add_position_noise
-from cleargs.splat.strategy.rules import (
+from cleargs.splat.densification import (
     refine,
     rotation_matrices,
     sample_once,
     sigmoid,
 )
+from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu.backend import add_position_noise
 
 OPEN = 0.005
 

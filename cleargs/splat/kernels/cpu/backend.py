@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from cleargs.splat import densification
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
@@ -17,7 +18,6 @@ from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
 from cleargs.splat.kernels.cpu.jit import Array, Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
-from cleargs.splat.strategy import rules
 from cleargs.splat.types import Moments, Rate, Reading
 
 ADAM_BLOCK = 4096
@@ -131,7 +131,7 @@ def adam_step(
 
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:
     if opacity > 0.0:
-        opacities = rules.sigmoid(gaussians.logit_opacities.numpy())
+        opacities = densification.sigmoid(gaussians.logit_opacities.numpy())
         gradients.logit_opacities.numpy()[:] += (
             np.float32(opacity / gaussians.num) * opacities * (1 - opacities)
         )
@@ -157,7 +157,7 @@ def refine(
     running = [
         {name: tensor.numpy() for name, tensor in group.items()} for group in (moments.first, moments.second)
     ]
-    arrays, running = rules.refine(
+    arrays, running = densification.refine(
         arrays,
         running,
         errors=errors.double().numpy(),
@@ -184,7 +184,7 @@ def add_position_noise(
             gaussians.logit_opacities.numpy(),
             amount,
             min_opacity,
-            rules.NOISE_CUT,
+            densification.NOISE_CUT,
             key,
         )
 

@@ -1,4 +1,4 @@
-"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``strategy.rules``.
+"""Refinement and noise of 3DGS-MCMC on the device; the rules are those of ``cleargs.splat.densification``.
 
 A refinement happens every so many steps and is made of torch operations; the noise of every step is one
 kernel. Draws come from Philox counters keyed by the step's seed: the same device draws the same each time.
@@ -15,10 +15,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from cleargs.splat import densification
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
 from cleargs.splat.kernels.reference import rotation_matrices
-from cleargs.splat.strategy import rules
 from cleargs.splat.types import Moments
 
 BLOCK = 256
@@ -39,17 +39,17 @@ def refine(
     min_opacity: float,
     seed: Sequence[int],
 ) -> tuple[Gaussians, Moments]:
-    """``rules.refine``. What is given is changed and must not be used again."""
+    """``densification.refine``. What is given is changed and must not be used again."""
     running = [moments.first, moments.second]
     generator = torch.Generator(gaussians.device).manual_seed(seed_of(seed))
     errors, start = errors.double(), gaussians.num
     growth = max(0, min(budget, int((1.0 + rate) * start)) - start)
-    for done in range(1, rules.ROUNDS + 1):
+    for done in range(1, densification.ROUNDS + 1):
         opacity = gaussians.logit_opacities.double().sigmoid()
         alive = opacity > min_opacity
         weights, dead = torch.where(alive, errors, 0.0), torch.nonzero(~alive).squeeze(1)
         count = gaussians.num
-        room = max(0, start + growth * done // rules.ROUNDS - count)
+        room = max(0, start + growth * done // densification.ROUNDS - count)
         cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), generator)
         others = _halves(gaussians, cut, opacity[cut], min_opacity)
         errors = torch.cat([errors, errors.new_zeros(max(0, len(cut) - len(dead)))])
@@ -71,7 +71,7 @@ def refine(
 
 
 def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
-    """``rules._placed``."""
+    """``densification._placed``."""
     longer = max(len(tensor), 1 + int(places.max())) if len(places) else len(tensor)
     if longer > len(tensor):
         tensor = torch.cat([tensor, tensor.new_zeros(longer - len(tensor), *tensor.shape[1:])])
@@ -80,19 +80,19 @@ def _placed(tensor: Tensor, places: Tensor, rows: Tensor) -> Tensor:
 
 
 def sample_once(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``rules.sample_once`` of float64 ``weights`` [N]."""
+    """``densification.sample_once`` of float64 ``weights`` [N]."""
     draws = torch.rand(len(weights), generator=generator, dtype=torch.float64, device=weights.device)
     return torch.sort(-torch.log1p(-draws) / weights, stable=True).indices[:count]
 
 
 def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: float) -> dict[str, Tensor]:
-    """``rules._halves``: make the Gaussians ``cut`` one of their halves, and return the other ones."""
+    """``densification._halves``: make the Gaussians ``cut`` one of their halves, and return the others."""
     rows = torch.arange(len(cut), device=cut.device)
     longest = gaussians.log_scales[cut].argmax(dim=1)
     axes = rotation_matrices(gaussians.rotations[cut])[rows, :, longest]
-    away = axes * (rules.PART * gaussians.log_scales[cut, longest].exp())[:, None]
-    faint = (1.0 - (1.0 - opacity) ** (0.5 / rules.PART)).clamp(min_opacity, 1.0 - 1e-6)
-    gaussians.log_scales[cut, longest] += math.log(rules.PART)
+    away = axes * (densification.PART * gaussians.log_scales[cut, longest].exp())[:, None]
+    faint = (1.0 - (1.0 - opacity) ** (0.5 / densification.PART)).clamp(min_opacity, 1.0 - 1e-6)
+    gaussians.log_scales[cut, longest] += math.log(densification.PART)
     gaussians.logit_opacities[cut] = (faint.log() - torch.log1p(-faint)).float()
     others = {name: tensor[cut] for name, tensor in gaussians.tensors().items()}
     gaussians.means[cut] -= away
@@ -131,7 +131,7 @@ def position_noise_kernel(
 def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
-    """Noise on the means for one step, in place; only Gaussians below ``rules.NOISE_CUT`` feel it."""
+    """Noise on the means for one step, in place; only Gaussians below ``densification.NOISE_CUT`` feel it."""
     position_noise_kernel[(-(-gaussians.num // BLOCK),)](
         gaussians.means,
         gaussians.log_scales,
@@ -141,7 +141,7 @@ def add_position_noise(
         seed_of(seed),
         amount,
         min_opacity,
-        rules.NOISE_CUT,
+        densification.NOISE_CUT,
         BLOCK=BLOCK,
         num_warps=4,
     )

@@ -1,6 +1,15 @@
-"""The rules of a refinement: pure functions on numpy arrays.
+"""Densification after "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024).
 
-They run on one thread, so the results depend on no thread count.
+As there, dead Gaussians move, the number grows to a hard budget, and noise that only transparent Gaussians
+feel is added to the means. But the error says where, not opacity: what takes part in pixels that are far from
+their frames (Rota Bulò et al., "Revising densification in Gaussian splatting", 2024) is cut in two along its
+longest axis (Deng et al., "Efficient density control", 2024); the dead become halves, as the new ones are.
+Drawn by opacity, copies at one place take long to part, and what lies in the dark or behind the sparse points
+gets none.
+
+Here are the rules of a refinement: pure functions on numpy arrays, on one thread, so that the results depend
+on no thread count. The noise, of every step, is a kernel. A GPU has the same rules, and draws other random
+numbers.
 """
 
 from __future__ import annotations

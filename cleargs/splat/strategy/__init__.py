@@ -1,1 +1,0 @@
-"""Densification: how the number and the places of Gaussians change during a training."""
