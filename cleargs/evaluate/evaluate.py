@@ -6,7 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from cleargs.evaluate.metrics import (
     pooled,
     region,
 )
-from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, require_match
+from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_error
 from cleargs.manifest import versions
@@ -106,10 +106,8 @@ def evaluate_images(
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
     files = images_by_stem(folder)
-    matched = tuple(view for view in reference.views if view.name in files)
-    require_match(
-        len(matched), files, (view.name for view in reference.views), "name the images like the references"
-    )
+    names = matching(files, [view.name for view in reference.views], "name the images like the references")
+    matched = tuple(view for view in reference.views if view.name in names)
 
     def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
         image = read_rgb(files[view.name])
@@ -121,7 +119,7 @@ def evaluate_images(
             )
         return _Prediction(image / 255.0)
 
-    restricted = Reference(reference.name, matched, reference.poses, reference.alignment)
+    restricted = replace(reference, views=matched)
     name = folder.resolve().name
     found = _evaluate(name, None, predict, restricted, options, threads, reporter, save)
     if len(matched) < len(reference.views):
