@@ -136,20 +136,12 @@ def load_metrics(options: EvalOptions) -> MetricSet:
         else:
             unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
     for name in options.scorers:
-        scorer = _scorer(name)
-        if scorer is not None:
-            scorers[name] = scorer
-            weights[name] = scorer.digest
-        else:
+        if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
             unavailable[name] = "not installed: see `cleargs models list`"
+        else:
+            scorers[name] = load_scorer(name)
+            weights[name] = scorers[name].digest
     return MetricSet(lpips, scorers, weights, unavailable)
-
-
-def _scorer(name: str) -> Scorer | None:
-    """The scorer of that name; None for one of `INSTALLABLE` that the user has not installed."""
-    if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
-        return None
-    return load_scorer(name)
 
 
 def _floats(image: Pixels) -> Image:
