@@ -14,9 +14,8 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import model_file, registered, verify
+from cleargs.models.registry import Model, load_network
 from cleargs.models.tiling import Image, map_tiled
-from cleargs.plugins import load_part
 
 
 class Expert(Protocol):
@@ -97,19 +96,11 @@ class OnnxExpert:
         return np.asarray(restored, np.float32)
 
 
-def expert_path(spec: str) -> Path | None:
-    """The ONNX file of the expert that a setting names: see `model_file`."""
-    return model_file(spec, "expert")
-
-
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """The expert named by ``spec`` (see `model_file`), on what `network_device` found. Raises InputError as
-    `OnnxExpert` does, and where an installed file is not what was installed."""
-    path = expert_path(spec)
-    if path is None:
-        maker: Callable[[Device], Expert] = load_part("experts", spec)
-        return maker(device)
-    model = registered(spec, "expert")
-    if model is not None and model.shipped is None:
-        verify(model, path.parent)
-    return OnnxExpert(path, None if model is None else spec, device)
+    """The expert named by ``spec`` (see `load_network`), on what `network_device` found. Raises InputError,
+    also as `OnnxExpert` does."""
+
+    def own(path: Path, model: Model | None) -> Expert:
+        return OnnxExpert(path, None if model is None else spec, device)
+
+    return load_network(spec, "expert", device, own)

@@ -7,16 +7,19 @@ import json
 import os
 import sys
 import tomllib
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from pydantic import Field
 
 from cleargs.errors import InputError, did_you_mean
-from cleargs.plugins import plugins
+from cleargs.plugins import load_part, plugins
 from cleargs.record import Record
 from cleargs.untrusted import open_regular, read_json
+
+T = TypeVar("T")
 
 Role = Literal["expert", "scorer", "metric"]
 State = Literal["shipped", "installed", "not installed", "incomplete"]
@@ -167,6 +170,22 @@ def model_file(spec: str, role: Role) -> Path | None:
         f"there is no {role} {spec!r}",
         hint=did_you_mean(spec, names, f"choose {', '.join(names)}, or give an ONNX file"),
     )
+
+
+def load_network(spec: str, role: Role, device: str, own: Callable[[Path, Model | None], T]) -> T:
+    """The expert or scorer that a setting names: what ``own`` makes of its file, and of its entry in the
+    registry, or the part that another package brings.
+
+    Raises InputError like `model_file`, and where an installed file is not what was installed.
+    """
+    path = model_file(spec, role)
+    if path is None:
+        part: T = load_part("experts" if role == "expert" else "scorers", spec)(device)
+        return part
+    model = registered(spec, role)
+    if model is not None and model.shipped is None:
+        verify(model, path.parent)
+    return own(path, model)
 
 
 def verify(model: Model, directory: Path) -> None:

@@ -91,8 +91,7 @@ def published(name: str) -> Any:
 def convert(name: str, path: Path) -> dict[str, Any]:
     """Convert the random network and compare it with PyTorch."""
     from cleargs.models.expert import OnnxExpert
-    from cleargs.models.musiq import MusiqScorer
-    from cleargs.models.scorer import LearnedScorer, Scorer
+    from cleargs.models.scorer import LearnedScorer, MusiqScorer, Scorer
     from tools.convert_models import restorer, scorers
 
     network, start = published(name), time.process_time()
@@ -139,8 +138,7 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
     """Seconds a megapixel and memory of the model on one thread; ``path``: of a network converted here."""
     from cleargs.models.expert import OnnxExpert, load_expert
     from cleargs.models.lpips import Lpips
-    from cleargs.models.musiq import MusiqScorer
-    from cleargs.models.scorer import LearnedScorer, load_scorer
+    from cleargs.models.scorer import LearnedScorer, MusiqScorer, load_scorer
 
     before, shown = peak_gb(), image(*SIZE)
     if name in ("restormer", "nafnet"):
