@@ -33,10 +33,6 @@ _CHECKPOINTS: dict[Net, tuple[str, str]] = {
     "alex": ("alexnet.ckpt", "AlexNet_0"),
     "vgg": ("vgg16.ckpt", "VGG16_0"),
 }
-_HEAD_CHANNELS: dict[Net, tuple[int, ...]] = {
-    "alex": (64, 192, 384, 256, 256),
-    "vgg": (64, 128, 256, 512, 512),
-}
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError)
 """What reading another archive may raise."""
 _MIN_SIDE = 32  # below this AlexNet's third block has no pixel left to speak of
@@ -93,7 +89,8 @@ class LpipsNetwork(nn.Module):
     def __init__(self, net: Net) -> None:
         super().__init__()
         self.trunk = _alexnet() if net == "alex" else _vgg16()
-        self.heads = nn.ModuleList(nn.Conv2d(c, 1, 1, bias=False) for c in _HEAD_CHANNELS[net])
+        widths = (64, 192, 384, 256, 256) if net == "alex" else (64, 128, 256, 512, 512)
+        self.heads = nn.ModuleList(nn.Conv2d(width, 1, 1, bias=False) for width in widths)
         # ImageNet mean and deviation, expressed for inputs in [-1, 1] as the reference implementation does.
         self.register_buffer(
             "shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False
@@ -174,13 +171,13 @@ def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[A
 def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
     """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
     state: dict[str, Tensor] = {}
-    trunk = LpipsNetwork(net).trunk
-    names = [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)]
+    network = LpipsNetwork(net)
+    names = [name for name, module in network.trunk.named_modules() if isinstance(module, nn.Conv2d)]
     for index, name in enumerate(names):
         layer = backbone[f"Conv_{index}"]
         state[f"trunk.{name}.weight"] = _oihw(layer["kernel"])
         state[f"trunk.{name}.bias"] = torch.from_numpy(np.array(layer["bias"], np.float32))
-    for index in range(len(_HEAD_CHANNELS[net])):
+    for index in range(len(network.heads)):
         state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
     return state
 
