@@ -261,15 +261,9 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     for metric in metrics:
         table.add_column(_label(metric), justify="right")
     for evaluation in report.evaluations:
-        if per_image:
-            for image in evaluation.images:
-                table.add_row(
-                    evaluation.subject,
-                    image.name,
-                    *(_figure(metric, image.values[metric]) for metric in metrics),
-                )
-        figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
-        table.add_row(evaluation.subject, f"mean of {len(evaluation.images)}", *figures)
+        shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
+        for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
+            table.add_row(evaluation.subject, name, *(_figure(metric, values[metric]) for metric in metrics))
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:
