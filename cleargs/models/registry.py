@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import sys
 import tomllib
@@ -209,15 +208,6 @@ def verify(model: Model, directory: Path) -> None:
         expected = file.digest or read_receipt(model, directory).get(file.name)
         if expected is None or file_digest(path) != expected:
             raise InputError(f"{path} is damaged", hint=f"{model.install_hint} again")
-
-
-def write_receipt(model: Model, directory: Path, source_sha256: str) -> Path:
-    """Note the digests of the source and of the files made of it."""
-    digests = {file.name: file_digest(directory / file.name) for file in model.files}
-    path = directory / model.receipt
-    receipt = {"model": model.name, "source_sha256": source_sha256, "files": digests}
-    path.write_text(json.dumps(receipt, indent=2) + "\n", "utf-8")
-    return path
 
 
 def read_receipt(model: Model, directory: Path) -> dict[str, str]:
