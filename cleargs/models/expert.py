@@ -6,7 +6,6 @@ Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embed
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -29,13 +28,8 @@ class Expert(Protocol):
     def digest(self) -> str:
         """Identifies the weights; part of the store key."""
 
-    def restore(
-        self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
-    ) -> Image:
-        """The restored image: [H, W, 3] float32 sRGB in [0, 1] in and out, bitwise equal for any ``threads``.
-
-        on_tile: called with (done, total) as the work proceeds.
-        """
+    def restore(self, image: Image, *, threads: int = 1) -> Image:
+        """The restored image, of the same bits for any ``threads``: [H, W, 3] float32 sRGB in [0, 1]."""
 
 
 class OnnxExpert:
@@ -66,15 +60,10 @@ class OnnxExpert:
         self.name = name or path.stem
         self.digest = model.digest
 
-    def restore(
-        self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
-    ) -> Image:
+    def restore(self, image: Image, *, threads: int = 1) -> Image:
         """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
         restored = map_tiled(
-            lambda tiles: self._model.map(self._restore, tiles, threads),
-            image,
-            fixed=self._fixed,
-            on_tile=on_tile,
+            lambda tiles: self._model.map(self._restore, tiles, threads), image, fixed=self._fixed
         )
         if not np.isfinite(restored).all():
             raise StageError(

@@ -105,13 +105,6 @@ def test_seams_are_smooth() -> None:
     assert np.abs(np.diff(blended, axis=1)).max() < means * np.pi / 2 / 32 * 1.05
 
 
-def test_progress_counts_every_tile() -> None:
-    calls: list[tuple[int, int]] = []
-    map_tiled(lambda t: t, noise_image(300, 300), fixed=(128, 128), on_tile=lambda *c: calls.append(c))
-    assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
-    assert {total for _, total in calls} == {len(calls)}
-
-
 # --- the shipped expert ---------------------------------------------------------------------------------
 
 
