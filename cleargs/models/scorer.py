@@ -154,14 +154,15 @@ class MusiqScorer:
     Raises InputError when the file is missing or of another form.
     """
 
-    def __init__(self, path: Path, name: str = "musiq", device: Device = "cpu") -> None:
+    name = "musiq"
+
+    def __init__(self, path: Path, device: Device = "cpu") -> None:
         model = OnnxModel(path, device)
         if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
             raise InputError(
                 f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",
                 hint=f"{find_model('musiq').install_hint} again",
             )
-        self.name = name
         self.digest = model.digest
         self._model = model
 
@@ -228,7 +229,7 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
         if spec == NATURALNESS:
             return StatisticsScorer()
         if model.converter == "musiq":
-            return MusiqScorer(path, spec, device)
+            return MusiqScorer(path, device)
         return LearnedScorer(path, spec, _TRAINED_ON if spec == CLARITY else None, device)
 
     return InformedScorer(load_network(spec, "scorer", device, own))
