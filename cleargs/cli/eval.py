@@ -20,7 +20,6 @@ from cleargs.run_results import SCENE, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
-    from cleargs.evaluate.references import Reference
 
 _LABELS = {
     "psnr": "PSNR",
@@ -151,17 +150,10 @@ def eval(
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
     from cleargs.evaluate.eval_report import Report, write_report
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
-    from cleargs.evaluate.references import reference_in, reference_of, views_trained_on
+    from cleargs.evaluate.references import reference_of, views_trained_on
 
     reporter, count = make_reporter(quiet), threads_or_all(threads)
-    reference: Reference
-    if run is not None:
-        reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
-    elif directory is not None:
-        reference = reference_in(directory)
-    else:
-        raise InputError("there is nothing to compare with", hint="give --reference DIR")
-
+    reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []
     for subject, scene in scenes.items():
         save = save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders

@@ -28,6 +28,7 @@ from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import linked_manifest
 from cleargs.media.image import IMAGE_SUFFIXES, read_alpha, read_mask, read_rgb
+from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import view_of
@@ -36,9 +37,6 @@ T = TypeVar("T")
 
 LARGE_RESIDUAL = 0.02
 """Above this share of the trajectory's extent the fit of two worlds deserves a warning."""
-
-MIN_SIDE = 32
-"""Pixels that the learned metrics need on each side."""
 
 SAME_VIEW = 0.05
 """Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
@@ -70,14 +68,14 @@ class Reference:
 
 
 def reference_of(
-    run_folder: Path,
+    run: Path | None,
     directory: Path | None,
     *,
     poses: PosesFrom = "reference",
     align: Path | None = None,
     reporter: Reporter,
 ) -> Reference:
-    """What the scenes of a run are compared with.
+    """What the scenes of a run are compared with, or without one a scene in the world of ``directory``.
 
     ``directory`` holds ``images/`` and ``transforms.json`` in the world of the run's input; None takes the
     frames that the run held out. ``poses`` says whether the reference's poses are rendered, or the run's own
@@ -87,12 +85,17 @@ def reference_of(
 
     Raises InputError when files are missing or damaged, when stems do not match, or nothing was held out.
     """
-    ingest = run_folder / "ingest"
-    manifest = linked_manifest(run_folder, "ingest")
+    if run is None:
+        if directory is None:
+            raise InputError("there is nothing to compare with", hint="give --reference DIR: sharp images")
+        views = [view for view, _ in _listed(directory).values()]
+        return _reference(directory, views, "reference", Alignment(world="scene", matched=0))
+    ingest = run / "ingest"
+    manifest = linked_manifest(run, "ingest")
     if manifest is None:
         raise InputError(
-            f"{run_folder} has no finished ingest: nothing is known of its world",
-            hint=f"see cleargs status {run_folder}",
+            f"{run} has no finished ingest: nothing is known of its world",
+            hint=f"see cleargs status {run}",
         )
     frames = load_frames(ingest)
     if directory is None:
@@ -100,10 +103,10 @@ def reference_of(
     else:
         listed = _listed(directory)
         own = _by_stem((stem_of(frame.name), _own_pose(frame)) for frame in frames if frame.registered)
-        hint = f"name the references like the frames (cleargs show {run_folder} ingest)"
+        hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
-            views = [_posed(listed[stem], own[stem]) for stem in matching(listed, own, hint)]
+            views = [_posed(listed[stem][0], own[stem]) for stem in matching(listed, own, hint)]
             if missing := len(listed) - len(views):
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
@@ -111,26 +114,17 @@ def reference_of(
             if manifest.summary.get("poses") in ("sfm", "refined"):
                 known = listed if align is None else _listed(align)
                 stems = matching(known, own, hint)
-                theirs, ours = [_pose(known[stem]) for stem in stems], [own[stem] for stem in stems]
+                theirs, ours = [known[stem][1] for stem in stems], [own[stem] for stem in stems]
                 similarity, alignment = align_cameras(theirs, ours)
                 _report_fit(alignment, align or directory, reporter)
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
-            views = [_posed(view, similarity.pose(_pose(view))) for view in listed.values()]
+            views = [_posed(view, similarity.pose(pose)) for view, pose in listed.values()]
         found = _reference(directory, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
     except StoreError:  # figures of what lies behind them are left out
         return found
-
-
-def reference_in(directory: Path) -> Reference:
-    """The images of ``directory`` (``images/``, ``transforms.json``) for a scene of the same world.
-
-    Raises InputError when files are missing or damaged.
-    """
-    views = _listed(directory).values()
-    return _reference(directory, views, "reference", Alignment(world="scene", matched=0))
 
 
 def matching(found: Iterable[str], wanted: Iterable[str], hint: str) -> list[str]:
@@ -171,11 +165,6 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
 
 
 # -- cameras -----------------------------------------------------------------------------------------------
-
-
-def _pose(view: ReferenceView) -> Pose:
-    matrix = view.camera.world_to_camera
-    return Pose(matrix[:3, :3], matrix[:3, 3])
 
 
 def _posed(view: ReferenceView, pose: Pose) -> ReferenceView:
@@ -250,8 +239,8 @@ def _about_there(camera: Camera, frame: Frame) -> bool:
 # -- a folder ----------------------------------------------------------------------------------------------
 
 
-def _listed(directory: Path) -> dict[str, ReferenceView]:
-    """Stem -> view in the folder's own world, of a folder with ``transforms.json``."""
+def _listed(directory: Path) -> dict[str, tuple[ReferenceView, Pose]]:
+    """Stem -> view in the folder's own world and its pose, of a folder with ``transforms.json``."""
     path = directory / "transforms.json"
     if not path.is_file():
         raise InputError(
@@ -271,8 +260,9 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         flat = way.pinhole
         camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, _matrix(pose))
         load = partial(_load, entry.path, entry.mask, (lens.width, lens.height), way)
-        views.append(ReferenceView(stem_of(entry.name), camera, load))
-    return _by_stem((view.name, view) for view in views)
+        view = ReferenceView(stem_of(entry.name), camera, load)
+        views.append((view.name, (view, pose)))
+    return _by_stem(views)
 
 
 def images_by_stem(folder: Path) -> dict[str, Path]:

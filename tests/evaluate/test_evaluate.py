@@ -36,7 +36,7 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
-from cleargs.evaluate.references import Reference, reference_in, reference_of
+from cleargs.evaluate.references import Reference, reference_of
 from cleargs.media.image import write_mask, write_rgb
 
 SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
@@ -48,6 +48,10 @@ NEARLY_EQUAL = 58.0
 
 def measured(scene: Path, reference: Reference, options: EvalOptions = PLAIN, threads: int = 1) -> Evaluation:
     return evaluate_scene(scene, reference, options=options, threads=threads, reporter=Remarks())
+
+
+def in_own_world(folder: Path) -> Reference:
+    return reference_of(None, folder, reporter=Remarks())
 
 
 def psnr_of(evaluation: Evaluation) -> float:
@@ -115,7 +119,7 @@ def test_own_renders_are_perfect_in_the_scenes_world(tmp_path: Path) -> None:
     scene = make_scene()
     run = write_run(tmp_path / "run", scene, cameras())
     folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME)
-    found = measured(run / "g0" / "scene.ply", reference_in(folder))
+    found = measured(run / "g0" / "scene.ply", in_own_world(folder))
     assert psnr_of(found) > NEARLY_EQUAL and found.alignment.world == "scene"
     assert found.images[0].prediction and found.scene is not None
 
@@ -128,7 +132,7 @@ def test_poses_go_through_ingests_similarity(tmp_path: Path) -> None:
     assert reference.alignment.world == "ingest" and reference.alignment.matched == 6
     assert psnr_of(measured(run / "g0" / "scene.ply", reference)) > NEARLY_EQUAL
     # Taken as they are, the poses are wrong.
-    assert psnr_of(measured(run / "g0" / "scene.ply", reference_in(folder))) < 25
+    assert psnr_of(measured(run / "g0" / "scene.ply", in_own_world(folder))) < 25
 
 
 def test_worlds_of_sfm_are_aligned_by_cameras(tmp_path: Path) -> None:
@@ -237,7 +241,7 @@ def test_another_methods_images(tmp_path: Path) -> None:
         write_rgb(tmp_path / "theirs" / f"{index:03d}.png", picture(scene, cameras()[index]))
     remarks = Remarks()
     found = evaluate_images(
-        tmp_path / "theirs", reference_in(folder), options=PLAIN, threads=1, reporter=remarks
+        tmp_path / "theirs", in_own_world(folder), options=PLAIN, threads=1, reporter=remarks
     )
     assert psnr_of(found) == math.inf and found.scene is None and found.subject == "theirs"
     assert "3 of 6" in remarks.warnings[0]
@@ -284,10 +288,10 @@ def test_colour_alignment_recovers_a_planted_affine(tmp_path: Path) -> None:
     ]
     folder = write_reference(tmp_path / "truth", scene, cameras(), similarity=SAME, pictures=pictures)
     run = write_run(tmp_path / "run", scene, cameras())
-    plain = measured(run / "g0" / "scene.ply", reference_in(folder))
+    plain = measured(run / "g0" / "scene.ply", in_own_world(folder))
     assert plain.images[0].colour is None and psnr_of(plain) < 30
     options = PLAIN.model_copy(update={"align_colour": True})
-    aligned = measured(run / "g0" / "scene.ply", reference_in(folder), options)
+    aligned = measured(run / "g0" / "scene.ply", in_own_world(folder), options)
     # Both images are rounded to 8 bits.
     np.testing.assert_allclose(aligned.images[0].colour, planted, atol=2e-3)
     assert psnr_of(aligned) > 50
@@ -327,7 +331,7 @@ def test_the_result_is_written_and_read(tmp_path: Path) -> None:
         write_rgb(tmp_path / "theirs" / f"{index:03d}.png", picture(scene, turned(camera, float(index))))
     options = PLAIN.model_copy(update={"align_colour": True})
     found = evaluate_images(
-        tmp_path / "theirs", reference_in(folder), options=options, threads=1, reporter=Remarks()
+        tmp_path / "theirs", in_own_world(folder), options=options, threads=1, reporter=Remarks()
     )
     report = Report(evaluations=(found,))
     path = tmp_path / "deep" / "eval.json"
@@ -345,7 +349,7 @@ def test_an_infinite_psnr_survives_the_file(tmp_path: Path) -> None:
     scene = make_scene()
     folder = write_reference(tmp_path / "truth", scene, cameras(2), similarity=SAME)
     found = evaluate_images(
-        folder / "images", reference_in(folder), options=PLAIN, threads=1, reporter=Remarks()
+        folder / "images", in_own_world(folder), options=PLAIN, threads=1, reporter=Remarks()
     )
     write_report(tmp_path / "eval.json", Report(evaluations=(found,)))
     json.loads((tmp_path / "eval.json").read_text(), parse_constant=pytest.fail)
