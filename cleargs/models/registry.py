@@ -13,10 +13,11 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
+from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
 from cleargs.plugins import load_part, plugins
 from cleargs.record import Record
-from cleargs.untrusted import open_regular, read_json
+from cleargs.untrusted import read_json
 
 T = TypeVar("T")
 
@@ -223,8 +224,7 @@ def file_digest(path: Path) -> str:
     """SHA-256 in hexadecimal: of an ONNX file's bytes, or of the names, shapes and values of the tensors in a
     safetensors file; "" if these cannot be read."""
     if path.suffix != ".safetensors":
-        with open_regular(path) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return bytes_digest(path)
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
