@@ -89,7 +89,7 @@ def reference_of(
         if directory is None:
             raise InputError("there is nothing to compare with", hint="give --reference DIR: sharp images")
         views = [view for view, _ in _listed(directory).values()]
-        return _reference(directory, views, "reference", Alignment(world="scene", matched=0))
+        return _reference(directory.resolve().name, views, "reference", Alignment(world="scene", matched=0))
     ingest = run / "ingest"
     manifest = linked_manifest(run, "ingest")
     if manifest is None:
@@ -120,7 +120,7 @@ def reference_of(
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
             views = [_posed(view, similarity.pose(pose)) for view, pose in listed.values()]
-        found = _reference(directory, views, poses, alignment)
+        found = _reference(directory.resolve().name, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
     except StoreError:  # figures of what lies behind them are left out
@@ -143,10 +143,10 @@ def _examples(stems: Iterable[str]) -> str:
 
 
 def _reference(
-    directory: Path, views: Iterable[ReferenceView], poses: PosesFrom, alignment: Alignment
+    name: str, views: Iterable[ReferenceView], poses: PosesFrom, alignment: Alignment
 ) -> Reference:
     ordered = sorted(views, key=lambda view: natural_key(view.name))
-    return Reference(directory.resolve().name, tuple(ordered), poses, alignment)
+    return Reference(name, tuple(ordered), poses, alignment)
 
 
 def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
@@ -205,8 +205,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         mask = None if frame.mask is None else ingest / frame.mask
         size = (frame.width, frame.height)
         views.append(ReferenceView(stem, view.camera, partial(_load, ingest / frame.image, mask, size, None)))
-    views.sort(key=lambda view: natural_key(view.name))
-    return Reference("holdout", tuple(views), "given", Alignment(world="scene", matched=len(views)))
+    return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
 def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
