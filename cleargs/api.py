@@ -266,16 +266,12 @@ def evaluate_scene(
     """
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.evaluate import evaluate_scene
-    from cleargs.evaluate.references import reference_in, reference_of
+    from cleargs.evaluate.references import reference_of
     from cleargs.splat.scene import Scene
 
     directory, reporter = None if reference is None else Path(reference), _reporter(progress)
-    if isinstance(scene, Run):
-        compared = reference_of(scene.folder, directory, reporter=reporter)
-    elif directory is not None:
-        compared = reference_in(directory)
-    else:
-        raise InputError("there is nothing to compare with", hint="give a folder of sharp images")
+    run = scene.folder if isinstance(scene, Run) else None
+    compared = reference_of(run, directory, reporter=reporter)
     with tempfile.TemporaryDirectory() as folder:
         if isinstance(scene, Scene):
             path = Path(folder) / SCENE

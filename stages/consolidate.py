@@ -58,9 +58,9 @@ LIBRARIES = REPAIR_LIBRARIES
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
     """The scorer's model file, whose content enters the key; none for one of another package."""
-    from cleargs.models.scorer import scorer_path
+    from cleargs.models.registry import model_file
 
-    path = scorer_path(config.scorer)
+    path = model_file(config.scorer, "scorer")
     return {} if path is None else {"scorer": path}
 
 

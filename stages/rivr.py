@@ -134,13 +134,12 @@ LIBRARIES = REPAIR_LIBRARIES
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
     """The model files, whose content enters the key (the version of what other packages bring does)."""
-    from cleargs.models.expert import expert_path
-    from cleargs.models.scorer import scorer_path
+    from cleargs.models.registry import model_file
 
     files = {
-        "expert": expert_path(config.expert),
-        "primary scorer": scorer_path(config.primary_scorer),
-        "tie-break scorer": scorer_path(config.tiebreak_scorer),
+        "expert": model_file(config.expert, "expert"),
+        "primary scorer": model_file(config.primary_scorer, "scorer"),
+        "tie-break scorer": model_file(config.tiebreak_scorer, "scorer"),
     }
     return {role: path for role, path in files.items() if path is not None}
 

@@ -23,13 +23,13 @@ from typing import Literal
 from cleargs.batch.sheet import Scene, SheetError
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
-from cleargs.manifest import Manifest, linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Device, Run
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import asked_run, opened_store, usable_cores
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.report.report_json import linked_manifests
 from cleargs.report.words import decibel, duration, size
 
 State = Literal["failed", "waiting", "partial", "done"]
@@ -152,7 +152,7 @@ class Batch:
 
     def result(self, scene: Scene) -> Result:
         """Return what is there of ``scene``."""
-        made = self.made(scene)
+        made = linked_manifests(self.run_folder(scene), self.dag.names)
         ingest = made["ingest"].summary if "ingest" in made else {}
         psnr = [manifest.summary.get("psnr_unseen") for manifest in made.values()]
         state, cause = self._state(scene)
@@ -167,11 +167,6 @@ class Batch:
             disk_gb=round(sum(manifest.bytes for manifest in made.values()) / 1e9, 3),
             cause=cause,
         )
-
-    def made(self, scene: Scene) -> dict[str, Manifest]:
-        """Return the manifests that the run of ``scene`` shows, in the order of the stages."""
-        found = {stage: linked_manifest(self.run_folder(scene), stage) for stage in self.dag.names}
-        return {stage: manifest for stage, manifest in found.items() if manifest is not None}
 
     def _state(self, scene: Scene) -> tuple[State, str]:
         try:

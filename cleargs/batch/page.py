@@ -16,7 +16,7 @@ from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
 from cleargs.report.html import new_report, write_page
-from cleargs.report.report_json import FOLDER, is_current, page_of
+from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.words import count, duration, size
 
 BYTES = 15_000_000
@@ -56,7 +56,8 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
 
 def _card(batch: Batch, scene: Scene, result: Result, report: Path, side: int) -> dict[str, Any]:
     """Return what the page says of one scene; an address is "" where there is no such file."""
-    made, run = batch.made(scene), batch.run_folder(scene)
+    run = batch.run_folder(scene)
+    made = linked_manifests(run, batch.dag.names)
     picture, shows = _picture(run, made, report, f"scenes/{scene.name}.jpg", side)
     return {
         "result": result,

@@ -20,7 +20,6 @@ from cleargs.run_results import SCENE, scene_stage
 
 if TYPE_CHECKING:
     from cleargs.evaluate.eval_report import Evaluation, Report
-    from cleargs.evaluate.references import Reference
 
 _LABELS = {
     "psnr": "PSNR",
@@ -151,17 +150,10 @@ def eval(
     options = EvalOptions(lpips=nets, scorers=scorers, align_colour=align_colour, refine_poses=refine_poses)
     from cleargs.evaluate.eval_report import Report, write_report
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
-    from cleargs.evaluate.references import reference_in, reference_of, views_trained_on
+    from cleargs.evaluate.references import reference_of, views_trained_on
 
     reporter, count = make_reporter(quiet), threads_or_all(threads)
-    reference: Reference
-    if run is not None:
-        reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
-    elif directory is not None:
-        reference = reference_in(directory)
-    else:
-        raise InputError("there is nothing to compare with", hint="give --reference DIR")
-
+    reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []
     for subject, scene in scenes.items():
         save = save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
@@ -261,15 +253,9 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     for metric in metrics:
         table.add_column(_label(metric), justify="right")
     for evaluation in report.evaluations:
-        if per_image:
-            for image in evaluation.images:
-                table.add_row(
-                    evaluation.subject,
-                    image.name,
-                    *(_figure(metric, image.values[metric]) for metric in metrics),
-                )
-        figures = (_figure(metric, evaluation.means[metric]) for metric in metrics)
-        table.add_row(evaluation.subject, f"mean of {len(evaluation.images)}", *figures)
+        shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
+        for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
+            table.add_row(evaluation.subject, name, *(_figure(metric, values[metric]) for metric in metrics))
     console = Console(highlight=False, markup=False, soft_wrap=True)  # names may hold brackets
     console.print(table)
     for evaluation in report.evaluations:

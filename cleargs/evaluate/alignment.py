@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +10,18 @@ from numpy.typing import NDArray
 from cleargs.capture.cameras import Pose
 from cleargs.capture.poses import Similarity
 from cleargs.errors import InputError
-
-LARGE_RESIDUAL = 0.02
-"""Above this share of the trajectory's extent the fit deserves a warning."""
+from cleargs.evaluate.eval_report import Alignment
+from cleargs.evaluate.refinement import rotation_between
 
 _ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they are one place
 _FLAT = 1e-3  # second-largest over largest extent of centres below which the turn about their line is open
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A fitted similarity and how well it fits."""
-
-    similarity: Similarity
-    residual: float
-    """RMS distance between fitted and given centres, over the largest distance between two of the latter."""
-
-
 def align_cameras(
     source: Sequence[Pose],  # cameras in the world to leave
     target: Sequence[Pose],  # the same ones in the world to enter
-) -> Fit:
-    """The similarity that takes cameras nearest to their like, by place and by direction.
+) -> tuple[Similarity, Alignment]:
+    """The similarity that takes cameras nearest to their like, by place and by direction; how well it fits.
 
     The centres of a handheld walk lie near a line or a plane, and say little about the turn: half a degree
     may be left, which costs an image decibels. So they only fix the size; then each camera counts as four
@@ -41,12 +30,21 @@ def align_cameras(
     Raises InputError for fewer than three cameras, or centres that lie on one line.
     """
     theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
-    scale = umeyama(theirs, ours).similarity.scale
+    scale = umeyama(theirs, ours).scale
     spread = float(np.sqrt(ours.var(axis=0).sum()))
     fit = umeyama(_with_axes(source, theirs, spread * scale), _with_axes(target, ours, spread))
-    errors = np.linalg.norm(fit.similarity.points(theirs) - ours, axis=1)
+    errors = np.linalg.norm(fit.points(theirs) - ours, axis=1)
     extent = float(np.linalg.norm(ours[:, None] - ours[None], axis=2).max())
-    return Fit(fit.similarity, float(np.sqrt((errors**2).mean())) / extent)
+    angles = [
+        rotation_between(fit.pose(their).rotation, our.rotation)
+        for their, our in zip(source, target, strict=True)
+    ]
+    return fit, Alignment(
+        world="umeyama",
+        matched=len(source),
+        residual=float(np.sqrt((errors**2).mean())) / extent,
+        rotation_deg=float(np.mean(angles)),
+    )
 
 
 def _with_axes(
@@ -59,7 +57,7 @@ def _with_axes(
 def umeyama(
     source: NDArray[np.float64],  # [N, 3] centres in the world to leave
     target: NDArray[np.float64],  # [N, 3] the same cameras' centres in the world to enter
-) -> Fit:
+) -> Similarity:
     """The similarity of least squares from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
 
     Raises InputError for fewer than three centres, or centres that lie on one line.
@@ -81,8 +79,4 @@ def umeyama(
     rotation = (u * mirror) @ vt
     scale = float((stretch * mirror).sum() / ((a * a).sum() / len(a)))
     # The similarity of ingest divides by its scale: x_target = rotation (x_source - origin) / (1 / scale).
-    origin = source_mean - rotation.T @ target_mean / scale
-    similarity = Similarity(rotation, origin, 1.0 / scale)
-    errors = np.linalg.norm(similarity.points(source) - target, axis=1)
-    extent = float(np.linalg.norm(target[:, None] - target[None], axis=2).max())
-    return Fit(similarity, float(np.sqrt((errors**2).mean())) / extent)
+    return Similarity(rotation, source_mean - rotation.T @ target_mean / scale, 1.0 / scale)

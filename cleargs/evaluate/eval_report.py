@@ -162,7 +162,8 @@ def write_report(path: Path, report: Report) -> None:
     write_json(path, report.document())
     metrics = dict.fromkeys(metric for found in report.evaluations for metric in found.options.metrics)
     schema = table_schema(tuple(metrics))
-    write_table(path.with_suffix(".parquet"), pa.Table.from_pylist(_rows(report), schema), schema)
+    rows = [_row(found, image) for found in report.evaluations for image in found.images]
+    write_table(path.with_suffix(".parquet"), pa.Table.from_pylist(rows, schema), schema)
 
 
 def read_report(path: Path) -> Report:
@@ -214,31 +215,19 @@ def meaning(metric: str) -> str:
     return known.get(metric, "no-reference score; higher is better")
 
 
-def _rows(report: Report) -> list[dict[str, Any]]:
-    metrics = [metric for evaluation in report.evaluations for metric in evaluation.options.metrics]
-    return [
-        {
-            **dict.fromkeys(metrics),
-            "subject": evaluation.subject,
-            "adjusted": _adjusted(evaluation.options),
-            **image.model_dump(include={"name", "width", "height", "prediction", "reference"}),
-            **image.values,
-            **_region("far", image.far),
-            **_region("clipped", image.clipped),
-            "colour": None if image.colour is None else [x for row in image.colour for x in row],
-            "refined_rotation_deg": image.refinement.rotation_deg if image.refinement else None,
-            "refined_shift": image.refinement.shift if image.refinement else None,
-        }
-        for evaluation in report.evaluations
-        for image in evaluation.images
-    ]
-
-
-def _region(name: str, found: Region | None) -> dict[str, float | None]:
-    return {
-        f"{name}_share": None if found is None else found.share,
-        f"{name}_psnr": None if found is None else found.psnr,
+def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
+    """The columns that one image has; the others of the table are null."""
+    row = {
+        "subject": evaluation.subject,
+        "adjusted": _adjusted(evaluation.options),
+        **dict(image),
+        **image.values,
+        "colour": None if image.colour is None else [x for line in image.colour for x in line],
     }
+    parts = {"far": image.far, "clipped": image.clipped, "refined": image.refinement}
+    for name, part in parts.items():
+        row |= {f"{name}_{figure}": value for figure, value in part or ()}
+    return row
 
 
 def _adjusted(options: EvalOptions) -> str:

@@ -6,7 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from cleargs.evaluate.metrics import (
     pooled,
     region,
 )
-from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, require_match
+from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, matching
 from cleargs.evaluate.refinement import refine_pose
 from cleargs.files import disk_error
 from cleargs.manifest import versions
@@ -82,7 +82,7 @@ def evaluate_scene(
             hint="give a scene.ply as `cleargs export` or the Inria code writes it",
         ) from error
     set_threads(threads)
-    renderer = _Renderer(loaded, options.refine_poses, reference.points)
+    renderer = _renderer(loaded, options.refine_poses, reference.points)
     name = subject or scene.name
     return _evaluate(name, file_digest(scene), renderer, reference, options, threads, reporter, save)
 
@@ -105,10 +105,8 @@ def evaluate_images(
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
     files = images_by_stem(folder)
-    matched = tuple(view for view in reference.views if view.name in files)
-    require_match(
-        len(matched), files, (view.name for view in reference.views), "name the images like the references"
-    )
+    names = matching(files, [view.name for view in reference.views], "name the images like the references")
+    matched = tuple(view for view in reference.views if view.name in names)
 
     def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
         image = read_rgb(files[view.name])
@@ -120,7 +118,7 @@ def evaluate_images(
             )
         return _Prediction(image / 255.0)
 
-    restricted = Reference(reference.name, matched, reference.poses, reference.alignment)
+    restricted = replace(reference, views=matched)
     name = folder.resolve().name
     found = _evaluate(name, None, predict, restricted, options, threads, reporter, save)
     if len(matched) < len(reference.views):
@@ -131,47 +129,39 @@ def evaluate_images(
     return found
 
 
-class _Renderer:
-    """Renders a scene at references' views, at poses refined by so many steps."""
+def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> Predict:
+    """Return what renders a scene at references' views, at poses refined by so many steps."""
+    engine = rasteriser_for(scene.gaussians.device)
 
-    def __init__(self, scene: Scene, refine_steps: int, points: NDArray[np.float64] | None) -> None:
-        self._scene = scene
-        self._engine = rasteriser_for(scene.gaussians.device)
-        self._steps = refine_steps
-        self._points = points
-
-    def __call__(self, view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
-        camera, refinement = view.camera, None
-        if self._steps:
-            camera, refinement = refine_pose(
-                self._render, camera, self._depth(camera), target, mask, self._steps
-            )
-        return _Prediction(self._render(camera), refinement, self._far(camera))
-
-    def _render(self, camera: Camera) -> NDArray[np.float64]:
-        scene = self._scene
-        image = self._engine.forward(
+    def render(camera: Camera) -> NDArray[np.float64]:
+        image = engine.forward(
             scene.gaussians, camera, background=scene.background, antialias=scene.antialias
         ).image
         pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
         return pixels
 
-    def _far(self, camera: Camera) -> Mask | None:
-        farthest = None if self._points is None else depth_of_points(self._points, camera)
-        return None if farthest is None else far_pixels(*self._depth_and_alpha(camera), farthest)
-
-    def _depth(self, camera: Camera) -> float:
-        """Median depth of what the view shows; 1 where it shows nothing."""
-        depth, alpha = self._depth_and_alpha(camera)
-        shown = alpha > 0.5
-        return float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
-
-    def _depth_and_alpha(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        rendered = self._engine.forward(
-            self._scene.gaussians, camera, antialias=self._scene.antialias, depth=True
-        )
+    def depth_and_alpha(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        rendered = engine.forward(scene.gaussians, camera, antialias=scene.antialias, depth=True)
         assert rendered.depth is not None  # asked for
         return rendered.depth.numpy(), rendered.alpha.numpy()
+
+    def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
+        camera, refinement, far = view.camera, None, None
+        if refine_steps:
+            depth = _median_depth(*depth_and_alpha(camera))
+            camera, refinement = refine_pose(render, camera, depth, target, mask, refine_steps)
+        farthest = None if points is None else depth_of_points(points, camera)
+        if farthest is not None:
+            far = far_pixels(*depth_and_alpha(camera), farthest)
+        return _Prediction(render(camera), refinement, far)
+
+    return predict
+
+
+def _median_depth(depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> float:
+    """Median depth of what a view shows; 1 where it shows nothing."""
+    shown = alpha > 0.5
+    return float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
 
 
 def _evaluate(

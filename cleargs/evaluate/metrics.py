@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cleargs.evaluate.config import INSTALLABLE, EvalOptions
 from cleargs.evaluate.eval_report import Region
-from cleargs.models.lpips import Lpips, weights_file
+from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
 from cleargs.splat.camera import Camera
@@ -131,25 +131,17 @@ def load_metrics(options: EvalOptions) -> MetricSet:
     for net in options.lpips:
         file = model_dir() / weights_file(net)
         if file.is_file():
-            lpips[f"lpips_{net}"] = Lpips(net).distance
+            lpips[f"lpips_{net}"] = load_lpips(net).distance
             weights[f"lpips_{net}"] = file_digest(file)
         else:
             unavailable[f"lpips_{net}"] = "not installed: run `cleargs models install lpips` once"
     for name in options.scorers:
-        scorer = _scorer(name)
-        if scorer is not None:
-            scorers[name] = scorer
-            weights[name] = scorer.digest
-        else:
+        if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
             unavailable[name] = "not installed: see `cleargs models list`"
+        else:
+            scorers[name] = load_scorer(name)
+            weights[name] = scorers[name].digest
     return MetricSet(lpips, scorers, weights, unavailable)
-
-
-def _scorer(name: str) -> Scorer | None:
-    """The scorer of that name; None for one of `INSTALLABLE` that the user has not installed."""
-    if name in INSTALLABLE and not (model_dir() / f"{name}.onnx").is_file():
-        return None
-    return load_scorer(name)
 
 
 def _floats(image: Pixels) -> Image:

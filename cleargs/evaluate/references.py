@@ -4,40 +4,39 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose
-from cleargs.capture.capture import SourceFrame
-from cleargs.capture.folders import mask_folder, masks_of, name_below_images, natural_key
+from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.poses import Similarity
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
-from cleargs.evaluate.alignment import LARGE_RESIDUAL, align_cameras
+from cleargs.evaluate.alignment import align_cameras
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
-from cleargs.manifest import Manifest, linked_manifest
+from cleargs.manifest import linked_manifest
 from cleargs.media.image import IMAGE_SUFFIXES, read_alpha, read_mask, read_rgb
+from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.views import view_of
 
 T = TypeVar("T")
 
-MIN_SIDE = 32
-"""Pixels that the learned metrics need on each side."""
+LARGE_RESIDUAL = 0.02
+"""Above this share of the trajectory's extent the fit of two worlds deserves a warning."""
 
 SAME_VIEW = 0.05
 """Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
@@ -69,14 +68,14 @@ class Reference:
 
 
 def reference_of(
-    run_folder: Path,
+    run: Path | None,
     directory: Path | None,
     *,
     poses: PosesFrom = "reference",
     align: Path | None = None,
     reporter: Reporter,
 ) -> Reference:
-    """What the scenes of a run are compared with.
+    """What the scenes of a run are compared with, or without one a scene in the world of ``directory``.
 
     ``directory`` holds ``images/`` and ``transforms.json`` in the world of the run's input; None takes the
     frames that the run held out. ``poses`` says whether the reference's poses are rendered, or the run's own
@@ -86,77 +85,56 @@ def reference_of(
 
     Raises InputError when files are missing or damaged, when stems do not match, or nothing was held out.
     """
-    ingest = run_folder / "ingest"
-    manifest = linked_manifest(run_folder, "ingest")
+    if run is None:
+        if directory is None:
+            raise InputError("there is nothing to compare with", hint="give --reference DIR: sharp images")
+        views = [view for view, _ in _listed(directory).values()]
+        return _reference(directory.resolve().name, views, "reference", Alignment(world="scene", matched=0))
+    ingest = run / "ingest"
+    manifest = linked_manifest(run, "ingest")
     if manifest is None:
         raise InputError(
-            f"{run_folder} has no finished ingest: nothing is known of its world",
-            hint=f"see cleargs status {run_folder}",
+            f"{run} has no finished ingest: nothing is known of its world",
+            hint=f"see cleargs status {run}",
         )
-    found = _in_world(run_folder, manifest, directory, poses, align, reporter)
+    frames = load_frames(ingest)
+    if directory is None:
+        found = _held_out(ingest, frames)
+    else:
+        listed = _listed(directory)
+        own = _by_stem((stem_of(frame.name), _own_pose(frame)) for frame in frames if frame.registered)
+        hint = f"name the references like the frames (cleargs show {run} ingest)"
+        alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
+        if poses == "given":
+            views = [_posed(listed[stem][0], own[stem]) for stem in matching(listed, own, hint)]
+            if missing := len(listed) - len(views):
+                reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
+            alignment = Alignment(world="scene", matched=len(views))
+        else:
+            if manifest.summary.get("poses") in ("sfm", "refined"):
+                known = listed if align is None else _listed(align)
+                stems = matching(known, own, hint)
+                theirs, ours = [known[stem][1] for stem in stems], [own[stem] for stem in stems]
+                similarity, alignment = align_cameras(theirs, ours)
+                _report_fit(alignment, align or directory, reporter)
+            else:
+                similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
+            views = [_posed(view, similarity.pose(pose)) for view, pose in listed.values()]
+        found = _reference(directory.resolve().name, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
     except StoreError:  # figures of what lies behind them are left out
         return found
 
 
-def _in_world(
-    run_folder: Path,
-    manifest: Manifest,
-    directory: Path | None,
-    poses: PosesFrom,
-    align: Path | None,
-    reporter: Reporter,
-) -> Reference:
-    ingest = run_folder / "ingest"
-    frames = load_frames(ingest)
-    if directory is None:
-        return _held_out(ingest, frames)
-    listed = _listed(directory)
-    own = _by_stem((stem_of(frame.name), frame) for frame in frames if frame.registered)
-    if poses == "given":
-        matched = sorted(listed.keys() & own.keys(), key=natural_key)
-        _require_match(matched, listed, own, run_folder)
-        if len(matched) < len(listed):
-            reporter.warn(
-                f"{len(listed) - len(matched)} of {len(listed)} references match no frame: left out"
-            )
-        views = [_view(stem, listed[stem], _own_pose(own[stem])) for stem in matched]
-        return _reference(directory, views, poses, Alignment(world="scene", matched=len(matched)))
-    if manifest.summary.get("poses") in ("sfm", "refined"):
-        similarity, alignment = _aligned(
-            listed if align is None else _listed(align), own, run_folder, align or directory, reporter
-        )
-    else:
-        similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
-        alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
-    views = [_view(stem, image, similarity.pose(_pose(image))) for stem, image in listed.items()]
-    return _reference(directory, views, poses, alignment)
-
-
-def reference_in(directory: Path) -> Reference:
-    """The images of ``directory`` (``images/``, ``transforms.json``) for a scene of the same world.
-
-    Raises InputError when files are missing or damaged.
-    """
-    views = [_view(stem, image, _pose(image)) for stem, image in _listed(directory).items()]
-    return _reference(directory, views, "reference", Alignment(world="scene", matched=0))
-
-
-def require_match(matched: int, found: Iterable[str], wanted: Iterable[str], hint: str) -> None:
-    """Raise InputError, with two examples of each side, when no stem is the same."""
-    if matched == 0:
+def matching(found: Iterable[str], wanted: Iterable[str], hint: str) -> list[str]:
+    """The stems that are on both sides; raises InputError, with two examples of each, where there is none."""
+    stems = sorted({*found} & {*wanted}, key=natural_key)
+    if not stems:
         raise InputError(
             f"no stem matches: there are {_examples(found)} against {_examples(wanted)}", hint=hint
         )
-
-
-def _require_match(
-    matched: list[str], listed: Mapping[str, object], own: Mapping[str, object], run: Path
-) -> None:
-    require_match(
-        len(matched), listed, own, f"name the references like the frames (cleargs show {run} ingest)"
-    )
+    return stems
 
 
 def _examples(stems: Iterable[str]) -> str:
@@ -165,10 +143,46 @@ def _examples(stems: Iterable[str]) -> str:
 
 
 def _reference(
-    directory: Path, views: Iterable[ReferenceView], poses: PosesFrom, alignment: Alignment
+    name: str, views: Iterable[ReferenceView], poses: PosesFrom, alignment: Alignment
 ) -> Reference:
     ordered = sorted(views, key=lambda view: natural_key(view.name))
-    return Reference(directory.resolve().name, tuple(ordered), poses, alignment)
+    return Reference(name, tuple(ordered), poses, alignment)
+
+
+def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
+    assert alignment.residual is not None  # fitted
+    text = (
+        f"worlds aligned by {alignment.matched} cameras of {folder}: residual {alignment.residual:.2%} "
+        f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
+    )
+    if alignment.residual > LARGE_RESIDUAL:
+        reporter.warn(
+            f"{text}: large; if equal stems are not the same frames there, give --align DIR "
+            "with the poses of the run's own frames"
+        )
+    else:
+        reporter.info(text)
+
+
+# -- cameras -----------------------------------------------------------------------------------------------
+
+
+def _posed(view: ReferenceView, pose: Pose) -> ReferenceView:
+    """The same image, taken from ``pose``."""
+    return replace(view, camera=replace(view.camera, world_to_camera=_matrix(pose)))
+
+
+def _matrix(pose: Pose) -> NDArray[np.float64]:  # [4, 4]
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
+    return matrix
+
+
+def _own_pose(frame: Frame) -> Pose:
+    """The pose that the run has of a registered frame."""
+    values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
+    numbers = np.array([value for value in values if value is not None], np.float64)
+    return Pose.from_quaternion(numbers[:4], numbers[4:])
 
 
 # -- the run's own held-out frames -------------------------------------------------------------------------
@@ -191,8 +205,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         mask = None if frame.mask is None else ingest / frame.mask
         size = (frame.width, frame.height)
         views.append(ReferenceView(stem, view.camera, partial(_load, ingest / frame.image, mask, size, None)))
-    views.sort(key=lambda view: natural_key(view.name))
-    return Reference("holdout", tuple(views), "given", Alignment(world="scene", matched=len(views)))
+    return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
 def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
@@ -225,18 +238,8 @@ def _about_there(camera: Camera, frame: Frame) -> bool:
 # -- a folder ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Listed:
-    """An entry of transforms.json."""
-
-    frame: SourceFrame
-    mask: Path | None
-    way: Undistorter | None
-    """None without distortion."""
-
-
-def _listed(directory: Path) -> dict[str, _Listed]:
-    """Stem -> entry, of a folder with ``transforms.json``."""
+def _listed(directory: Path) -> dict[str, tuple[ReferenceView, Pose]]:
+    """Stem -> view in the folder's own world and its pose, of a folder with ``transforms.json``."""
     path = directory / "transforms.json"
     if not path.is_file():
         raise InputError(
@@ -246,39 +249,25 @@ def _listed(directory: Path) -> dict[str, _Listed]:
     entries = read_transforms(path, poses=True)
     if not entries:
         raise InputError(f"{path} lists no frames", hint="list at least one image with its pose")
-    masks = masks_of(mask_folder(directory / "images"), [name_below_images(entry.name) for entry in entries])
-    undistorters: dict[Lens, Undistorter] = {}
-    listed = []
-    for entry in entries:
-        lens = entry.camera
-        assert lens is not None  # asked for with poses=True
-        if lens not in undistorters:
-            undistorters[lens] = undistorter(lens, sys.maxsize)
-        mask = entry.mask or masks.get(name_below_images(entry.name))
-        listed.append((stem_of(entry.name), _Listed(entry, mask, undistorters[lens])))
-    return _by_stem(listed)
+    names = [name_below_images(entry.name) for entry in entries]
+    way_of = cache(partial(undistorter, max_size=sys.maxsize))
+    views = []
+    for entry in chosen(entries, directory / "images", len(entries), names):
+        lens, pose = entry.camera, entry.pose
+        assert lens is not None and pose is not None  # asked for with poses=True
+        way = way_of(lens)
+        flat = way.pinhole
+        camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, _matrix(pose))
+        load = partial(_load, entry.path, entry.mask, (lens.width, lens.height), way)
+        view = ReferenceView(stem_of(entry.name), camera, load)
+        views.append((view.name, (view, pose)))
+    return _by_stem(views)
 
 
 def images_by_stem(folder: Path) -> dict[str, Path]:
     """The image files of a folder; of two of a stem, the later by name."""
     files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
     return {path.stem: path for path in files}
-
-
-def _pose(listed: _Listed) -> Pose:
-    assert listed.frame.pose is not None  # read with poses=True
-    return listed.frame.pose
-
-
-def _view(stem: str, listed: _Listed, pose: Pose) -> ReferenceView:
-    lens, way = listed.frame.camera, listed.way
-    assert lens is not None and way is not None
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose.rotation, pose.translation
-    flat = way.pinhole
-    camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, world_to_camera)
-    size = (lens.width, lens.height)
-    return ReferenceView(stem, camera, partial(_load, listed.frame.path, listed.mask, size, way))
 
 
 def _load(
@@ -310,46 +299,6 @@ def _load(
             hint=f"give references of at least {MIN_SIDE} pixels on each side",
         )
     return image, None if stencil is None else stencil > 0
-
-
-# -- worlds ------------------------------------------------------------------------------------------------
-
-
-def _aligned(
-    listed: Mapping[str, _Listed], own: Mapping[str, Frame], run: Path, folder: Path, reporter: Reporter
-) -> tuple[Similarity, Alignment]:
-    """The similarity from the reference's world to that of a run whose poses are not the input's."""
-    matched = sorted(listed.keys() & own.keys(), key=natural_key)
-    _require_match(matched, listed, own, run)
-    theirs = [_pose(listed[stem]) for stem in matched]
-    ours = [_own_pose(own[stem]) for stem in matched]
-    fit = align_cameras(theirs, ours)
-    angles = [
-        rotation_between(fit.similarity.pose(their).rotation, our.rotation)
-        for their, our in zip(theirs, ours, strict=True)
-    ]
-    alignment = Alignment(
-        world="umeyama", matched=len(matched), residual=fit.residual, rotation_deg=float(np.mean(angles))
-    )
-    text = (
-        f"worlds aligned by {len(matched)} cameras of {folder}: residual {fit.residual:.2%} "
-        f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
-    )
-    if fit.residual > LARGE_RESIDUAL:
-        reporter.warn(
-            f"{text}: large; if equal stems are not the same frames there, give --align DIR "
-            "with the poses of the run's own frames"
-        )
-    else:
-        reporter.info(text)
-    return fit.similarity, alignment
-
-
-def _own_pose(frame: Frame) -> Pose:
-    """The pose that the run has of a registered frame."""
-    values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-    numbers = np.array([value for value in values if value is not None], np.float64)
-    return Pose.from_quaternion(numbers[:4], numbers[4:])
 
 
 # -- names -------------------------------------------------------------------------------------------------

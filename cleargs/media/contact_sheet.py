@@ -34,31 +34,29 @@ def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> N
     """The rows of tiles below one another, each image resampled to ``tile_width`` px. At least one tile."""
     strips = [_row(row, tile_width) for row in rows]
     width = max(strip.shape[1] for strip in strips)
-    sheet = np.full((sum(strip.shape[0] for strip in strips), width, 3), _BACKGROUND, np.uint8)
-    top = 0
-    for strip in strips:
-        sheet[top : top + strip.shape[0], : strip.shape[1]] = strip
-        top += strip.shape[0]
-    return sheet
+    return np.concatenate([_padded(strip, strip.shape[0], width) for strip in strips])
 
 
 def _row(tiles: Sequence[Tile], width: int) -> NDArray[np.uint8]:
-    images = [None if tile.image is None else _resized(to_uint8(tile.image), width) for tile in tiles]
-    height = max((image.shape[0] for image in images if image is not None), default=0)
-    size = (_LABEL_HEIGHT + height + _GAP, len(tiles) * (width + _GAP) - _GAP, 3)
-    strip = np.full(size, _BACKGROUND, np.uint8)
-    for k, (tile, image) in enumerate(zip(tiles, images, strict=True)):
-        left = k * (width + _GAP)
-        label = np.full((_LABEL_HEIGHT, width, 3), _MARKED if tile.marked else _BACKGROUND, np.uint8)
-        cv2.putText(label, tile.label, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
-        strip[:_LABEL_HEIGHT, left : left + width] = label
-        if image is not None:
-            strip[_LABEL_HEIGHT : _LABEL_HEIGHT + image.shape[0], left : left + width] = image
-    return strip
+    cells = [_cell(tile, width) for tile in tiles]
+    height = max(cell.shape[0] for cell in cells)
+    return np.concatenate([_padded(cell, height + _GAP, width + _GAP) for cell in cells], axis=1)[:, :-_GAP]
 
 
-def _resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+def _cell(tile: Tile, width: int) -> NDArray[np.uint8]:
+    """The label above the image."""
+    label = np.full((_LABEL_HEIGHT, width, 3), _MARKED if tile.marked else _BACKGROUND, np.uint8)
+    cv2.putText(label, tile.label, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
+    if tile.image is None:
+        return label
+    image = to_uint8(tile.image)
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     kernel = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_NEAREST
-    resized = cv2.resize(image, (width, height), interpolation=kernel)
-    return resized.astype(np.uint8, copy=False)
+    return np.concatenate(
+        [label, np.asarray(cv2.resize(image, (width, height), interpolation=kernel), np.uint8)]
+    )
+
+
+def _padded(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    below, right = height - image.shape[0], width - image.shape[1]
+    return np.pad(image, ((0, below), (0, right), (0, 0)), constant_values=_BACKGROUND)

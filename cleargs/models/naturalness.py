@@ -48,8 +48,9 @@ class Quadratic(Record):
 class StatisticsScorer:
     """100 - 100 x expected LPIPS, from the statistics of 128-pixel tiles."""
 
-    def __init__(self, name: str = "naturalness-stats") -> None:
-        self.name = name
+    name = "naturalness-stats"
+
+    def __init__(self) -> None:
         source = (files("cleargs.models") / COEFFICIENTS).read_bytes()
         self.digest = hashlib.sha256(source).hexdigest()
         self._predict = Quadratic.model_validate(tomllib.loads(source.decode("utf-8")))

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import sys
 import tomllib
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from pydantic import Field
 
+from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
-from cleargs.plugins import plugins
+from cleargs.plugins import load_part, plugins
 from cleargs.record import Record
-from cleargs.untrusted import open_regular, read_json
+from cleargs.untrusted import read_json
+
+T = TypeVar("T")
 
 Role = Literal["expert", "scorer", "metric"]
 State = Literal["shipped", "installed", "not installed", "incomplete"]
@@ -169,6 +172,22 @@ def model_file(spec: str, role: Role) -> Path | None:
     )
 
 
+def load_network(spec: str, role: Role, device: str, own: Callable[[Path, Model | None], T]) -> T:
+    """The expert or scorer that a setting names: what ``own`` makes of its file, and of its entry in the
+    registry, or the part that another package brings.
+
+    Raises InputError like `model_file`, and where an installed file is not what was installed.
+    """
+    path = model_file(spec, role)
+    if path is None:
+        part: T = load_part("experts" if role == "expert" else "scorers", spec)(device)
+        return part
+    model = registered(spec, role)
+    if model is not None and model.shipped is None:
+        verify(model, path.parent)
+    return own(path, model)
+
+
 def verify(model: Model, directory: Path) -> None:
     """Check the files of an installed model, digest by digest, and that a shipped one is in its place.
 
@@ -192,15 +211,6 @@ def verify(model: Model, directory: Path) -> None:
             raise InputError(f"{path} is damaged", hint=f"{model.install_hint} again")
 
 
-def write_receipt(model: Model, directory: Path, source_sha256: str) -> Path:
-    """Note the digests of the source and of the files made of it."""
-    digests = {file.name: file_digest(directory / file.name) for file in model.files}
-    path = directory / model.receipt
-    receipt = {"model": model.name, "source_sha256": source_sha256, "files": digests}
-    path.write_text(json.dumps(receipt, indent=2) + "\n", "utf-8")
-    return path
-
-
 def read_receipt(model: Model, directory: Path) -> dict[str, str]:
     """The digests of the installed files by name; none if there is no readable receipt."""
     try:
@@ -214,8 +224,7 @@ def file_digest(path: Path) -> str:
     """SHA-256 in hexadecimal: of an ONNX file's bytes, or of the names, shapes and values of the tensors in a
     safetensors file; "" if these cannot be read."""
     if path.suffix != ".safetensors":
-        with open_regular(path) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return bytes_digest(path)
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 

@@ -11,18 +11,17 @@ share of the image that carries information (`information`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.models.naturalness import StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import model_file, registered, verify
-from cleargs.models.tiling import Image, mean_over_tiles
-from cleargs.plugins import load_part
+from cleargs.models.registry import Model, find_model, load_network
+from cleargs.models.tiling import Image, mean_over_tiles, require_scorable
 
 CLARITY = "clarity-net"
 """The embedded network, meant for the primary role."""
@@ -38,6 +37,11 @@ _STEPS = 255.0
 _CLIPPED = 2.0  # steps from black or white up to which a value counts as clipped, in part
 _ENOUGH = 0.5  # a block counts in full while so many of its values are not clipped: highlights are no fault
 _FLAT, _TEXTURED = 0.5, 0.75  # steps of deviation inside a block; rounding alone makes up to 0.5
+
+PATCH = 32
+"""Side of MUSIQ's patches, px."""
+_LONGER_SIDES = (224, 384)
+_GRID = 10  # MUSIQ tells positions apart on a grid of this many cells a side
 
 
 class Scorer(Protocol):
@@ -141,9 +145,74 @@ class LearnedScorer:
         return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
 
 
-def scorer_path(spec: str) -> Path | None:
-    """The file with the weights of the scorer that a setting names: see `model_file`."""
-    return model_file(spec, "scorer")
+class MusiqScorer:
+    """MUSIQ (Ke et al., ICCV 2021) from an ONNX file: a transformer on patches of the image at three sizes.
+
+    Patches [N, 3, 32, 32], places [N] and sizes [N] in, one score out. Cutting the image up is done here, as
+    pyiqa does it: at its own size and reduced or enlarged to longer sides of 224 and 384 pixels.
+
+    Raises InputError when the file is missing or of another form.
+    """
+
+    name = "musiq"
+
+    def __init__(self, path: Path, device: Device = "cpu") -> None:
+        model = OnnxModel(path, device)
+        if [len(info.shape) for info in model.inputs] != [4, 1, 1]:
+            raise InputError(
+                f"{path} is not MUSIQ: its inputs are {[info.shape for info in model.inputs]}",
+                hint=f"{find_model('musiq').install_hint} again",
+            )
+        self.digest = model.digest
+        self._model = model
+
+    def score(self, image: Image, *, threads: int = 1) -> float:
+        """The predicted mean opinion score, about 0 to 100. See Scorer."""
+        require_scorable(image)
+        return float(self._model.run(*patches(image))[0].item())
+
+
+def patches(image: Image) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+    """The patches [N, 3, 32, 32] of an sRGB image in [0, 1], in [-1, 1]; cells of the position grid [N] and
+    numbers of the sizes [N]."""
+    import torch  # seconds, which naming a scorer must not take
+    from torch.nn.functional import interpolate
+
+    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1), np.float32))[None] * 2.0 - 1.0
+    height, width = image.shape[:2]
+    sizes = []
+    for side in _LONGER_SIDES:
+        ratio = side / max(height, width)
+        extent = (round(height * ratio), round(width * ratio))
+        sizes.append(interpolate(planes, extent, mode="bicubic", align_corners=False))
+    cut = [_cut(resized[0].numpy()) for resized in (*sizes, planes)]
+    scales = [np.full(len(places), number) for number, (_, places) in enumerate(cut)]
+    return (
+        np.concatenate([tiles for tiles, _ in cut]),
+        np.concatenate([places for _, places in cut]),
+        np.concatenate(scales),
+    )
+
+
+def _cut(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Patches of an image [3, H, W], row by row, and the cells of the position grid that they lie in.
+
+    The image is padded evenly by zeros, the odd pixel below and right.
+    """
+    height, width = planes.shape[1:]
+    rows, columns = -(-height // PATCH), -(-width // PATCH)
+    missing = (rows * PATCH - height, columns * PATCH - width)
+    padded = np.pad(planes, ((0, 0), *((n // 2, n - n // 2) for n in missing)))
+    grid = padded.reshape(3, rows, PATCH, columns, PATCH).transpose(1, 3, 0, 2, 4)
+    places = _cells(rows)[:, None] * _GRID + _cells(columns)[None, :]
+    return np.ascontiguousarray(grid.reshape(-1, 3, PATCH, PATCH)), places.ravel()
+
+
+def _cells(count: int) -> NDArray[np.int64]:
+    """The grid cell of each of ``count`` patches in a row: torch's nearest neighbour, in float32 as there."""
+    scale = np.float32(_GRID) / np.float32(count)
+    cells = np.floor(np.arange(count, dtype=np.float32) * scale)
+    return np.asarray(np.minimum(cells, _GRID - 1), np.int64)
 
 
 def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
@@ -153,23 +222,14 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
 
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
-    return InformedScorer(_load(spec, device))
 
+    def own(path: Path, model: Model | None) -> Scorer:
+        if model is None:
+            return LearnedScorer(path, device=device)
+        if spec == NATURALNESS:
+            return StatisticsScorer()
+        if model.converter == "musiq":
+            return MusiqScorer(path, device)
+        return LearnedScorer(path, spec, _TRAINED_ON if spec == CLARITY else None, device)
 
-def _load(spec: str, device: Device) -> Scorer:
-    path = scorer_path(spec)
-    if path is None:
-        maker: Callable[[Device], Scorer] = load_part("scorers", spec)
-        return maker(device)
-    model = registered(spec, "scorer")
-    if model is None:
-        return LearnedScorer(path, device=device)
-    if spec == NATURALNESS:
-        return StatisticsScorer()
-    if model.shipped is None:
-        verify(model, path.parent)
-    if model.converter == "musiq":
-        from cleargs.models.musiq import MusiqScorer  # torch, which naming a scorer must not import
-
-        return MusiqScorer(path, spec, device)
-    return LearnedScorer(path, spec, _TRAINED_ON if spec == CLARITY else None, device)
+    return InformedScorer(load_network(spec, "scorer", device, own))

@@ -28,7 +28,7 @@ MULTIPLE = 64
 """Free tile sides are multiples of this, which suits encoders that halve the image up to six times."""
 
 MIN_SIDE = 32
-"""Shortest side of an image that is scored, px."""
+"""Shortest side of an image that is scored, px; below it AlexNet's third block has hardly a pixel left."""
 
 _OUTSIDE = 1e-3
 """How far values may lie outside [0, 1], by rounding: half floats near 1 are so far apart."""
@@ -89,13 +89,11 @@ def map_tiled(
     image: Image,
     *,
     fixed: Sides = (None, None),
-    on_tile: Callable[[int, int], None] | None = None,
 ) -> Image:
     """The function's result on the whole image [H, W, 3], computed on tiles that it is given together.
 
     function: maps tiles [h, w, 3], all of one size, to as many of the same size, in their order.
     fixed: height and width of the tiles where the function accepts only these.
-    on_tile: called with (done, total) after each tile, in the caller's thread.
 
     The image is padded by reflection at its right and bottom sides where it has to be.
     """
@@ -113,10 +111,8 @@ def map_tiled(
     ]
     result = np.zeros_like(padded)
     tiles = function([padded[place] for place, _ in places])
-    for done, ((place, weight), tile) in enumerate(zip(places, tiles, strict=True), start=1):
+    for (place, weight), tile in zip(places, tiles, strict=True):
         result[place] += weight * tile
-        if on_tile is not None:
-            on_tile(done, len(places))
     return np.ascontiguousarray(result[:height, :width])
 
 

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
-from cleargs.models.expert import OnnxExpert, expert_path, load_expert
+from cleargs.models.expert import OnnxExpert, load_expert
 from cleargs.models.onnx import OnnxModel
+from cleargs.models.registry import model_file
 from cleargs.models.tiling import Sides, map_tiled, plan_axis
 from tools.train_models.degrade import Degradation, degrade, motion_kernel
 
@@ -104,18 +105,11 @@ def test_seams_are_smooth() -> None:
     assert np.abs(np.diff(blended, axis=1)).max() < means * np.pi / 2 / 32 * 1.05
 
 
-def test_progress_counts_every_tile() -> None:
-    calls: list[tuple[int, int]] = []
-    map_tiled(lambda t: t, noise_image(300, 300), fixed=(128, 128), on_tile=lambda *c: calls.append(c))
-    assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
-    assert {total for _, total in calls} == {len(calls)}
-
-
 # --- the shipped expert ---------------------------------------------------------------------------------
 
 
 def test_shipped_model_is_small_and_has_a_stable_digest() -> None:
-    path = expert_path("embedded")
+    path = model_file("embedded", "expert")
     assert path.stat().st_size <= 8_000_000
     expert = load_expert("embedded")
     assert expert.name == "embedded"
@@ -141,7 +135,7 @@ def test_any_size(size: tuple[int, int]) -> None:
 def test_tiling_hardly_shows() -> None:
     # The network sees a bounded neighbourhood; away from tile borders it computes the same in any tile.
     image = drawing(192, 704)
-    expert = OnnxExpert(expert_path("embedded"))
+    expert = OnnxExpert(model_file("embedded", "expert"))
     whole = expert._restore(image[None])[0]
     assert psnr(expert.restore(image), np.clip(whole, 0, 1)) > 50
 
@@ -175,7 +169,7 @@ def test_missing_file() -> None:
     with pytest.raises(InputError, match="No such file") as caught:
         load_expert("no/such/model.onnx")
     with pytest.raises(InputError, match="there is no expert 'embeded'") as error:
-        expert_path("embeded")
+        model_file("embeded", "expert")
     assert error.value.hint == "did you mean embedded?"
     assert caught.value.hint
 
@@ -188,7 +182,7 @@ def test_file_that_is_no_model(tmp_path: Path) -> None:
 
 
 def test_values_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    expert = OnnxExpert(expert_path("embedded"))
+    expert = OnnxExpert(model_file("embedded", "expert"))
     output = np.full((1, 3, 64, 64), np.nan, np.float32)
     monkeypatch.setattr(expert._model, "run", lambda *_: [output])
     with pytest.raises(StageError, match="not finite"):
@@ -196,7 +190,7 @@ def test_values_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_model_that_changes_the_size_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    expert = OnnxExpert(expert_path("embedded"))
+    expert = OnnxExpert(model_file("embedded", "expert"))
     output = np.zeros((1, 3, 128, 128), np.float32)
     monkeypatch.setattr(expert._model, "run", lambda *_: [output])
     with pytest.raises(InputError, match="maps"):

@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.lpips import NETS, Lpips, convert_sdist, load_network, weights_file
+from cleargs.models.lpips import NETS, convert_sdist, load_lpips, weights_file
 from cleargs.models.registry import model_dir
 
 ALEX = [(11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256)]
@@ -117,11 +117,11 @@ def test_equals_the_original_layout(checkpoint: dict[str, Any], installed: Path)
     expected = numpy_alexnet_distance(checkpoint, a, b)
     assert expected > 0.1  # the comparison must not be between zeros
     # float32 convolutions against float64
-    assert Lpips("alex", installed).distance(a, b) == pytest.approx(expected, rel=1e-4)
+    assert load_lpips("alex", installed).distance(a, b) == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_distance(installed: Path) -> None:
-    lpips = Lpips("alex", installed)
+    lpips = load_lpips("alex", installed)
     a, b = pair()
     assert lpips.distance(a, a) == 0.0
     assert lpips.distance(a, b) == pytest.approx(lpips.distance(b, a), rel=1e-6)
@@ -130,7 +130,7 @@ def test_a_distance(installed: Path) -> None:
 
 
 def test_same_bits_for_any_thread_count(installed: Path) -> None:
-    lpips = Lpips("alex", installed)
+    lpips = load_lpips("alex", installed)
     a, b = pair(height=160, width=200)
     before = torch.get_num_threads()
     found = set()
@@ -145,7 +145,7 @@ def test_same_bits_for_any_thread_count(installed: Path) -> None:
 
 
 def test_refuses_images_that_do_not_fit(installed: Path) -> None:
-    lpips = Lpips("alex", installed)
+    lpips = load_lpips("alex", installed)
     a, b = pair()
     with pytest.raises(InputError, match="one size"):
         lpips.distance(a, b[:-1])
@@ -155,14 +155,14 @@ def test_refuses_images_that_do_not_fit(installed: Path) -> None:
 
 def test_says_when_it_is_not_installed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not installed") as caught:
-        Lpips("vgg", tmp_path)
+        load_lpips("vgg", tmp_path)
     assert "cleargs models install lpips" in caught.value.hint
 
 
 def test_damaged_weights(installed: Path, tmp_path: Path) -> None:
     (tmp_path / weights_file("alex")).write_bytes((installed / weights_file("alex")).read_bytes()[:1000])
     with pytest.raises(InputError, match="does not hold"):
-        Lpips("alex", tmp_path)
+        load_lpips("alex", tmp_path)
 
 
 class _Runs:
@@ -220,5 +220,5 @@ def test_heads_equal_those_of_the_lpips_package(net: Any) -> None:
     assert spec is not None and spec.origin is not None
     file = Path(spec.origin).parent / "weights" / "v0.1" / f"{net}.pth"
     original = torch.load(file, map_location="cpu", weights_only=True)
-    for index, head in enumerate(load_network(net, path).heads):
+    for index, head in enumerate(load_lpips(net).heads):
         assert torch.equal(head.get_parameter("weight"), original[f"lin{index}.model.1.weight"])

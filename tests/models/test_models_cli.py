@@ -15,19 +15,20 @@ from test_lpips import alex_checkpoint, sdist, vgg_checkpoint
 from cleargs.cli.models import models
 from cleargs.errors import InputError, StageError
 from cleargs.models import install as installer
-from cleargs.models.expert import expert_path, load_expert
+from cleargs.models.expert import load_expert
 from cleargs.models.lpips import NETS, convert_sdist, weights_file
 from cleargs.models.registry import (
     InstalledFile,
     Model,
+    Role,
     file_digest,
     find_model,
     load_registry,
     model_dir,
+    model_file,
     state,
     verify,
 )
-from cleargs.models.scorer import scorer_path
 from cleargs.stages.rivr import RivrConfig
 
 
@@ -169,22 +170,23 @@ def test_checkpoint_hint_names_the_tool(name: str, tmp_path: Path) -> None:
 def test_settings_name_installed_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path))
     with pytest.raises(InputError, match="not installed") as caught:
-        expert_path("nafnet-gopro")
+        model_file("nafnet-gopro", "expert")
     assert "tools.convert_models nafnet-gopro NAFNet-GoPro-width64.pth" in caught.value.hint
     with pytest.raises(InputError, match="not installed") as caught:
-        scorer_path("musiq")
+        model_file("musiq", "scorer")
     assert "--accept-licence" in caught.value.hint
 
     file = tmp_path / "nafnet-gopro.onnx"
-    file.write_bytes(expert_path("embedded").read_bytes())  # a sound model, but another one
-    assert expert_path("nafnet-gopro") == file
+    file.write_bytes(model_file("embedded", "expert").read_bytes())  # a sound model, but another one
+    assert model_file("nafnet-gopro", "expert") == file
     with pytest.raises(InputError, match="damaged"):
         load_expert("nafnet-gopro")
 
-    assert expert_path("nets/own.onnx") == Path("nets/own.onnx").absolute()
-    for named, name in ((scorer_path, "nonesuch"), (expert_path, "nonesuch"), (expert_path, "musiq")):
+    assert model_file("nets/own.onnx", "expert") == Path("nets/own.onnx").absolute()
+    nonesuch: list[tuple[str, Role]] = [("nonesuch", "scorer"), ("nonesuch", "expert"), ("musiq", "expert")]
+    for name, role in nonesuch:
         with pytest.raises(InputError, match=f"there is no .* '{name}'"):  # a scorer is no expert
-            named(name)
+            model_file(name, role)
 
 
 def test_what_ships_is_listed_under_the_name_that_settings_take() -> None:

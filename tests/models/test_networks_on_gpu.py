@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from cleargs.errors import StageError
-from cleargs.models.expert import OnnxExpert, expert_path
+from cleargs.models.expert import OnnxExpert
 from cleargs.models.onnx import CUDA_PROVIDER, OnnxModel, in_batches, network_device
-from cleargs.models.scorer import CLARITY, LearnedScorer, scorer_path
+from cleargs.models.registry import model_file
+from cleargs.models.scorer import CLARITY, LearnedScorer
 
 Floats = NDArray[np.float32]
 
@@ -61,7 +62,7 @@ def test_a_provider_that_does_not_load_gives_way_with_one_line(
     assert network_device("cuda", warnings.append) == "cpu"
     assert len(warnings) == 1
     assert "does not load" in warnings[0]
-    assert OnnxModel(expert_path("embedded"), "cuda").device == "cpu"
+    assert OnnxModel(model_file("embedded", "expert"), "cuda").device == "cpu"
     assert capsys.readouterr().out == ""  # where results go
 
 
@@ -82,9 +83,9 @@ def test_a_provider_that_loads_is_used(
     (name, options), fallback = asked[0]
     assert (name, fallback) == (CUDA_PROVIDER, "CPUExecutionProvider")
     assert options["use_tf32"] == "0"
-    assert OnnxModel(expert_path("embedded"), "cuda").takes_batches
+    assert OnnxModel(model_file("embedded", "expert"), "cuda").takes_batches
     asked.clear()
-    OnnxModel(expert_path("embedded"))
+    OnnxModel(model_file("embedded", "expert"))
     assert asked == [["CPUExecutionProvider"]]
 
 
@@ -140,16 +141,14 @@ def test_one_item_that_does_not_fit_and_other_failures_are_errors() -> None:
 
 def test_batches_restore_and_score_as_single_tiles_do(monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.random.default_rng(0).random((64, 300, 3), np.float32)
-    expert = OnnxExpert(expert_path("embedded"))
-    path = scorer_path(CLARITY)
+    expert = OnnxExpert(model_file("embedded", "expert"))
+    path = model_file(CLARITY, "scorer")
     assert path is not None
     scorer = LearnedScorer(path, CLARITY, 64)
     monkeypatch.setattr("cleargs.models.tiling.FREE_TILE", 128)
     single, score = expert.restore(image), scorer.score(image)
     monkeypatch.setattr(OnnxModel, "takes_batches", True)
-    counts: list[tuple[int, int]] = []
-    together = expert.restore(image, on_tile=lambda *count: counts.append(count))
-    assert len(counts) > 1
+    together = expert.restore(image)
     # The sums of a convolution may take another order in a batch.
     np.testing.assert_allclose(together, single, atol=1e-5)
     assert scorer.score(image) == pytest.approx(score, abs=1e-4)

@@ -17,7 +17,7 @@ import numpy as np
 from cleargs.capture.tables import load_frames
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb
-from cleargs.models.lpips import Lpips
+from cleargs.models.lpips import load_lpips
 from cleargs.rivr.tables import read_selection
 
 LAYERS = ("observed", "deblurred", "render", "restored", "fused")
@@ -25,7 +25,7 @@ LAYERS = ("observed", "deblurred", "render", "restored", "fused")
 
 def main(runs: list[Path]) -> None:
     """Print a table of every run."""
-    lpips = Lpips()
+    lpips = load_lpips()
     for run in runs:
         capture = Path(tomllib.loads((run / "run.toml").read_text())["input"])
         folder = capture / "truth" / "observed" / "images"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ class Sharpen:
     def __init__(self) -> None:
         self.calls = 0
 
-    def restore(self, image: Image, *, threads: int = 1, on_tile: Callable[..., None] | None = None) -> Image:
+    def restore(self, image: Image, *, threads: int = 1) -> Image:
         self.calls += 1
         soft = cv2.GaussianBlur(image, (0, 0), 1.5)
         return np.clip(image + 1.5 * (image - soft), 0.0, 1.0)

@@ -22,9 +22,8 @@ from torch import nn
 
 from cleargs.errors import InputError
 from cleargs.models.expert import OnnxExpert, load_expert
-from cleargs.models.musiq import MusiqScorer, patches
 from cleargs.models.registry import find_model, read_receipt, verify
-from cleargs.models.scorer import LearnedScorer
+from cleargs.models.scorer import LearnedScorer, MusiqScorer, patches
 from tools.convert_models import restorer, scorers
 from tools.convert_models.__main__ import install_checkpoint, main
 from tools.convert_models.torch_export import mend_torchvision, require

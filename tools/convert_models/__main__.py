@@ -6,14 +6,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 from pathlib import Path
 
 import click
 
-from cleargs.errors import CleargsError
-from cleargs.models.install import install
-from cleargs.models.registry import Model, find_model, model_dir
+from cleargs.errors import CleargsError, InputError
+from cleargs.models.install import place, read_checked
+from cleargs.models.registry import Model, file_digest, find_model, model_dir
 from cleargs.untrusted import read_bytes
 from tools.convert_models import restorer, scorers
 from tools.convert_models.torch_export import require
@@ -66,24 +68,38 @@ def install_checkpoint(
 ) -> list[Path]:
     """Convert the checkpoint into ``directory``; returns the files written.
 
-    Raises InputError as `install` does, and for a package that is missing from this environment.
+    Raises InputError for a model that needs no conversion, a licence that must be accepted first, a file that
+    is not the published one, and a package that is missing from this environment.
     """
+    source = model.source
+    if source is None or source.spec != "file":
+        raise InputError(f"{model.name} needs no conversion", hint="see `cleargs models list`")
     require(*_PACKAGES.get(model.converter or "", ()), purpose=f"converting {model.name}")
-    if model.source is not None and not model.source.verified:
+    if not source.verified:
         click.echo(
-            f"warning: the publisher of {model.source.label} states no whole digest: nothing shows that the "
+            f"warning: the publisher of {source.label} states no whole digest: nothing shows that the "
             "file is the published one. The digest of this file is noted, and later checks compare with it",
             err=True,
         )
 
-    def convert(data: bytes, folder: Path) -> None:
+    if not (model.commercial or licence_accepted):
+        raise InputError(
+            f"{model.name} is not for commercial use; its licence: {model.licence}",
+            hint="if you accept that licence, repeat the command with --accept-licence",
+        )
+    data = read_checked(checkpoint, source)
+
+    def convert(folder: Path) -> None:
         path = folder / model.files[0].name
         if model.converter == "spandrel":
             restorer.convert(data, path)
         else:
             scorers.convert(model.converter or "", data, path)
+        digests = {file.name: file_digest(folder / file.name) for file in model.files}
+        facts = {"model": model.name, "source_sha256": hashlib.sha256(data).hexdigest(), "files": digests}
+        (folder / model.receipt).write_text(json.dumps(facts, indent=2) + "\n", "utf-8")
 
-    return install(model, directory, checkpoint, convert=convert, licence_accepted=licence_accepted)
+    return place(model, directory, convert)
 
 
 if __name__ == "__main__":

@@ -91,8 +91,7 @@ def published(name: str) -> Any:
 def convert(name: str, path: Path) -> dict[str, Any]:
     """Convert the random network and compare it with PyTorch."""
     from cleargs.models.expert import OnnxExpert
-    from cleargs.models.musiq import MusiqScorer
-    from cleargs.models.scorer import LearnedScorer, Scorer
+    from cleargs.models.scorer import LearnedScorer, MusiqScorer, Scorer
     from tools.convert_models import restorer, scorers
 
     network, start = published(name), time.process_time()
@@ -138,9 +137,8 @@ def convert(name: str, path: Path) -> dict[str, Any]:
 def cost(name: str, path: Path | None) -> dict[str, Any]:
     """Seconds a megapixel and memory of the model on one thread; ``path``: of a network converted here."""
     from cleargs.models.expert import OnnxExpert, load_expert
-    from cleargs.models.lpips import Lpips
-    from cleargs.models.musiq import MusiqScorer
-    from cleargs.models.scorer import LearnedScorer, load_scorer
+    from cleargs.models.lpips import load_lpips
+    from cleargs.models.scorer import LearnedScorer, MusiqScorer, load_scorer
 
     before, shown = peak_gb(), image(*SIZE)
     if name in ("restormer", "nafnet"):
@@ -150,7 +148,7 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
         assert path is not None
         work = (MusiqScorer(path) if name == "musiq" else LearnedScorer(path)).score
     elif name.startswith("lpips"):
-        metric = Lpips("vgg" if name == "lpips-vgg" else "alex")
+        metric = load_lpips("vgg" if name == "lpips-vgg" else "alex")
 
         def work(one: Any) -> Any:
             return metric.distance(one, one[::-1].copy())

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from cleargs.errors import InputError
-from cleargs.models.musiq import PATCH
+from cleargs.models.scorer import PATCH
 from tools.convert_models.torch_export import export, first_line, mend_torchvision
 
 

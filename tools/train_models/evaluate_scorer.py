@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.models.lpips import Lpips
+from cleargs.models.lpips import load_lpips
 from cleargs.models.scorer import CLARITY, NATURALNESS, load_scorer
 from tools.train_models import artefacts
 from tools.train_models.degrade import Degradation, Image, degrade, motion_kernel
@@ -92,7 +92,7 @@ def _photo(path: Path) -> Image:
 def main(photos: Path, models: Path | None, seed: int) -> None:
     """Print the tables of both embedded scorers."""
     cv2.setNumThreads(1)
-    lpips = Lpips("alex", models)
+    lpips = load_lpips("alex", models)
     scorers = [load_scorer(CLARITY), load_scorer(NATURALNESS)]
     held = [_photo(path) for path in list_photos(photos, held_out=True)]
     distances, scores, offered = [], [], []

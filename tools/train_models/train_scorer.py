@@ -25,8 +25,7 @@ from scipy.stats import spearmanr
 from torch import Tensor, nn
 from torch.nn import functional
 
-from cleargs.models.lpips import load_network, weights_file
-from cleargs.models.registry import model_dir
+from cleargs.models.lpips import load_lpips
 from tools.train_models.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
 from tools.train_models.train_restorer import HELD_OUT, source_of
 
@@ -348,7 +347,7 @@ def main(
     """Make the pairs, train, report on the held-out photo sources, export."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(1)
-    lpips = load_network("alex", (models or model_dir()) / weights_file("alex"))
+    lpips = load_lpips("alex", models)
     files = sorted(photos.glob("*.jpg"))
     unseen = [p for p in files if source_of(p) in hold_out]
     seen = [p for p in files if p not in unseen]

@@ -1,7 +1,5 @@
 """A restoration expert: rivr.expert=unsharp sharpens by unsharp masking."""
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +17,6 @@ class UnsharpMask:
         image: NDArray[np.float32],  # [H, W, 3] sRGB in [0, 1], as is what is returned
         *,
         threads: int = 1,
-        on_tile: Callable[[int, int], None] | None = None,
     ) -> NDArray[np.float32]:
         soft = cv2.GaussianBlur(image, (0, 0), 1.5)
         return np.clip(image + (image - soft), 0.0, 1.0)
