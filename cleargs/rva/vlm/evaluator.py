@@ -20,9 +20,9 @@ import numpy.typing as npt
 from cleargs.errors import StageError
 from cleargs.progress import Reporter
 from cleargs.rva.arrays import Floats
+from cleargs.rva.config import QwenConfig
 from cleargs.rva.evaluator import ItemCache, View, load_view, view_digest
 from cleargs.rva.tables import CUE_COLUMNS
-from cleargs.rva.vlm.prompt import VERSION
 
 _MASKED = 127  # mid-grey, as the prompt calls it
 
@@ -92,7 +92,7 @@ class QwenEvaluator:
     Scores are kept in ``cache``, one file a picture, as they come: a second call asks for the others only.
     """
 
-    version = VERSION
+    version = QwenConfig.prompt
 
     def __init__(self, scorer: PictureScorer, *, image_size: int, cache: Path) -> None:
         self._scorer = scorer
@@ -136,7 +136,7 @@ class QwenEvaluator:
         return cues
 
     def _score(self, view: View) -> Floats:
-        digest = view_digest([self._scorer.identity, VERSION, self._image_size], view)
+        digest = view_digest([self._scorer.identity, QwenConfig.prompt, self._image_size], view)
         kept = self._cache.find(digest)
         if kept is not None and bool(((kept >= 0.0) & (kept <= 1.0)).all()):
             return kept
