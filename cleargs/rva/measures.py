@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cleargs.rva.arrays import Floats
-from cleargs.rva.evaluator import View, load_view
+from cleargs.rva.evaluator import reduced
 
 Plane = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -70,23 +70,10 @@ def reduce_luminance(
 ) -> Luminance:
     """Luma as given, and reduced by area averaging; a reduced pixel counts if all that it averages does."""
     full = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    height, width = full.shape
-    scale = LONG_SIDE / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale))) if scale < 1.0 else (width, height)
-    reduced = _shrink(full, size)
+    small = reduced(full, LONG_SIDE)
     if mask is None:
-        return Luminance(full, reduced, np.ones(reduced.shape, dtype=bool))
-    kept = _shrink((mask > 0).astype(np.float32), size)
-    return Luminance(full, reduced, kept > 0.999)
-
-
-def _shrink(plane: Plane, size: tuple[int, int]) -> Plane:  # size: (width, height)
-    return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def load_luminance(view: View) -> Luminance:
-    """Read a frame and its mask from disk. Raises StoreError when one cannot be read."""
-    return reduce_luminance(*load_view(view))
+        return Luminance(full, small, np.ones(small.shape, dtype=bool))
+    return Luminance(full, small, reduced((mask > 0).astype(np.float32), LONG_SIDE) > 0.999)
 
 
 def away_from_masked(valid: Mask, radius: int) -> Mask:
@@ -209,29 +196,17 @@ def ringing(luminance: Plane, valid: Mask, noise: float) -> float:
     return max(float(np.quantile(response[band], 0.25)) / 0.319 - noise, 0.0)
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """How a frame uses the range of levels."""
+def exposure(luminance: Plane, valid: Mask) -> tuple[float, float, float]:
+    """How the pixels that count use the range of levels, black and clipped where none counts.
 
-    mean: float
-    """Mean luma over 255."""
-    clipped: float
-    """Share of the pixels at black or white."""
-    spread: float
-    """From the 5th to the 95th percentile of the luma, over 255."""
-
-
-def exposure(luminance: Plane, valid: Mask) -> Exposure:
-    """Brightness, clipping and contrast of the pixels that count. All zero and clipped where none does."""
+    The mean luma over 255, the share of clipped pixels, and the 95th percentile less the 5th, over 255.
+    """
     levels = luminance[valid]
     if not levels.size:
-        return Exposure(mean=0.0, clipped=1.0, spread=0.0)
+        return 0.0, 1.0, 0.0
     low, high = np.quantile(levels, [0.05, 0.95])
-    return Exposure(
-        mean=float(np.mean(levels, dtype=np.float64)) / 255.0,
-        clipped=float(np.mean((levels <= _DARK) | (levels >= _BRIGHT))),
-        spread=float(high - low) / 255.0,
-    )
+    clipped = float(np.mean((levels <= _DARK) | (levels >= _BRIGHT)))
+    return float(np.mean(levels, dtype=np.float64)) / 255.0, clipped, float(high - low) / 255.0
 
 
 def ghosting(luminance: Plane, noise: float) -> float:
