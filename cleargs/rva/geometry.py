@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from cleargs.rva.arrays import Bools, Floats, Ints
-from cleargs.rva.config import GeometryConfig
+from cleargs.rva.config import AssessmentConfig
 
 _PAIRS_AT_ONCE = 1 << 20
 """Pairs of frames held in memory at a time (8 MB an array of float64)."""
@@ -52,7 +52,7 @@ def pose_diversity(
     centres: Floats,  # [N, 3]
     directions: Floats,  # [N, 3] unit vectors
     reference: Bools,  # [N] the reliable set (or its stand-in)
-    config: GeometryConfig,
+    config: AssessmentConfig,
 ) -> Floats:  # D [N] in [0, 1]
     """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
 
@@ -128,7 +128,7 @@ def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [
     return largest
 
 
-def geometric_utility(C: Floats, D: Floats, O: Floats, config: GeometryConfig) -> Floats:
+def geometric_utility(C: Floats, D: Floats, O: Floats, config: AssessmentConfig) -> Floats:
     """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 
@@ -145,7 +145,7 @@ class Bins:
 def cumulative_motion(
     centres: Floats,  # [N, 3] in trajectory order
     directions: Floats,  # [N, 3] unit vectors
-    config: GeometryConfig,
+    config: AssessmentConfig,
 ) -> Floats:  # s [N], from 0
     """Pose motion up to each frame: a step is gamma_c (normalised centre distance) + gamma_v (view angle /
     pi).
