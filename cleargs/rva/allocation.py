@@ -55,17 +55,19 @@ def is_reliable(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
     return np.asarray((config.tau_R <= R) & (config.tau_B >= B))
 
 
+def best_frames(R: Floats, B: Floats, count: int) -> Bools:  # [N] each, in trajectory order
+    """The ``count`` frames of the largest R - B; ties go to the earlier."""
+    chosen = np.zeros(len(R), dtype=bool)
+    chosen[np.argsort(B - R, kind="stable")[:count]] = True
+    return chosen
+
+
 def stand_in_set(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
     """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
 
-    They take the place of an empty set A in the geometry. Rows are in trajectory order: ties go to the
-    earlier.
+    They take the place of an empty set A in the geometry.
     """
-    chosen = np.zeros(len(R), dtype=bool)
-    if len(R):
-        count = max(1, round(config.stand_in_share * len(R)))
-        chosen[np.argsort(B - R, kind="stable")[:count]] = True
-    return chosen
+    return best_frames(R, B, max(1, round(config.stand_in_share * len(R))))
 
 
 def standard_roles(R: Floats, B: Floats, G: Floats, config: AssessmentConfig) -> Roles:  # [N] each
@@ -130,17 +132,15 @@ def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AssessmentCo
     return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
 
 
-def keep_sharp(
-    R: Floats, B: Floats, share: float, config: AssessmentConfig
-) -> tuple[Roles, Floats]:  # [N] each
+def keep_sharp(R: Floats, B: Floats, config: AssessmentConfig) -> tuple[Roles, Floats]:  # [N] each
     """Roles and weights of the baseline that drops blurry frames.
 
-    ``share`` of the frames (rounded up, so at least one), best by R - B, and every reliable frame beyond it
-    get weight 1, the others 0. Ties go to the earlier frame.
+    A share `binary_share` of the frames (rounded up, at least one), best by R - B, and every reliable frame
+    beyond it get weight 1, the others 0.
     """
     reliable = is_reliable(R, B, config)
-    kept = reliable.copy()
-    kept[np.argsort(B - R, kind="stable")[: max(1, math.ceil(share * len(R) - _ROUNDING))]] = True
+    count = max(1, math.ceil(config.binary_share * len(R) - _ROUNDING))
+    kept = reliable | best_frames(R, B, count)
     roles = np.select(
         [reliable, kept], [Role.STRONG.value, Role.AUXILIARY.value], default=Role.SUPPRESSED.value
     )

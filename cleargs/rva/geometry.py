@@ -73,20 +73,20 @@ def pose_diversity(
 
 
 def visibility(
-    frame_row: Ints,  # [M] row of the observing frame
+    frame_id: Ints,  # [N] ascending
+    observer: Ints,  # [M] id of the frame that observes
     point_id: Ints,  # [M]
-    n_frames: int,
 ) -> sparse.csr_array:  # [N, P] of 0 and 1
-    """The sets P_i as a sparse matrix; a point that a frame lists twice counts once.
+    """The sets P_i as a sparse matrix; what other frames observe is left out.
 
-    Columns are the points in ascending id, so that sums over points do not depend on the order of the frames.
+    A point that a frame lists twice counts once. Columns are the points in ascending id, so that sums over
+    points do not depend on the order of the frames.
     """
-    _, columns = np.unique(point_id, return_inverse=True)
-    n_points = int(columns.max()) + 1 if len(columns) else 0
+    kept = np.isin(observer, frame_id)
+    points, columns = np.unique(point_id[kept], return_inverse=True)
+    rows = np.searchsorted(frame_id, observer[kept])
     seen = sparse.csr_array(
-        (np.ones(len(columns), dtype=np.int32), (frame_row, columns)),
-        shape=(n_frames, n_points),
-        dtype=np.int32,
+        (np.ones(len(columns), dtype=np.int32), (rows, columns)), shape=(len(frame_id), len(points))
     )
     seen.sum_duplicates()
     seen.data[:] = 1
