@@ -21,8 +21,6 @@ from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
 
 S = TypeVar("S", bound=np.generic)
 
-_WEIGHT_STEPS = 10
-
 
 @dataclass(frozen=True)
 class Poses:
@@ -179,9 +177,7 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
     count = len(result.covered)
     placed = result.bin[result.bin >= 0]
     active = result.bin[(result.bin >= 0) & (result.weight > 0.0)]
-    reactivated: list[list[int]] = [[] for _ in range(count)]
-    for row in np.flatnonzero(result.role == Role.REACTIVATED):
-        reactivated[result.bin[row]].append(int(frame_id[row]))
+    revived = result.role == Role.REACTIVATED
     return pa.table(
         {
             "bin": np.arange(count, dtype=np.int32),
@@ -190,7 +186,7 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
             "n_frames": np.bincount(placed, minlength=count).astype(np.int32),
             "n_active": np.bincount(active, minlength=count).astype(np.int32),
             "covered": result.covered,
-            "reactivated": pa.array(reactivated, type=pa.list_(pa.int32())),
+            "reactivated": [frame_id[revived & (result.bin == k)] for k in range(count)],
         },
         schema=BINS,
     )
@@ -201,7 +197,7 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
     size.
     """
     roles, rules = Counter(result.role.tolist()), Counter(result.reactivated_for.tolist())
-    histogram, _ = np.histogram(result.weight, bins=_WEIGHT_STEPS, range=(0.0, 1.0))
+    histogram, edges = np.histogram(result.weight, bins=10, range=(0.0, 1.0))
     return {
         "evaluator": evaluator,
         "frames": len(result.R),
@@ -211,7 +207,7 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
         "active": int(np.count_nonzero(result.weight)),
         "reliable": int(np.count_nonzero(result.reliable)),
         "stand_in": int(np.count_nonzero(result.stand_in)),
-        "weights": {f"{k / _WEIGHT_STEPS:.1f}": int(histogram[k]) for k in range(_WEIGHT_STEPS)},
+        "weights": {f"{edge:.1f}": int(n) for edge, n in zip(edges, histogram, strict=False)},
         "effective_frames": round(allocation.effective_sample_size(result.weight), 3),
         "bins": len(result.covered),
         "bins_uncovered_before": int(np.count_nonzero(~result.covered)),

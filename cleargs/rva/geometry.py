@@ -23,8 +23,7 @@ def camera_centres(
     translations: Floats,  # [N, 3]
 ) -> Floats:  # [N, 3] in the world
     """Camera centres -R^T t."""
-    centres: Floats = -np.einsum("nij,ni->nj", rotations, translations)
-    return centres
+    return np.asarray(-np.einsum("nij,ni->nj", rotations, translations))
 
 
 def view_directions(rotations: Floats) -> Floats:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
@@ -105,8 +104,7 @@ def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P]
     covered[seen[reference].indices] = True
     total = seen @ weight
     gained = seen @ np.where(covered, 0.0, weight)
-    share: Floats = np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
-    return share
+    return np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
 
 
 def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> O [N] in [0, 1]

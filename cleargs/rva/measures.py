@@ -13,6 +13,7 @@ of length L acts along its own direction only, where s = L / sqrt(12), while def
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -225,17 +226,15 @@ def ghosting(luminance: Plane, noise: float) -> float:
     if reach <= _NEAREST_LAG:
         return 0.0
     window = np.outer(np.hanning(size), np.hanning(size)).astype(np.float32)
-    floor = (noise**2 + 1.0 / 12.0) * float(
-        np.sum(np.square(window, dtype=np.float64))
-    )  # rounding is noise as well
+    energy = float(np.sum(np.square(window, dtype=np.float64)))
+    floor = (noise**2 + 1.0 / 12.0) * energy  # rounding is noise as well
     spectrum = np.zeros((size, size // 2 + 1))
-    for y in _tile_starts(luminance.shape[0], size):
-        for x in _tile_starts(luminance.shape[1], size):
-            tile = luminance[y : y + size, x : x + size]
-            power = np.abs(np.fft.rfft2((tile - tile.mean(dtype=np.float64)) * window)) ** 2
-            spectrum += np.log(power + 4.0 * floor)
-    count = len(_tile_starts(luminance.shape[0], size)) * len(_tile_starts(luminance.shape[1], size))
-    cepstrum = np.fft.irfft2(spectrum / count, s=(size, size))
+    starts = list(product(*(_tile_starts(length, size) for length in luminance.shape)))
+    for y, x in starts:
+        tile = luminance[y : y + size, x : x + size]
+        power = np.abs(np.fft.rfft2((tile - tile.mean(dtype=np.float64)) * window)) ** 2
+        spectrum += np.log(power + 4.0 * floor)
+    cepstrum = np.fft.irfft2(spectrum / len(starts), s=(size, size))
     cepstrum = np.roll(cepstrum, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     smooth = cv2.GaussianBlur(cepstrum, (0, 0), 3.0)
     offset = np.arange(2 * reach + 1) - reach

@@ -20,9 +20,6 @@ from cleargs.rva.tables import B_CUES, R_CUES
 CUES = R_CUES + B_CUES
 """Keys of a reply, in the order of `tables.CUE_COLUMNS`."""
 
-STEP = 0.05
-"""Scores move in steps of this: models tell no finer ones apart, and the replies form a finite language."""
-
 
 def prompt_text(*, masked: bool) -> str:
     """The question that goes with an image; ``masked``: parts of it are painted grey and do not count."""
@@ -35,10 +32,9 @@ def reply_schema() -> dict[str, Any]:
     """JSON schema of a reply.
 
     Scores are an enumeration: every decoder for constrained output knows it (bounds of numbers, many do not),
-    and a model without sense cannot write digits without end.
+    and a model without sense cannot write digits without end. Models tell no finer scores apart.
     """
-    steps = round(1 / STEP)
-    score = {"type": "number", "enum": [round(k / steps, 2) for k in range(steps + 1)]}
+    score = {"type": "number", "enum": [round(k / 20, 2) for k in range(21)]}
     return {
         "type": "object",
         "properties": dict.fromkeys(CUES, score),

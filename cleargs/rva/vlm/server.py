@@ -163,18 +163,18 @@ class QwenServer(QwenEvaluator):
         Raises UnscoredError where this chat gets none, StageError where none would: wrong key, model or
         address.
         """
-        pause = self._config.backoff_s
-        for tried in range(1, self._config.attempts + 1):
+        pause, tried = self._config.backoff_s, 0
+        while True:
             try:
                 return self._once(body)
             except PassingError as fault:
+                tried += 1
                 last = tried == self._config.attempts
                 if last or self._stopped.wait(min(_MAX_PAUSE_S, max(pause, fault.after))):
                     reason = f"{fault} ({tried} tries)"
                     self._gone = reason if fault.nobody else self._gone
                     raise UnscoredError(reason) from None
                 pause *= 2
-        raise AssertionError("attempts is at least 1")
 
     def _once(self, body: Mapping[str, Any]) -> str:
         answer, raw = self._send("POST", "chat/completions", self._config.timeout_s, body)
@@ -225,12 +225,10 @@ class QwenServer(QwenEvaluator):
     def _words(self, raw: bytes) -> str:
         """The server's explanation in one short line, without the key."""
         text = raw.decode("utf-8", "replace")
-        try:
+        with suppress(ValueError, RecursionError):
             fault = json.loads(text)
             fault = fault.get("error", fault) if isinstance(fault, dict) else fault
             text = str(fault.get("message", fault) if isinstance(fault, dict) else fault)
-        except (ValueError, RecursionError):
-            pass
         if self._key:
             text = text.replace(self._key, "***")
         text = " ".join(text.split())[:_SHOWN]
