@@ -83,7 +83,6 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)
-    scored = np.asarray(~np.isnan(cues).any(axis=1))
     frame_id = np.array([frame.frame_id for frame in frames], dtype=np.int32)
     result = assess(frame_id, cues, poses_from(frames), observations, config)
 
@@ -99,7 +98,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
         )
     missing = tuple(
         f"frame {frame.frame_id} ({frame.name}) was not scored"
-        for frame, there in zip(frames, scored, strict=True)
-        if not there
+        for frame, row in zip(frames, cues, strict=True)
+        if np.isnan(row).any()
     )
     return StageResult(missing, figures)

@@ -11,7 +11,7 @@ from scipy.stats import rankdata
 
 from cleargs.rva.allocation import appearance_scores, is_reliable
 from cleargs.rva.arrays import Floats
-from cleargs.rva.config import ScoreConfig
+from cleargs.rva.config import AssessmentConfig
 from cleargs.rva.tables import CUE_COLUMNS
 
 
@@ -71,7 +71,7 @@ class Agreement:
         }
 
 
-def compare(first: EvaluatorCues, second: EvaluatorCues, config: ScoreConfig, *, most: int) -> Agreement:
+def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int) -> Agreement:
     """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cleargs.rva.arrays import Bools, Floats
-from cleargs.rva.config import AllocationConfig, ScoreConfig
+from cleargs.rva.config import AssessmentConfig
 from cleargs.rva.tables import R_CUES
 
 Roles = npt.NDArray[np.str_]
@@ -25,7 +25,7 @@ class Rule(StrEnum):
     COVERAGE = "coverage"
     """Its bin had no active frame (the paper's Trajectory Coverage Compensation)."""
     ACTIVE_SHARE = "active_share"
-    """Fewer frames than `AllocationConfig.active_share` of all were active."""
+    """Fewer frames than `AssessmentConfig.active_share` of all were active."""
 
 
 class Role(StrEnum):
@@ -40,7 +40,7 @@ class Role(StrEnum):
 
 def appearance_scores(
     cues: Floats,  # [N, 11] in [0, 1], columns as tables.CUE_COLUMNS
-    config: ScoreConfig,
+    config: AssessmentConfig,
 ) -> tuple[Floats, Floats]:  # R [N], B [N], both in [0, 1]
     """R = w_R . r and B = w_B . b. The sums run cue by cue, so that a row's score needs that row alone."""
     r, b = cues[:, : len(R_CUES)], cues[:, len(R_CUES) :]
@@ -50,25 +50,27 @@ def appearance_scores(
     return np.clip(R, 0.0, 1.0), np.clip(B, 0.0, 1.0)
 
 
-def is_reliable(R: Floats, B: Floats, config: ScoreConfig) -> Bools:
+def is_reliable(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
     """Membership in the appearance-reliable set A = {R >= tau_R, B <= tau_B}."""
     return np.asarray((config.tau_R <= R) & (config.tau_B >= B))
 
 
-def stand_in_set(R: Floats, B: Floats, config: ScoreConfig) -> Bools:
-    """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
-
-    They take the place of an empty set A in the geometry. Rows are in trajectory order: ties go to the
-    earlier.
-    """
+def best_frames(R: Floats, B: Floats, count: int) -> Bools:  # [N] each, in trajectory order
+    """The ``count`` frames of the largest R - B; ties go to the earlier."""
     chosen = np.zeros(len(R), dtype=bool)
-    if len(R):
-        count = max(1, round(config.stand_in_share * len(R)))
-        chosen[np.argsort(B - R, kind="stable")[:count]] = True
+    chosen[np.argsort(B - R, kind="stable")[:count]] = True
     return chosen
 
 
-def standard_roles(R: Floats, B: Floats, G: Floats, config: AllocationConfig) -> Roles:  # [N] each
+def stand_in_set(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
+    """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
+
+    They take the place of an empty set A in the geometry.
+    """
+    return best_frames(R, B, max(1, round(config.stand_in_share * len(R))))
+
+
+def standard_roles(R: Floats, B: Floats, G: Floats, config: AssessmentConfig) -> Roles:  # [N] each
     """The standard supervision conditions, evaluated from top to bottom; suppressed where none holds."""
     geometric = (config.geometric_G <= G) & (config.geometric_B >= B)
     auxiliary = (config.auxiliary_R <= R) & (config.auxiliary_G <= G) & (config.auxiliary_B >= B)
@@ -79,7 +81,7 @@ def standard_roles(R: Floats, B: Floats, G: Floats, config: AllocationConfig) ->
     )
 
 
-def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: AllocationConfig) -> Floats:
+def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: AssessmentConfig) -> Floats:
     """lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z (paper, eq. tca_selection)."""
     quality = config.lambda_R * R + config.lambda_B * (1.0 - B)
     return np.asarray(config.lambda_G * G + quality + config.lambda_Z * Z)
@@ -89,7 +91,7 @@ def reactivate(
     roles: Roles,  # [N] standard roles, in trajectory order
     bins: npt.NDArray[np.int32],  # [N]
     gain: Floats,  # [N] from `reactivation_gain`
-    config: AllocationConfig,
+    config: AssessmentConfig,
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
     """Which suppressed frames supervise after all, and why.
 
@@ -111,7 +113,7 @@ def reactivate(
     return rules
 
 
-def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AllocationConfig) -> Floats:
+def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AssessmentConfig) -> Floats:
     """The weight w in [0, 1] that the table gives to each role."""
 
     def attenuated(mix: tuple[float, float]) -> Floats:
@@ -130,17 +132,15 @@ def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AllocationCo
     return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
 
 
-def keep_sharp(
-    R: Floats, B: Floats, share: float, config: AllocationConfig
-) -> tuple[Roles, Floats]:  # [N] each
+def keep_sharp(R: Floats, B: Floats, config: AssessmentConfig) -> tuple[Roles, Floats]:  # [N] each
     """Roles and weights of the baseline that drops blurry frames.
 
-    ``share`` of the frames (rounded up, so at least one), best by R - B, and every reliable frame beyond it
-    get weight 1, the others 0. Ties go to the earlier frame.
+    A share `binary_share` of the frames (rounded up, at least one), best by R - B, and every reliable frame
+    beyond it get weight 1, the others 0.
     """
     reliable = is_reliable(R, B, config)
-    kept = reliable.copy()
-    kept[np.argsort(B - R, kind="stable")[: max(1, math.ceil(share * len(R) - _ROUNDING))]] = True
+    count = max(1, math.ceil(config.binary_share * len(R) - _ROUNDING))
+    kept = reliable | best_frames(R, B, count)
     roles = np.select(
         [reliable, kept], [Role.STRONG.value, Role.AUXILIARY.value], default=Role.SUPPRESSED.value
     )

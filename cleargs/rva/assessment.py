@@ -4,48 +4,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture.tables import Frame
-from cleargs.rva.allocation import (
-    Role,
-    Roles,
-    Rule,
-    appearance_scores,
-    effective_sample_size,
-    is_reliable,
-    keep_sharp,
-    reactivate,
-    reactivation_gain,
-    stand_in_set,
-    standard_roles,
-    supervision_weights,
-)
+from cleargs.rva import allocation, geometry
+from cleargs.rva.allocation import Role, Roles, Rule
 from cleargs.rva.arrays import Bools, Floats, Ints
 from cleargs.rva.config import AssessmentConfig
-from cleargs.rva.geometry import (
-    camera_centres,
-    coverage_gain,
-    cumulative_motion,
-    cut_into_bins,
-    geometric_utility,
-    pose_diversity,
-    redundancy,
-    view_directions,
-    visibility,
-)
 from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
 
 S = TypeVar("S", bound=np.generic)
-
-_WEIGHT_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -102,33 +76,35 @@ def assess(
     false every registered frame is strong with weight 1, with ``config.weighting`` "binary" the better ones
     are; all other columns stay what they are.
     """
-    R, B = appearance_scores(cues, config)
+    R, B = allocation.appearance_scores(cues, config)
     by_id = np.argsort(frame_id, kind="stable")
     usable = poses.registered & ~np.isnan(cues).any(axis=1)
     rows = by_id[usable[by_id]]  # the trajectory: registered and scored frames by frame_id
     r, b = R[rows], B[rows]
 
-    reliable = is_reliable(r, b, config)
-    stand_in = np.zeros(len(rows), dtype=bool) if reliable.any() else stand_in_set(r, b, config)
+    reliable = allocation.is_reliable(r, b, config)
+    stand_in = np.zeros_like(reliable) if reliable.any() else allocation.stand_in_set(r, b, config)
     reference = reliable | stand_in
-    centres = camera_centres(poses.rotations[rows], poses.translations[rows])
-    directions = view_directions(poses.rotations[rows])
-    seen = _seen_by(frame_id[rows], observations)
-    C = coverage_gain(seen, reference)
-    D = pose_diversity(centres, directions, reference, config)
-    overlap = redundancy(seen, reference)
-    G = geometric_utility(C, D, overlap, config)
-    bins = cut_into_bins(cumulative_motion(centres, directions, config), config.frames_per_bin)
-    roles = standard_roles(r, b, G, config)
+    centres = geometry.camera_centres(poses.rotations[rows], poses.translations[rows])
+    directions = geometry.view_directions(poses.rotations[rows])
+    seen = geometry.visibility(frame_id[rows], observations.frame_id, observations.point_id)
+    C = geometry.coverage_gain(seen, reference)
+    D = geometry.pose_diversity(centres, directions, reference, config)
+    overlap = geometry.redundancy(seen, reference)
+    G = geometry.geometric_utility(C, D, overlap, config)
+    bins = geometry.cut_into_bins(
+        geometry.cumulative_motion(centres, directions, config), config.frames_per_bin
+    )
+    roles = allocation.standard_roles(r, b, G, config)
     covered = np.isin(np.arange(len(bins.edges) - 1), bins.index[roles != Role.SUPPRESSED])
     rules = np.full_like(roles, "")
     if config.coverage and config.weighting == "graded":
-        gain = reactivation_gain(r, b, G, bins.centrality, config)
-        rules = reactivate(roles, bins.index, gain, config)
+        gain = allocation.reactivation_gain(r, b, G, bins.centrality, config)
+        rules = allocation.reactivate(roles, bins.index, gain, config)
         roles = np.where(rules != "", Role.REACTIVATED.value, roles)
-    weight = supervision_weights(roles, r, G, config)
+    weight = allocation.supervision_weights(roles, r, G, config)
     if config.weighting == "binary":
-        roles, weight = keep_sharp(r, b, config.binary_share, config)
+        roles, weight = allocation.keep_sharp(r, b, config)
     if not config.enabled:
         roles, weight = np.full_like(roles, Role.STRONG.value), np.ones(len(rows))
         rules = np.full_like(rules, "")
@@ -159,13 +135,6 @@ def assess(
     )
 
 
-def _seen_by(frame_id: Ints, observations: Observations) -> sparse.csr_array:  # [N] ascending -> [N, P]
-    """The point sets of the given frames; what other frames observe is left out."""
-    kept = np.isin(observations.frame_id, frame_id)
-    row = np.searchsorted(frame_id, observations.frame_id[kept])
-    return visibility(row, observations.point_id[kept], len(frame_id))
-
-
 def poses_from(frames: Sequence[Frame]) -> Poses:
     """Rotation matrices and translations, world to camera; identity where a frame has no pose."""
     rotations = np.tile(np.eye(3), (len(frames), 1, 1))
@@ -187,23 +156,18 @@ def frames_table(
     result: Assessment,
 ) -> pa.Table:
     """The rows of rva/frames.parquet; NaN becomes null."""
-    placed = result.bin >= 0
+    nulls = dict.fromkeys(("C", "D", "O", "G", "bin", "Z"), result.bin < 0)
+    nulls["reactivated_for"] = result.reactivated_for == ""
     columns: dict[str, Any] = {
         "frame_id": frame_id,
         "name": list(names),
         "evaluator": [evaluator] * len(names),
         **{column: pa.array(cues[:, k], from_pandas=True) for k, column in enumerate(CUE_COLUMNS)},
-        "R": pa.array(result.R, from_pandas=True),
-        "B": pa.array(result.B, from_pandas=True),
-        "reliable": result.reliable,
         **{
-            column: pa.array(getattr(result, column), mask=~placed)
-            for column in ("C", "D", "O", "G", "bin", "Z")
+            field.name: pa.array(getattr(result, field.name), mask=nulls.get(field.name), from_pandas=True)
+            for field in fields(result)
+            if field.name in FRAMES.names
         },
-        "role": result.role.tolist(),
-        "weight": result.weight,
-        "stand_in": result.stand_in,
-        "reactivated_for": [rule or None for rule in result.reactivated_for.tolist()],
     }
     return pa.table(columns, schema=FRAMES)
 
@@ -213,9 +177,7 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
     count = len(result.covered)
     placed = result.bin[result.bin >= 0]
     active = result.bin[(result.bin >= 0) & (result.weight > 0.0)]
-    reactivated: list[list[int]] = [[] for _ in range(count)]
-    for row in np.flatnonzero(result.role == Role.REACTIVATED):
-        reactivated[result.bin[row]].append(int(frame_id[row]))
+    revived = result.role == Role.REACTIVATED
     return pa.table(
         {
             "bin": np.arange(count, dtype=np.int32),
@@ -224,7 +186,7 @@ def bins_table(frame_id: npt.NDArray[np.int32], result: Assessment) -> pa.Table:
             "n_frames": np.bincount(placed, minlength=count).astype(np.int32),
             "n_active": np.bincount(active, minlength=count).astype(np.int32),
             "covered": result.covered,
-            "reactivated": pa.array(reactivated, type=pa.list_(pa.int32())),
+            "reactivated": [frame_id[revived & (result.bin == k)] for k in range(count)],
         },
         schema=BINS,
     )
@@ -235,7 +197,7 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
     size.
     """
     roles, rules = Counter(result.role.tolist()), Counter(result.reactivated_for.tolist())
-    histogram, _ = np.histogram(result.weight, bins=_WEIGHT_STEPS, range=(0.0, 1.0))
+    histogram, edges = np.histogram(result.weight, bins=10, range=(0.0, 1.0))
     return {
         "evaluator": evaluator,
         "frames": len(result.R),
@@ -245,8 +207,8 @@ def summary(result: Assessment, evaluator: str) -> dict[str, Any]:
         "active": int(np.count_nonzero(result.weight)),
         "reliable": int(np.count_nonzero(result.reliable)),
         "stand_in": int(np.count_nonzero(result.stand_in)),
-        "weights": {f"{k / _WEIGHT_STEPS:.1f}": int(histogram[k]) for k in range(_WEIGHT_STEPS)},
-        "effective_frames": round(effective_sample_size(result.weight), 3),
+        "weights": {f"{edge:.1f}": int(n) for edge, n in zip(edges, histogram, strict=False)},
+        "effective_frames": round(allocation.effective_sample_size(result.weight), 3),
         "bins": len(result.covered),
         "bins_uncovered_before": int(np.count_nonzero(~result.covered)),
     }

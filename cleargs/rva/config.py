@@ -6,16 +6,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, JsonValue, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cleargs.plugins import require_known
 from cleargs.record import Record, Settings, Unit
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
 
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+"""A number above 0 and at most 1."""
 
 EVALUATORS = ("statistics", "qwen3-vl")
 """Those that ship with ClearGS."""
@@ -23,9 +25,8 @@ EVALUATORS = ("statistics", "qwen3-vl")
 MODEL_VARIABLE = "CLEARGS_VLM_MODEL"
 """Environment variable with the model's name, where ``qwen.model`` gives none."""
 
-_PLACE: dict[str, JsonValue] = {
-    "key": False
-}  # where the work is done, not what comes of it: stays out of the stage's key
+_PLACE = Field(json_schema_extra={"key": False})
+"""Marks where the work is done, not what comes of it: stays out of the stage's key."""
 
 
 class QwenConfig(Settings):
@@ -40,16 +41,13 @@ class QwenConfig(Settings):
         max_length=200,
         description=f"name of the model at the server; empty: from {MODEL_VARIABLE} in the environment",
     )
-    base_url: str = Field(
+    base_url: Annotated[str, _PLACE] = Field(
         "",
-        json_schema_extra=_PLACE,
         description="OpenAI-compatible server (vLLM, llama.cpp, Ollama, LM Studio), up to and with /v1; "
         "empty: from CLEARGS_VLM_URL in the environment, else http://127.0.0.1:8000/v1",
     )
-    model_dir: str = Field(
-        "",
-        json_schema_extra=_PLACE,
-        description="folder of a Qwen3-VL model to run in process (extra vlm) in place of a server",
+    model_dir: Annotated[str, _PLACE] = Field(
+        "", description="folder of a Qwen3-VL model to run in process (extra vlm) in place of a server"
     )
     prompt: ClassVar[int] = 1
     """Version of the prompt."""
@@ -63,32 +61,18 @@ class QwenConfig(Settings):
         le=256,
         description="threads of a model in process on the CPU; its sums depend on their number",
     )
-    concurrency: int = Field(
-        4, ge=1, le=256, json_schema_extra=_PLACE, description="requests under way at once"
+    concurrency: Annotated[int, _PLACE] = Field(4, ge=1, le=256, description="requests under way at once")
+    timeout_s: Annotated[float, _PLACE] = Field(
+        120.0, gt=0.0, le=3600.0, description="longest wait for one reply"
     )
-    timeout_s: float = Field(
-        120.0, gt=0.0, le=3600.0, json_schema_extra=_PLACE, description="longest wait for one reply"
+    attempts: Annotated[int, _PLACE] = Field(
+        5, ge=1, le=100, description="tries of one request while the server is busy, fails or does not answer"
     )
-    attempts: int = Field(
-        5,
-        ge=1,
-        le=100,
-        json_schema_extra=_PLACE,
-        description="tries of one request while the server is busy, fails or does not answer",
+    backoff_s: Annotated[float, _PLACE] = Field(
+        1.0, ge=0.0, le=60.0, description="pause before the second try; doubled before each further one"
     )
-    backoff_s: float = Field(
-        1.0,
-        ge=0.0,
-        le=60.0,
-        json_schema_extra=_PLACE,
-        description="pause before the second try; doubled before each further one",
-    )
-    asks: int = Field(
-        3,
-        ge=1,
-        le=20,
-        json_schema_extra=_PLACE,
-        description="how often a frame is asked for while the replies break the schema",
+    asks: Annotated[int, _PLACE] = Field(
+        3, ge=1, le=20, description="how often a frame is asked for while the replies break the schema"
     )
 
 
@@ -131,9 +115,20 @@ class EvaluatorConfig(Record):
         return self
 
 
-class ScoreConfig(Settings):
-    """Scores from cues, and the reliable set."""
+class AssessmentConfig(Settings):
+    """All of RVA but the evaluator."""
 
+    # Geometric evidence from poses and observations.
+    frames_per_bin: int = Field(
+        8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
+    )
+    gamma_c: Unit = Field(0.65, description="share of the camera-centre distance in a pose distance")
+    gamma_v: Unit = Field(0.35, description="share of the view angle in a pose distance")
+    alpha: Unit = Field(0.45, description="weight of the coverage gain C in the geometric utility G")
+    beta: Unit = Field(0.35, description="weight of the pose diversity D in G")
+    eta: Unit = Field(0.30, description="weight of the visibility redundancy O, subtracted from G")
+
+    # Scores from cues, and the reliable set.
     stand_in_share: ClassVar[float] = 0.10
     """When no frame is reliable, this share of the registered frames (at least one), best by R - B, stands in
     for the reliable set in the geometry."""
@@ -146,45 +141,10 @@ class ScoreConfig(Settings):
         description="weights in B of motion blur, defocus, ghosting, exposure failure, unreliable texture, "
         "artifacts; they sum to 1",
     )
-    tau_R: float = Field(
-        0.70, ge=0.0, le=1.0, description="a reliable (and strong) frame has at least this R"
-    )
-    tau_B: float = Field(0.60, ge=0.0, le=1.0, description="a reliable (and strong) frame has at most this B")
+    tau_R: Unit = Field(0.70, description="a reliable (and strong) frame has at least this R")
+    tau_B: Unit = Field(0.60, description="a reliable (and strong) frame has at most this B")
 
-    @model_validator(mode="after")
-    def _weights_sum_to_one(self) -> ScoreConfig:
-        for name in ("w_R", "w_B"):
-            _require_sum_of_one(name, sum(getattr(self, name)))
-        return self
-
-
-class GeometryConfig(Record):
-    """Geometric evidence from poses and observations."""
-
-    frames_per_bin: int = Field(
-        8, ge=1, le=10_000, description="registered frames a trajectory bin holds on average"
-    )
-    gamma_c: float = Field(
-        0.65, ge=0.0, le=1.0, description="share of the camera-centre distance in a pose distance"
-    )
-    gamma_v: float = Field(0.35, ge=0.0, le=1.0, description="share of the view angle in a pose distance")
-    alpha: float = Field(
-        0.45, ge=0.0, le=1.0, description="weight of the coverage gain C in the geometric utility G"
-    )
-    beta: float = Field(0.35, ge=0.0, le=1.0, description="weight of the pose diversity D in G")
-    eta: float = Field(
-        0.30, ge=0.0, le=1.0, description="weight of the visibility redundancy O, subtracted from G"
-    )
-
-    @model_validator(mode="after")
-    def _distances_stay_in_range(self) -> GeometryConfig:
-        _require_sum_of_one("gamma_c + gamma_v", self.gamma_c + self.gamma_v)
-        return self
-
-
-class AllocationConfig(ScoreConfig):
-    """Roles and weights from scores and geometry."""
-
+    # Roles and weights from scores and geometry.
     enabled: bool = Field(
         True,
         description="false: the all-view ablation. Every registered frame gets weight 1 and the role strong; "
@@ -195,69 +155,50 @@ class AllocationConfig(ScoreConfig):
         description="graded: the paper's roles and weights; binary: the baseline that drops blurry frames. "
         "Weight 1 for the better frames by R - B, 0 for the others, without coverage compensation",
     )
-    binary_share: float = Field(
+    binary_share: Share = Field(
         0.5,
-        gt=0.0,
-        le=1.0,
         description="binary: this share of the registered frames (at least one) is kept, and every reliable "
         "frame beyond it",
     )
     coverage: bool = Field(
         True, description="reactivate suppressed frames where the trajectory would have a hole"
     )
-    active_share: float = Field(
+    active_share: Unit = Field(
         1.0,
-        ge=0.0,
-        le=1.0,
         description="with coverage: suppressed frames are reactivated until this share of the registered "
         "frames is active; 0: the paper's",
     )
-    lambda_G: float = Field(
-        0.35, ge=0.0, le=1.0, description="weight of G when a frame to reactivate is chosen"
+    lambda_G: Unit = Field(0.35, description="weight of G when a frame to reactivate is chosen")
+    lambda_R: Unit = Field(0.25, description="weight of R when a frame to reactivate is chosen")
+    lambda_B: Unit = Field(0.30, description="weight of 1 - B when a frame to reactivate is chosen")
+    lambda_Z: Unit = Field(
+        0.10, description="weight of the centrality Z when a frame to reactivate is chosen"
     )
-    lambda_R: float = Field(
-        0.25, ge=0.0, le=1.0, description="weight of R when a frame to reactivate is chosen"
-    )
-    lambda_B: float = Field(
-        0.30, ge=0.0, le=1.0, description="weight of 1 - B when a frame to reactivate is chosen"
-    )
-    lambda_Z: float = Field(
-        0.10, ge=0.0, le=1.0, description="weight of the centrality Z when a frame to reactivate is chosen"
-    )
-    reactivated_weight: float = Field(0.12, gt=0.0, le=1.0, description="weight of a reactivated frame")
-    strong_base: float = Field(0.80, gt=0.0, le=1.0, description="weight of a strong frame: base + gain R")
-    strong_gain: float = Field(0.20, ge=0.0, le=1.0, description="weight of a strong frame: base + gain R")
-    geometric_G: float = Field(0.60, ge=0.0, le=1.0, description="a geometric frame has at least this G")
-    geometric_B: float = Field(0.80, ge=0.0, le=1.0, description="a geometric frame has at most this B")
+    reactivated_weight: Share = Field(0.12, description="weight of a reactivated frame")
+    strong_base: Share = Field(0.80, description="weight of a strong frame: base + gain R")
+    strong_gain: Unit = Field(0.20, description="weight of a strong frame: base + gain R")
+    geometric_G: Unit = Field(0.60, description="a geometric frame has at least this G")
+    geometric_B: Unit = Field(0.80, description="a geometric frame has at most this B")
     geometric_mix: ClassVar[tuple[float, float]] = (0.35, 0.65)
     """The paper's: a geometric frame weighs base + gain (mix[0] R + mix[1] G)."""
-    auxiliary_R: float = Field(0.35, ge=0.0, le=1.0, description="an auxiliary frame has at least this R")
-    auxiliary_G: float = Field(0.25, ge=0.0, le=1.0, description="an auxiliary frame has at least this G")
-    auxiliary_B: float = Field(0.75, ge=0.0, le=1.0, description="an auxiliary frame has at most this B")
+    auxiliary_R: Unit = Field(0.35, description="an auxiliary frame has at least this R")
+    auxiliary_G: Unit = Field(0.25, description="an auxiliary frame has at least this G")
+    auxiliary_B: Unit = Field(0.75, description="an auxiliary frame has at most this B")
     auxiliary_mix: ClassVar[tuple[float, float]] = (0.50, 0.50)
     """The paper's: an auxiliary frame weighs base + gain (mix[0] R + mix[1] G)."""
-    attenuated_base: float = Field(
-        0.30, gt=0.0, le=1.0, description="base of the weight of geometric and auxiliary frames"
-    )
-    attenuated_gain: float = Field(
-        0.30, ge=0.0, le=1.0, description="gain of the weight of geometric and auxiliary frames"
-    )
+    attenuated_base: Share = Field(0.30, description="base of the weight of geometric and auxiliary frames")
+    attenuated_gain: Unit = Field(0.30, description="gain of the weight of geometric and auxiliary frames")
 
     @model_validator(mode="after")
-    def _weights_stay_in_range(self) -> AllocationConfig:
+    def _sums_stay_in_range(self) -> AssessmentConfig:
+        sums = {"w_R": sum(self.w_R), "w_B": sum(self.w_B), "gamma_c + gamma_v": self.gamma_c + self.gamma_v}
+        for name, total in sums.items():
+            if abs(total - 1.0) > _SUM_TOLERANCE:
+                raise ValueError(f"{name} must sum to 1, not {total:g}")
         for base, gain in (("strong_base", "strong_gain"), ("attenuated_base", "attenuated_gain")):
             if getattr(self, base) + getattr(self, gain) > 1.0 + _SUM_TOLERANCE:
                 raise ValueError(f"{base} + {gain} must not exceed 1: it is the largest weight of a frame")
         return self
-
-
-class AssessmentConfig(AllocationConfig, GeometryConfig):
-    """All of RVA but the evaluator."""
-
-
-def _require_sum_of_one(name: str, total: float) -> None:
-    if abs(total - 1.0) > _SUM_TOLERANCE:
-        raise ValueError(f"{name} must sum to 1, not {total:g}")
 
 
 def check_base_url(url: str) -> None:

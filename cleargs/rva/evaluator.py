@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -44,6 +46,16 @@ def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] 
     return rgb, mask
 
 
+def reduced(image: npt.NDArray[Any], long_side: int) -> npt.NDArray[Any]:
+    """``image``, by area averaging where its long side exceeds ``long_side`` px."""
+    height, width = image.shape[:2]
+    scale = long_side / max(height, width)
+    if scale >= 1.0:
+        return image
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
 class Evaluator(Protocol):
     """Estimates the eleven appearance cues of every frame of a capture."""
 
@@ -69,32 +81,40 @@ def label(evaluator: Evaluator) -> str:
     return f"{evaluator.name}-{evaluator.version}"
 
 
+@dataclass(frozen=True)
 class ItemCache:
     """Rows of numbers with named columns, a JSON file each, named by the digest of all that decides them."""
 
-    def __init__(self, folder: Path, columns: Sequence[str]) -> None:
-        self._folder = folder
-        self._columns = columns
+    folder: Path | None
+    """None: nothing is kept."""
+    columns: Sequence[str]
+    facts: Sequence[object]
+    """JSON values that decide the rows next to the files of the views."""
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    """Rows with a number outside are not taken from files."""
 
-    def find(self, digest: str) -> Floats | None:
-        """The row; None where there is none, or where its file is damaged."""
+    def row(self, view: View, make: Callable[[View], Floats]) -> Floats:
+        """The kept row of ``view``, or else what ``make`` finds; a new file appears whole.
+
+        Raises OSError when a file of the view cannot be read.
+        """
+        if self.folder is None:
+            return make(view)
+        parts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (view.image, view.mask) if path]
+        digest = hashlib.sha256(json.dumps([*self.facts, *parts]).encode()).hexdigest()
+        row = self.find(self.folder / f"{digest}.json")
+        if row is None:
+            row = make(view)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(self.folder / f"{digest}.json", dict(zip(self.columns, row.tolist(), strict=True)))
+        return row
+
+    def find(self, file: Path) -> Floats | None:
+        """The row in ``file``; None where there is none, or where it is damaged."""
         try:
-            kept = read_json(self._folder / f"{digest}.json")
-            row = np.array([kept[column] for column in self._columns], dtype=np.float64)
+            kept = read_json(file)
+            row = np.array([kept[column] for column in self.columns], dtype=np.float64)
         except (OSError, ValueError, KeyError, TypeError):
             return None
-        return row if bool(np.isfinite(row).all()) else None
-
-    def add(self, digest: str, row: Floats) -> None:
-        """Keep ``row``; the file appears whole."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        write_json(self._folder / f"{digest}.json", dict(zip(self._columns, row.tolist(), strict=True)))
-
-
-def view_digest(facts: Sequence[object], view: View) -> str:
-    """Names what is found out about the files of ``view`` in the light of ``facts`` (JSON values).
-
-    Raises OSError when a file cannot be read.
-    """
-    parts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (view.image, view.mask) if path]
-    return hashlib.sha256(json.dumps([*facts, *parts]).encode()).hexdigest()
+        low, high = self.bounds
+        return row if bool((np.isfinite(row) & (row >= low) & (row <= high)).all()) else None

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from cleargs.rva.arrays import Bools, Floats, Ints
-from cleargs.rva.config import GeometryConfig
+from cleargs.rva.config import AssessmentConfig
 
 _PAIRS_AT_ONCE = 1 << 20
 """Pairs of frames held in memory at a time (8 MB an array of float64)."""
@@ -23,8 +23,7 @@ def camera_centres(
     translations: Floats,  # [N, 3]
 ) -> Floats:  # [N, 3] in the world
     """Camera centres -R^T t."""
-    centres: Floats = -np.einsum("nij,ni->nj", rotations, translations)
-    return centres
+    return np.asarray(-np.einsum("nij,ni->nj", rotations, translations))
 
 
 def view_directions(rotations: Floats) -> Floats:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
@@ -52,7 +51,7 @@ def pose_diversity(
     centres: Floats,  # [N, 3]
     directions: Floats,  # [N, 3] unit vectors
     reference: Bools,  # [N] the reliable set (or its stand-in)
-    config: GeometryConfig,
+    config: AssessmentConfig,
 ) -> Floats:  # D [N] in [0, 1]
     """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
 
@@ -73,20 +72,20 @@ def pose_diversity(
 
 
 def visibility(
-    frame_row: Ints,  # [M] row of the observing frame
+    frame_id: Ints,  # [N] ascending
+    observer: Ints,  # [M] id of the frame that observes
     point_id: Ints,  # [M]
-    n_frames: int,
 ) -> sparse.csr_array:  # [N, P] of 0 and 1
-    """The sets P_i as a sparse matrix; a point that a frame lists twice counts once.
+    """The sets P_i as a sparse matrix; what other frames observe is left out.
 
-    Columns are the points in ascending id, so that sums over points do not depend on the order of the frames.
+    A point that a frame lists twice counts once. Columns are the points in ascending id, so that sums over
+    points do not depend on the order of the frames.
     """
-    _, columns = np.unique(point_id, return_inverse=True)
-    n_points = int(columns.max()) + 1 if len(columns) else 0
+    kept = np.isin(observer, frame_id)
+    points, columns = np.unique(point_id[kept], return_inverse=True)
+    rows = np.searchsorted(frame_id, observer[kept])
     seen = sparse.csr_array(
-        (np.ones(len(columns), dtype=np.int32), (frame_row, columns)),
-        shape=(n_frames, n_points),
-        dtype=np.int32,
+        (np.ones(len(columns), dtype=np.int32), (rows, columns)), shape=(len(frame_id), len(points))
     )
     seen.sum_duplicates()
     seen.data[:] = 1
@@ -105,8 +104,7 @@ def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P]
     covered[seen[reference].indices] = True
     total = seen @ weight
     gained = seen @ np.where(covered, 0.0, weight)
-    share: Floats = np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
-    return share
+    return np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
 
 
 def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> O [N] in [0, 1]
@@ -128,7 +126,7 @@ def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [
     return largest
 
 
-def geometric_utility(C: Floats, D: Floats, O: Floats, config: GeometryConfig) -> Floats:
+def geometric_utility(C: Floats, D: Floats, O: Floats, config: AssessmentConfig) -> Floats:
     """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 
@@ -145,7 +143,7 @@ class Bins:
 def cumulative_motion(
     centres: Floats,  # [N, 3] in trajectory order
     directions: Floats,  # [N, 3] unit vectors
-    config: GeometryConfig,
+    config: AssessmentConfig,
 ) -> Floats:  # s [N], from 0
     """Pose motion up to each frame: a step is gamma_c (normalised centre distance) + gamma_v (view angle /
     pi).

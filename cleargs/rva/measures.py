@@ -13,13 +13,14 @@ of length L acts along its own direction only, where s = L / sqrt(12), while def
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cleargs.rva.arrays import Floats
-from cleargs.rva.evaluator import View, load_view
+from cleargs.rva.evaluator import reduced
 
 Plane = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -70,23 +71,10 @@ def reduce_luminance(
 ) -> Luminance:
     """Luma as given, and reduced by area averaging; a reduced pixel counts if all that it averages does."""
     full = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    height, width = full.shape
-    scale = LONG_SIDE / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale))) if scale < 1.0 else (width, height)
-    reduced = _shrink(full, size)
+    small = reduced(full, LONG_SIDE)
     if mask is None:
-        return Luminance(full, reduced, np.ones(reduced.shape, dtype=bool))
-    kept = _shrink((mask > 0).astype(np.float32), size)
-    return Luminance(full, reduced, kept > 0.999)
-
-
-def _shrink(plane: Plane, size: tuple[int, int]) -> Plane:  # size: (width, height)
-    return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def load_luminance(view: View) -> Luminance:
-    """Read a frame and its mask from disk. Raises StoreError when one cannot be read."""
-    return reduce_luminance(*load_view(view))
+        return Luminance(full, small, np.ones(small.shape, dtype=bool))
+    return Luminance(full, small, reduced((mask > 0).astype(np.float32), LONG_SIDE) > 0.999)
 
 
 def away_from_masked(valid: Mask, radius: int) -> Mask:
@@ -209,29 +197,17 @@ def ringing(luminance: Plane, valid: Mask, noise: float) -> float:
     return max(float(np.quantile(response[band], 0.25)) / 0.319 - noise, 0.0)
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """How a frame uses the range of levels."""
+def exposure(luminance: Plane, valid: Mask) -> tuple[float, float, float]:
+    """How the pixels that count use the range of levels, black and clipped where none counts.
 
-    mean: float
-    """Mean luma over 255."""
-    clipped: float
-    """Share of the pixels at black or white."""
-    spread: float
-    """From the 5th to the 95th percentile of the luma, over 255."""
-
-
-def exposure(luminance: Plane, valid: Mask) -> Exposure:
-    """Brightness, clipping and contrast of the pixels that count. All zero and clipped where none does."""
+    The mean luma over 255, the share of clipped pixels, and the 95th percentile less the 5th, over 255.
+    """
     levels = luminance[valid]
     if not levels.size:
-        return Exposure(mean=0.0, clipped=1.0, spread=0.0)
+        return 0.0, 1.0, 0.0
     low, high = np.quantile(levels, [0.05, 0.95])
-    return Exposure(
-        mean=float(np.mean(levels, dtype=np.float64)) / 255.0,
-        clipped=float(np.mean((levels <= _DARK) | (levels >= _BRIGHT))),
-        spread=float(high - low) / 255.0,
-    )
+    clipped = float(np.mean((levels <= _DARK) | (levels >= _BRIGHT)))
+    return float(np.mean(levels, dtype=np.float64)) / 255.0, clipped, float(high - low) / 255.0
 
 
 def ghosting(luminance: Plane, noise: float) -> float:
@@ -250,17 +226,15 @@ def ghosting(luminance: Plane, noise: float) -> float:
     if reach <= _NEAREST_LAG:
         return 0.0
     window = np.outer(np.hanning(size), np.hanning(size)).astype(np.float32)
-    floor = (noise**2 + 1.0 / 12.0) * float(
-        np.sum(np.square(window, dtype=np.float64))
-    )  # rounding is noise as well
+    energy = float(np.sum(np.square(window, dtype=np.float64)))
+    floor = (noise**2 + 1.0 / 12.0) * energy  # rounding is noise as well
     spectrum = np.zeros((size, size // 2 + 1))
-    for y in _tile_starts(luminance.shape[0], size):
-        for x in _tile_starts(luminance.shape[1], size):
-            tile = luminance[y : y + size, x : x + size]
-            power = np.abs(np.fft.rfft2((tile - tile.mean(dtype=np.float64)) * window)) ** 2
-            spectrum += np.log(power + 4.0 * floor)
-    count = len(_tile_starts(luminance.shape[0], size)) * len(_tile_starts(luminance.shape[1], size))
-    cepstrum = np.fft.irfft2(spectrum / count, s=(size, size))
+    starts = list(product(*(_tile_starts(length, size) for length in luminance.shape)))
+    for y, x in starts:
+        tile = luminance[y : y + size, x : x + size]
+        power = np.abs(np.fft.rfft2((tile - tile.mean(dtype=np.float64)) * window)) ** 2
+        spectrum += np.log(power + 4.0 * floor)
+    cepstrum = np.fft.irfft2(spectrum / len(starts), s=(size, size))
     cepstrum = np.roll(cepstrum, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     smooth = cv2.GaussianBlur(cepstrum, (0, 0), 3.0)
     offset = np.arange(2 * reach + 1) - reach

@@ -156,7 +156,7 @@ def test_sparse_sums_equal_sets() -> None:
     pairs = [(frame, point) for frame, seen in enumerate(sets) for point in seen]
     pairs += pairs[:10]  # a pair listed twice is still one member of the set
     rows, points = np.array(pairs).T
-    seen = visibility(rows, points, 25)
+    seen = visibility(ids(25), rows, points)
     observers = {point: sum(point in one for one in sets) for point in range(60)}
     covered = set().union(*(sets[j] for j in np.flatnonzero(reference)))
     for i, own in enumerate(sets):

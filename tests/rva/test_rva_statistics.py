@@ -21,7 +21,7 @@ from cleargs.rva.measures import (
     noise_level,
     reduce_luminance,
 )
-from cleargs.rva.statistics import Calibration, StatisticsEvaluator, as_measures, cues_from_measures, measure
+from cleargs.rva.statistics import StatisticsEvaluator, cues_from_measures, measure
 from cleargs.rva.tables import CUE_COLUMNS
 from cleargs.stages.rva import RvaConfig
 
@@ -64,7 +64,7 @@ def defocused(linear: Linear, sigma: float) -> Linear:
 def cues_of(images: list[Image]) -> dict[str, npt.NDArray[np.float64]]:
     """Cues and scores of a video made of these images."""
     rows = np.stack([measure(reduce_luminance(image, None)) for image in images])
-    cues = cues_from_measures(as_measures(rows), Calibration())
+    cues = cues_from_measures(rows)
     R, B = appearance_scores(cues, RvaConfig())
     return {**{name: cues[:, k] for k, name in enumerate(CUE_COLUMNS)}, "R": R, "B": B}
 

@@ -185,8 +185,12 @@ def make_ingest(folder: Path) -> None:
     write_table(folder / "observations.parquet", seen, ingest.OBSERVATIONS)
 
 
-class Nothing(BaseModel):
+class PreparedConfig(BaseModel):
+    """The settings of ingest that a verdict reads."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
+    fps: float | None = None
+    max_frames: int = FRAMES
 
 
 @dataclass
@@ -194,7 +198,7 @@ class PreparedIngest:
     """A stage that publishes `make_ingest`."""
 
     VERSION: int = 1
-    CONFIG: type[BaseModel] = Nothing
+    CONFIG: type[BaseModel] = PreparedConfig
     INPUTS: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     OUTPUTS: tuple[str, ...] = ("frames.parquet", "observations.parquet", "images")
     LEFTOVERS: tuple[str, ...] = ()

@@ -7,6 +7,8 @@ processor (the variant on Pillow) and its tokenizer do the same alone.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +20,7 @@ import torch
 from cleargs.errors import InputError
 from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.vlm.evaluator import Picture, UnscoredError
+from cleargs.rva.vlm.evaluator import Picture, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 _IMAGE = "<|image_pad|>"
@@ -36,92 +38,80 @@ class _Loaded:
     grammar: str
 
 
-class LocalPictureScorer:
-    """Runs a model folder of this machine; see `PictureScorer`. Loads it when the first picture comes."""
+class QwenFolder(QwenEvaluator):
+    """Runs a model folder of this machine. Loads it when the first picture comes."""
 
-    workers = 1
-
-    def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"]) -> None:
+    def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"], cache: Path | None) -> None:
+        """The folder's files are known by size and time: reading gigabytes for a digest is left to the
+        stage's key."""
         self._folder = Path(config.model_dir).expanduser().absolute()
         self._device = device
-        self._threads = config.local_threads
-        self._max_tokens = config.max_tokens
-        self.model = self._folder.name
-
-    @cached_property
-    def identity(self) -> str:
-        """The folder's files by size and time: reading gigabytes for a digest is left to the stage's key."""
         files = sorted(path for path in self._folder.rglob("*") if path.is_file())
         facts = [(path.name, stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]]
-        return json.dumps(["local", self._device, self._threads, self._max_tokens, facts])
+        identity = json.dumps(["local", device, config.local_threads, config.max_tokens, facts])
+        super().__init__(config, model=self._folder.name, identity=identity, cache=cache)
 
-    def stop(self) -> None:
-        """See `PictureScorer.stop`: the one picture under way is finished."""
+    def check(self) -> None:
+        """Raise InputError when the extra is not installed or the folder is not that of a Qwen3-VL model.
+        Reads no weights."""
+        try:
+            import llguidance.hf  # noqa: F401
+            from transformers import AutoConfig
+        except ImportError as error:
+            raise InputError(
+                f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
+            ) from error
+        with self._fault_told():
+            kind = AutoConfig.from_pretrained(self._folder, local_files_only=True).model_type
+            if kind not in _ARCHITECTURES:
+                raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
+
+    @contextmanager
+    def _fault_told(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"{self._folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
+                hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
+            ) from error
 
     @cached_property
     def _loaded(self) -> _Loaded:
-        return _load(self._folder, self._device)
+        """Raises InputError as `check`, and when the weights cannot be loaded."""
+        self.check()
+        import llguidance
+        import llguidance.hf
+        from transformers import AutoModelForImageTextToText, AutoTokenizer
+        from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+        from transformers.utils.logging import disable_progress_bar
+
+        disable_progress_bar()
+        with self._fault_told():
+            tokenizer = AutoTokenizer.from_pretrained(self._folder, local_files_only=True)
+            images = Qwen2VLImageProcessorPil.from_pretrained(self._folder, local_files_only=True)
+            model = AutoModelForImageTextToText.from_pretrained(
+                self._folder, local_files_only=True, dtype="auto"
+            )
+        n_vocab = model.config.get_text_config().vocab_size
+        vocabulary = llguidance.hf.from_tokenizer(tokenizer, n_vocab=n_vocab)
+        grammar = llguidance.LLMatcher.grammar_from_json_schema(
+            reply_schema(), defaults={"whitespace_flexible": False}
+        )
+        return _Loaded(model.to(self._device).eval(), tokenizer, images, vocabulary, grammar)
 
     def score(self, picture: Picture) -> Floats:
-        """See `PictureScorer.score`. Greedy decoding: the same picture gets the same scores."""
+        """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
-        torch.set_num_threads(self._threads)
+        torch.set_num_threads(self._config.local_threads)
         try:
-            text = _generate(self._loaded, picture, self._max_tokens)
+            text = _generate(self._loaded, picture, self._config.max_tokens)
         finally:
             torch.set_num_threads(threads)
         try:
             return parse_reply(text)
         except ReplyError as fault:  # a reply cut off at max_tokens
             raise UnscoredError(f"the reply cannot be used: {fault}") from None
-
-
-def check_folder(folder: Path) -> None:
-    """Raise InputError when the extra is not installed or the folder is not that of a Qwen3-VL model. Reads
-    no weights."""
-    try:
-        import llguidance.hf  # noqa: F401
-        from transformers import AutoConfig
-    except ImportError as error:
-        raise InputError(
-            f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
-        ) from error
-    try:
-        kind = AutoConfig.from_pretrained(folder, local_files_only=True).model_type
-        if kind not in _ARCHITECTURES:
-            raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
-    except (OSError, ValueError, KeyError) as error:
-        raise _unusable(folder, error) from error
-
-
-def _unusable(folder: Path, error: Exception) -> InputError:
-    return InputError(
-        f"{folder} holds no Qwen3-VL model that can be loaded: {str(error).splitlines()[0]}",
-        hint="give rva.qwen.model_dir the folder with config.json, the weights and the tokenizer",
-    )
-
-
-def _load(folder: Path, device: Literal["cpu", "cuda"]) -> _Loaded:
-    """Raises InputError as `check_folder`, and when the weights cannot be loaded."""
-    check_folder(folder)
-    import llguidance
-    import llguidance.hf
-    from transformers import AutoModelForImageTextToText, AutoTokenizer
-    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-    from transformers.utils.logging import disable_progress_bar
-
-    disable_progress_bar()
-    try:
-        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        images = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
-        model = AutoModelForImageTextToText.from_pretrained(folder, local_files_only=True, dtype="auto")
-    except (OSError, ValueError, KeyError) as error:
-        raise _unusable(folder, error) from error
-    vocabulary = llguidance.hf.from_tokenizer(tokenizer, n_vocab=model.config.get_text_config().vocab_size)
-    grammar = llguidance.LLMatcher.grammar_from_json_schema(
-        reply_schema(), defaults={"whitespace_flexible": False}
-    )
-    return _Loaded(model.to(device).eval(), tokenizer, images, vocabulary, grammar)
 
 
 def _generate(loaded: _Loaded, picture: Picture, max_tokens: int) -> str:

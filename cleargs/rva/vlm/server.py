@@ -12,8 +12,10 @@ import json
 import os
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
+from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -22,7 +24,7 @@ import httpx2
 from cleargs.errors import InputError, StageError
 from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.evaluator import Picture, UnscoredError
+from cleargs.rva.vlm.evaluator import Picture, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
@@ -39,6 +41,12 @@ _REPEATED = 2000  # characters of a faulty reply that the model is shown again
 _KEY_HINT = f"put the server's key into {KEY_VARIABLE} of the environment"
 
 
+_RESPONSE_FORMAT = {
+    "type": "json_schema",
+    "json_schema": {"name": "cues", "strict": True, "schema": reply_schema()},
+}
+
+
 class RefusedError(UnscoredError):
     """The server understood the request and will not answer it (400, 413, 422 and the like)."""
 
@@ -46,24 +54,24 @@ class RefusedError(UnscoredError):
 class PassingError(UnscoredError):
     """No answer this time; another try may bring one, ``after`` seconds at the earliest."""
 
-    def __init__(self, reason: str, after: float = 0.0) -> None:
+    def __init__(self, reason: str, *, after: float = 0.0, nobody: bool = False) -> None:
         super().__init__(reason)
         self.after = after
+        self.nobody = nobody
+        """Whether nobody listens at the server's address."""
 
 
-class UnreachableError(PassingError):
-    """Nobody listens at the server's address."""
+class QwenServer(QwenEvaluator):
+    """Sends chats to ``BASE/chat/completions``."""
 
-
-class ChatClient:
-    """Sends chats to ``BASE/chat/completions``. Safe to use from several threads."""
-
-    def __init__(self, config: QwenConfig) -> None:
+    def __init__(self, config: QwenConfig, *, seed: int, cache: Path | None) -> None:
         """Raises InputError when the address or the key of the environment cannot be used."""
-        self.base_url = config.base_url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL
-        self.base_url = self.base_url.rstrip("/")
+        identity = json.dumps(["server", config.model, config.max_tokens, seed])
+        super().__init__(config, model=config.model, identity=identity, cache=cache)
+        self.workers = config.concurrency
+        self._url = (config.base_url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL).rstrip("/")
         try:
-            check_base_url(self.base_url)
+            check_base_url(self._url)
         except ValueError as error:
             raise InputError(str(error), hint=f"set rva.qwen.base_url or {URL_VARIABLE}") from None
         self._key = os.environ.get(KEY_VARIABLE, "").strip()
@@ -71,9 +79,17 @@ class ChatClient:
             raise InputError(
                 f"{KEY_VARIABLE} holds characters that no key has", hint="set it to the key alone"
             )
-        self._config = config
+        self._request = {
+            "model": config.model,
+            "temperature": 0,
+            "seed": seed % 2**31,  # servers hold it in 32 bits
+            "max_tokens": config.max_tokens,
+        }
+        self._takes_schema = True
+        self._gone = ""
+        """Why no frame is asked for any more."""
         self._stopped = Event()
-        url = httpx2.URL(self.base_url)
+        url = httpx2.URL(self._url)
         self._http = httpx2.Client(
             base_url=url,
             headers={"Authorization": f"Bearer {self._key}"} if self._key else None,
@@ -85,49 +101,83 @@ class ChatClient:
         """End pauses between tries, and start no further ones."""
         self._stopped.set()
 
-    def check_model(self) -> None:
+    def check(self) -> None:
         """Raise InputError when nobody answers, the server refuses the key, or it lists its models and the
         one of the settings is not among them. A server that lists none passes."""
         model = self._config.model
         try:
-            answer, raw = self._request("GET", "models", min(self._config.timeout_s, _MAX_CHECK_S))
+            answer, raw = self._send("GET", "models", min(self._config.timeout_s, _MAX_CHECK_S))
         except PassingError:
             raise InputError(
-                f"no server for {model} answers at {self.base_url}",
+                f"no server for {model} answers at {self._url}",
                 hint=f"start one (vllm serve {model}), or set rva.qwen.base_url or {URL_VARIABLE}",
             ) from None
         if answer.status_code in (401, 403):
-            raise InputError(f"the server at {self.base_url} refuses the key", hint=_KEY_HINT)
+            raise InputError(f"the server at {self._url} refuses the key", hint=_KEY_HINT)
         try:
             served = [entry["id"] for entry in json.loads(raw)["data"]]
         except _NO_REPLY:
             return  # it answers; whether it has the model, the first frame will tell
         if served and model not in served:
             raise InputError(
-                f"the server at {self.base_url} has no model {model}; "
+                f"the server at {self._url} has no model {model}; "
                 f"it has {', '.join(map(str, served))[:_SHOWN]}",
                 hint="name one with --set rva.qwen.model=NAME, or serve the other",
             )
 
-    def complete(self, body: Mapping[str, Any]) -> str:
+    def score(self, picture: Picture) -> Floats:
+        """See `QwenEvaluator.score`. A reply outside the schema is answered with what is wrong with it."""
+        if self._gone:
+            raise UnscoredError(self._gone)  # this frame need not wait for the same end
+        image = {"type": "image_url", "image_url": {"url": picture.data_url()}}
+        text = {"type": "text", "text": prompt_text(masked=picture.masked)}
+        question: dict[str, Any] = {"role": "user", "content": [image, text]}
+        messages, fault = [question], ""
+        for _ in range(self._config.asks):
+            reply = self._reply(messages)
+            try:
+                return parse_reply(reply)
+            except ReplyError as error:
+                fault = str(error)
+            complaint = f"This reply cannot be used: {fault}. Answer again with the JSON object alone."
+            messages = [
+                question,
+                {"role": "assistant", "content": reply[:_REPEATED]},
+                {"role": "user", "content": complaint},
+            ]
+        raise UnscoredError(f"the last of {self._config.asks} replies cannot be used: {fault}")
+
+    def _reply(self, messages: list[dict[str, Any]]) -> str:
+        """The model's text; by the schema where the server knows how to force it, else as it comes."""
+        chat = {**self._request, "messages": messages}
+        if self._takes_schema:
+            with suppress(RefusedError):
+                return self._complete({**chat, "response_format": _RESPONSE_FORMAT})
+        reply = self._complete(chat)
+        self._takes_schema = False  # the server takes the picture, but not the format
+        return reply
+
+    def _complete(self, body: Mapping[str, Any]) -> str:
         """The text of the reply to the chat ``body``.
 
         Raises UnscoredError where this chat gets none, StageError where none would: wrong key, model or
         address.
         """
-        pause = self._config.backoff_s
-        for tried in range(1, self._config.attempts + 1):
+        pause, tried = self._config.backoff_s, 0
+        while True:
             try:
                 return self._once(body)
             except PassingError as fault:
+                tried += 1
                 last = tried == self._config.attempts
                 if last or self._stopped.wait(min(_MAX_PAUSE_S, max(pause, fault.after))):
-                    raise type(fault)(f"{fault} ({tried} tries)") from None
+                    reason = f"{fault} ({tried} tries)"
+                    self._gone = reason if fault.nobody else self._gone
+                    raise UnscoredError(reason) from None
                 pause *= 2
-        raise AssertionError("attempts is at least 1")
 
     def _once(self, body: Mapping[str, Any]) -> str:
-        answer, raw = self._request("POST", "chat/completions", self._config.timeout_s, body)
+        answer, raw = self._send("POST", "chat/completions", self._config.timeout_s, body)
         if not answer.is_success:
             raise self._refusal(answer, raw)
         try:
@@ -136,7 +186,7 @@ class ChatClient:
             raise PassingError("the server's answer is no chat completion, or breaks off") from None
         return text if isinstance(text, str) else ""
 
-    def _request(
+    def _send(
         self, method: str, path: str, timeout: float, body: Mapping[str, Any] | None = None
     ) -> tuple[httpx2.Response, bytes]:
         """The answer and its content. Raises PassingError where none came whole within ``timeout`` s."""
@@ -152,7 +202,7 @@ class ChatClient:
         except httpx2.TimeoutException:
             raise PassingError(f"no answer within {timeout:g} s") from None
         except httpx2.ConnectError:
-            raise UnreachableError(f"nobody answers at {self.base_url}") from None
+            raise PassingError(f"nobody answers at {self._url}", nobody=True) from None
         except httpx2.RequestError as error:
             raise PassingError(f"the connection broke off ({type(error).__name__})") from None
         return answer, raw
@@ -162,8 +212,8 @@ class ChatClient:
         code = answer.status_code
         reason = f"the server answered {code}{self._words(raw)}"
         if code in _BUSY:
-            return PassingError(reason, _retry_after(answer.headers.get("Retry-After", "")))
-        where = f"{reason} at {self.base_url}"
+            return PassingError(reason, after=_retry_after(answer.headers.get("Retry-After", "")))
+        where = f"{reason} at {self._url}"
         if code in (401, 403):
             return StageError(where, hint=_KEY_HINT)
         if code == 404:
@@ -175,12 +225,10 @@ class ChatClient:
     def _words(self, raw: bytes) -> str:
         """The server's explanation in one short line, without the key."""
         text = raw.decode("utf-8", "replace")
-        try:
+        with suppress(ValueError, RecursionError):
             fault = json.loads(text)
             fault = fault.get("error", fault) if isinstance(fault, dict) else fault
             text = str(fault.get("message", fault) if isinstance(fault, dict) else fault)
-        except (ValueError, RecursionError):
-            pass
         if self._key:
             text = text.replace(self._key, "***")
         text = " ".join(text.split())[:_SHOWN]
@@ -190,86 +238,10 @@ class ChatClient:
 def _retry_after(value: str) -> float:
     """Seconds that a Retry-After header (a number, or a date) asks for."""
     try:
-        return max(0.0, float(value))
+        seconds = float(value)
     except ValueError:
-        pass
-    try:
-        date = parsedate_to_datetime(value)
-    except ValueError:
-        return 0.0
-    return max(0.0, (date.astimezone(UTC) - datetime.now(UTC)).total_seconds())
-
-
-class ServerPictureScorer:
-    """Asks a server for scores; see `PictureScorer`."""
-
-    def __init__(self, config: QwenConfig, *, seed: int) -> None:
-        """Raises InputError when the server's address or key cannot be used."""
-        self.model = config.model
-        self.workers = config.concurrency
-        self.identity = json.dumps(["server", config.model, config.max_tokens, seed])
-        self._asks = config.asks
-        self._request = {
-            "model": config.model,
-            "temperature": 0,
-            "seed": seed % 2**31,  # servers hold it in 32 bits
-            "max_tokens": config.max_tokens,
-        }
-        self._client = ChatClient(config)
-        self._takes_schema = True
-        self._gone: str | None = None
-
-    def stop(self) -> None:
-        """See `PictureScorer.stop`."""
-        self._client.stop()
-
-    def score(self, picture: Picture) -> Floats:
-        """See `PictureScorer.score`. A reply outside the schema is answered with what is wrong with it."""
-        if self._gone is not None:
-            raise UnscoredError(self._gone)
-        messages: list[dict[str, Any]] = [
-            {
-                "role": "user",
-                "content": [
-                    {"type": "image_url", "image_url": {"url": picture.data_url()}},
-                    {"type": "text", "text": prompt_text(masked=picture.masked)},
-                ],
-            }
-        ]
-        fault = ""
-        for _ in range(self._asks):
-            reply = self._reply(messages)
-            try:
-                return parse_reply(reply)
-            except ReplyError as error:
-                fault = str(error)
-            complaint = f"This reply cannot be used: {fault}. Answer again with the JSON object alone."
-            messages = [
-                messages[0],
-                {"role": "assistant", "content": reply[:_REPEATED]},
-                {"role": "user", "content": complaint},
-            ]
-        raise UnscoredError(f"the last of {self._asks} replies cannot be used: {fault}")
-
-    def _reply(self, messages: list[dict[str, Any]]) -> str:
-        """The model's text; by the schema where the server knows how to force it, else as it comes."""
-        chat = {**self._request, "messages": messages}
         try:
-            if self._takes_schema:
-                try:
-                    return self._client.complete({**chat, "response_format": _RESPONSE_FORMAT})
-                except RefusedError:
-                    # The server does not take the format, or the picture: ask without the former.
-                    reply = self._client.complete(chat)
-                    self._takes_schema = False
-                    return reply
-            return self._client.complete(chat)
-        except UnreachableError as error:
-            self._gone = str(error)  # the other frames need not wait for the same end
-            raise
-
-
-_RESPONSE_FORMAT = {
-    "type": "json_schema",
-    "json_schema": {"name": "cues", "strict": True, "schema": reply_schema()},
-}
+            seconds = (parsedate_to_datetime(value).astimezone(UTC) - datetime.now(UTC)).total_seconds()
+        except ValueError:
+            return 0.0
+    return max(0.0, seconds)
