@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -166,6 +168,22 @@ def test_a_count_that_no_file_holds(tmp_path: Path, name: str, offset: int) -> N
     file.write_bytes(data)
     with pytest.raises(InputError, match="a file breaks off"):
         read_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["rigs", "frames"])
+@pytest.mark.parametrize("damage", [b"", b"\xff\x07" * 700])
+def test_damaged_rigs_are_not_read(tmp_path: Path, name: str, damage: bytes) -> None:
+    """pycolmap would read on past the end of the file; in a process of its own, so that it may not end."""
+    write_model(tmp_path, small_model(), np.zeros((4, 3), np.uint8))
+    pycolmap.Reconstruction(str(tmp_path)).write_binary(tmp_path)
+    (tmp_path / f"{name}.bin").write_bytes(damage)
+    program = (
+        "import sys; from pathlib import Path; from cleargs.capture.model import read_model\n"
+        "print(len(read_model(Path(sys.argv[1])).images))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
