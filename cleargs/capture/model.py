@@ -66,7 +66,7 @@ def read_model(folder: Path) -> SparseModel:
     kind = "bin" if (folder / "images.bin").exists() else "txt"
     try:
         with TemporaryDirectory(prefix="cleargs-model-") as alone:
-            # pycolmap also reads rigs and frames where they lie next to these, and their sizes are not checked.
+            # pycolmap also reads rigs and frames next to these files, and their sizes are not checked.
             for name, end in _ENDS.items():
                 file = folder / f"{name}.{kind}"
                 if kind == "bin":
