@@ -150,16 +150,17 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         lambda index: read_rgb(work / "images" / frames[index].image),
         [frame.image in registered for frame in frames],
     )
-    model = publish(frames, scene.model, scene.placed, test, work, context.out, config.max_size, reporter)
+    outcome = scene.outcome
+    model = publish(frames, scene.model, outcome.placed, test, work, context.out, config.max_size, reporter)
     return StageResult(
         summary={
             "kind": capture.kind,
-            "poses": ("refined" if scene.refined else "input") if capture.posed else "sfm",
-            "given_poses_missed_px": None if scene.missed is None else round(scene.missed, 6),
+            "poses": ("refined" if outcome.refined else "input") if capture.posed else "sfm",
+            "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),
-            "placed": dict(Counter(scene.placed[frame.image] for frame in frames)),
+            "placed": dict(Counter(outcome.placed[frame.image] for frame in frames)),
             "test": len(test),
             "holdout_hash": holdout_hash(config.holdout, (frames[index].source.name for index in test)),
             "points": len(model.point_ids),

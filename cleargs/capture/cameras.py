@@ -76,26 +76,18 @@ class Camera:
         return self.params[start], self.params[start + 1]
 
     @property
-    def distortion(self) -> tuple[float, ...]:
-        return self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
-
-    @property
     def is_pinhole(self) -> bool:
         """Whether the image needs no undistortion."""
-        return not any(self.distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
+        distortion = self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
+        return not any(distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the same picture scaled to another size."""
         if (width, height) == (self.width, self.height):
             return self
-        sx, sy = width / self.width, height / self.height
-        (fx, fy), (cx, cy) = self.focal, self.centre
-        if self.model not in SINGLE_FOCAL:
-            params = (fx * sx, fy * sy, cx * sx, cy * sy, *self.distortion)
-        else:
-            # Rounding to whole pixels leaves sx and sy a little apart; one focal length stays one.
-            params = (fx * (sx + sy) / 2, cx * sx, cy * sy, *self.distortion)
-        return Camera(self.model, width, height, params)
+        camera = self.colmap()
+        camera.rescale(width, height)
+        return Camera(self.model, width, height, tuple(camera.params.tolist()))
 
     def colmap(self) -> pycolmap.Camera:
         """As pycolmap has it (loaded when it is first needed: every run looks up its inputs)."""
@@ -110,10 +102,13 @@ def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float)
     return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
-def guessed_camera(width: int, height: int) -> Camera:
-    """A pinhole of COLMAP's default focal length (1.2 long sides), for frames that have none."""
+def guessed_camera(model: str, width: int, height: int) -> Camera:
+    """COLMAP's first guess for a frame that has no camera: focal length 1.2 long sides, no distortion."""
+    from cleargs.capture.colmap import pycolmap
+
     focal = 1.2 * max(width, height)
-    return pinhole(width, height, focal, focal, width / 2, height / 2)
+    guess = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
+    return Camera(model, width, height, tuple(guess.params.tolist()))
 
 
 @dataclass(frozen=True)

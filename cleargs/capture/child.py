@@ -1,9 +1,9 @@
 """Work in a child process that reports progress, can be killed, and may abort without taking us along.
 
 The child writes JSON objects, one a line, to its standard output: ``{"phase": label, "total": n}`` opens
-a phase, ``{"done": k, "note": text}`` moves it, ``{"error": cause, "hint": remedy}`` ends in failure. Its
-standard error (COLMAP's log) goes to a file. It dies with its parent: it watches its standard input, whose
-other end closes when the parent is gone, however it went.
+a phase, ``{"done": k}`` moves it, ``{"error": cause, "hint": remedy}`` ends in failure. Its standard error
+(COLMAP's log) goes to a file. It dies with its parent: it watches its standard input, whose other end closes
+when the parent is gone, however it went.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import shutil
 import signal
 import subprocess
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, TextIO
 
 from cleargs.children import module_command
 from cleargs.errors import StageError
@@ -30,37 +29,15 @@ _FULL = 8 * 2**20
 """A disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB."""
 
 
-class ChildChannel:
-    """The child's side: how it reports."""
+def reports_to_parent() -> Callable[..., None]:
+    """Take standard output for reports alone, and return the function that sends one, given by name.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    @staticmethod
-    def open() -> ChildChannel:
-        """Take standard output for the reports, and from now on die when the parent does."""
-        return ChildChannel(reports_to_parent())
-
-    def phase(self, label: str, total: int | None) -> None:
-        self._send({"phase": label, "total": total})
-
-    def done(self, steps: int, note: str | None = None) -> None:
-        self._send({"done": steps, "note": note})
-
-    def error(self, cause: str, hint: str) -> None:
-        self._send({"error": cause, "hint": hint})
-
-    def _send(self, message: Mapping[str, Any]) -> None:
-        self._stream.write(json.dumps(message) + "\n")
-
-
-def reports_to_parent() -> TextIO:
-    """Standard output, for reports alone: whatever a library prints there goes to the log instead. From now
-    on this process dies when its parent does."""
+    Whatever a library prints goes to the log instead. From now on this process dies when its parent does.
+    """
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    return reports
+    return lambda **message: print(json.dumps(message), file=reports)
 
 
 def _die_with_parent() -> None:
@@ -102,8 +79,9 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
             raise
-    if status != 0:
-        _check_space(log)
+    # On a full disk, COLMAP and SQLite fail at whatever they were doing.
+    if status != 0 and shutil.disk_usage(log.parent).free < _FULL:
+        raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
     if failure is not None:
         raise failure
     if status != 0:
@@ -111,12 +89,6 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
             f"COLMAP stopped ({_exit_reason(status)}): {_last_failure(log)}",
             hint="try other images, another ingest.camera_model or fewer ingest.max_features",
         )
-
-
-def _check_space(log: Path) -> None:
-    """Raise StoreError where the disk is full: COLMAP and SQLite then fail at whatever they were doing."""
-    if shutil.disk_usage(log.parent).free < _FULL:
-        raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
 
 
 def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | None:
@@ -133,7 +105,7 @@ def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | No
             elif "error" in message:
                 failure = StageError(message["error"], hint=message["hint"])
             elif task is not None:
-                task.update(done=message["done"], note=message["note"])
+                task.update(done=message["done"])
     return failure
 
 

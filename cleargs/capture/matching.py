@@ -4,33 +4,32 @@ Pairs are all with all, or neighbours and distant frames that look alike. That n
 elsewhere: the words are clustered from the capture's own descriptors.
 
 COLMAP's own threads do not always find the same matches: with two of them 2 of 76 runs over the same features
-differed (pycolmap 4.2.1), with one none of 60. Each process works through its share of the pairs in a copy of
-the database (``python -m cleargs.capture.matching``); what was matched is gathered in the end, or by the next
-run when this one is killed.
+differed (pycolmap 4.2.1), with one none of 60. Each process matches blocks of pairs in its own copy of the
+database. Its matches are gathered in the end, or by the next run when this one is killed.
 """
 
 from __future__ import annotations
 
+import os
+import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, suppress
+from functools import partial
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
-from cleargs.children import module_command
 
 _PAIRS_PER_BLOCK = 200
 """COLMAP indexes the features of a frame anew in each block (a tenth of the time), and keeps nothing of one
 that it did not finish."""
-
 
 N_WORDS = 32
 """Words of the vocabulary: VLAD works with few."""
@@ -39,11 +38,6 @@ _SAMPLE = 20_000
 _ROUNDS = 8
 _MAX_IMAGES = 2**31 - 1
 """COLMAP numbers a pair of images by the id of the first, times this, plus that of the second."""
-
-
-def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
-    """Every pair (i, j) with i < j."""
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
@@ -117,49 +111,61 @@ def match_pairs(
 ) -> None:
     """Match and verify the pairs of frames (numbers in ``names``) that ``database`` has no matches of yet.
 
-    Equal for any number of processes. ``done`` is told how many pairs are through, from any thread. Raises
-    ChildProcessError when a process fails, sqlite3.DatabaseError when its matches cannot be gathered.
+    Equal for any number of processes. ``done`` is told how many pairs are through. Raises BrokenProcessPool
+    when a process ends, sqlite3.DatabaseError when its matches cannot be gathered.
     """
-    for leftover in sorted(database.parent.glob(f"{database.stem}-share*.db")):
+    for leftover in _shares(database):
         with suppress(sqlite3.DatabaseError):  # damaged by whatever killed it: matched again
             _gather(database, leftover)
-        _remove(leftover)
+        remove_database(leftover)
     with pycolmap.Database.open(database) as opened:
         todo = [pair for pair in pairs if not opened.exists_matches(pair[0] + 1, pair[1] + 1)]
     through = len(pairs) - len(todo)
     done(through)
-    counting = threading.Lock()
-
-    def count(more: int) -> None:
-        nonlocal through
-        with counting:
-            through += more
+    size = min(_PAIRS_PER_BLOCK, max(1, -(-len(todo) // processes)))
+    lines = [f"{names[i]} {names[j]}\n" for i, j in todo]
+    blocks = [lines[start : start + size] for start in range(0, len(lines), size)]
+    with ProcessPoolExecutor(processes, get_context("spawn"), _end_with_parent) as pool:
+        for count in pool.map(partial(_match_block, database, seed), blocks):
+            through += count
             done(through)
-
-    size = max(1, -(-len(todo) // processes))
-    shares: list[Path] = []
-    for start in range(0, len(todo), size):
-        shares.append(database.with_name(f"{database.stem}-share{len(shares)}.db"))
-        with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(shares[-1])) as target:
-            source.backup(target)
-        lines = (f"{names[i]} {names[j]}\n" for i, j in todo[start : start + size])
-        shares[-1].with_suffix(".txt").write_text("".join(lines), encoding="utf-8")
-    with ThreadPoolExecutor(max(1, len(shares))) as pool:
-        list(pool.map(lambda share: _in_a_process(share, seed, count), shares))
-    for share in shares:
+    for share in _shares(database):
         _gather(database, share)
-        _remove(share)
+        remove_database(share)
 
 
-def _in_a_process(share: Path, seed: int, count: Callable[[int], None]) -> None:
-    command = module_command("cleargs.capture.matching", str(share), str(seed))
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None
-        for line in child.stdout:
-            count(int(line))
-        status = child.wait()
-    if status != 0:
-        raise ChildProcessError(f"a process that matches frames ended with {status}")
+def _end_with_parent() -> None:
+    """Let this process end when its parent does, however that went."""
+
+    def wait() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _match_block(database: Path, seed: int, block: Sequence[str]) -> int:
+    """Match these pairs (lines of two names) in this process's copy of ``database``; their number."""
+    share = database.with_name(f"{database.stem}-share{os.getpid()}.db")
+    if not share.exists():
+        with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(share)) as target:
+            source.backup(target)
+    pycolmap.set_random_seed(seed)
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    with NamedTemporaryFile("w", encoding="utf-8") as listed:
+        listed.writelines(block)
+        listed.flush()
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed.name)
+        pycolmap.match_image_pairs(share, matching, pairing, verification)
+    return len(block)
+
+
+def _shares(database: Path) -> list[Path]:
+    return sorted(database.parent.glob(f"{database.stem}-share*.db"))
 
 
 def _gather(database: Path, share: Path) -> None:
@@ -174,15 +180,15 @@ def _gather(database: Path, share: Path) -> None:
         opened.commit()
 
 
-def _remove(share: Path) -> None:
-    for leftover in share.parent.glob(f"{share.stem}.*"):
+def remove_database(database: Path) -> None:
+    """Remove what SQLite wrote of ``database``, its log of changes too."""
+    for leftover in database.parent.glob(f"{database.name}*"):
         leftover.unlink()
 
 
 def copy_without_features(database: Path, copy: Path, image_ids: Collection[int]) -> None:
     """Copy COLMAP's ``database`` but for the features of these images and their matches."""
-    for leftover in copy.parent.glob(f"{copy.name}*"):
-        leftover.unlink()
+    remove_database(copy)
     listed = ", ".join(str(int(image_id)) for image_id in image_ids)
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
         source.backup(target)
@@ -214,25 +220,3 @@ def why_missing(database: Path, missing: Collection[int]) -> dict[int, str]:
         else "no features"
         for image_id, count in features.items()
     }
-
-
-def main() -> None:
-    """Match the pairs listed beside the database ``argv[1]``; after each block the number of its pairs is
-    printed."""
-    share, seed = Path(sys.argv[1]), int(sys.argv[2])
-    reports = reports_to_parent()
-    pairs = share.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
-    pycolmap.set_random_seed(seed)
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=share.with_suffix(".block"))
-    for start in range(0, len(pairs), _PAIRS_PER_BLOCK):
-        block = pairs[start : start + _PAIRS_PER_BLOCK]
-        Path(pairing.match_list_path).write_text("\n".join(block) + "\n", encoding="utf-8")
-        pycolmap.match_image_pairs(share, matching, pairing, verification)
-        print(len(block), file=reports)
-
-
-if __name__ == "__main__":
-    main()

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,13 +63,18 @@ class SparseModel:
 
 def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model. Raises InputError when it is damaged or incomplete."""
+    kind = "bin" if (folder / "images.bin").exists() else "txt"
     try:
-        if (folder / "images.bin").exists():
-            _require_whole(folder)
-        else:
-            for name in ("cameras.txt", "images.txt", "points3D.txt"):
-                open_regular(folder / name).close()
-        return _converted(pycolmap.Reconstruction(str(folder)))
+        with TemporaryDirectory(prefix="cleargs-model-") as alone:
+            # pycolmap also reads rigs and frames next to these files, and their sizes are not checked.
+            for name, end in _ENDS.items():
+                file = folder / f"{name}.{kind}"
+                if kind == "bin":
+                    _require_whole(file, end)
+                else:
+                    open_regular(file).close()
+                (Path(alone) / file.name).symlink_to(file.resolve())
+            return _converted(pycolmap.Reconstruction(alone))
     except _FAULTS as error:
         # COLMAP's failed checks start with the line of its source.
         reason = "a file breaks off" if isinstance(error, struct.error) else cause(error).rpartition("] ")[2]
@@ -133,30 +139,38 @@ def moved(
     )
 
 
-def _require_whole(folder: Path) -> None:
+def _camera_end(data: bytes, at: int) -> int:
+    kind = pycolmap.CameraModelId(*struct.unpack_from("<4xi", data, at))
+    return at + 24 + 8 * len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
+
+
+def _image_end(data: bytes, at: int) -> int:
+    end = data.find(b"\0", at + 64)  # of the name
+    if end < 0:
+        raise struct.error
+    return end + 9 + _POINT2D.itemsize * _count(data, end + 1)
+
+
+def _point_end(data: bytes, at: int) -> int:
+    return at + 51 + 8 * _count(data, at + 43)
+
+
+_ENDS: dict[str, Callable[[bytes, int], int]] = {
+    "cameras": _camera_end,
+    "images": _image_end,
+    "points3D": _point_end,
+}
+"""File of a model -> the position behind the entry at a position of its binary form."""
+
+
+def _require_whole(file: Path, end: Callable[[bytes, int], int]) -> None:
     """Raise where the counts in a binary file do not fit its size: pycolmap would read zeros on and on."""
-
-    def camera(data: bytes, at: int) -> int:
-        kind = pycolmap.CameraModelId(*struct.unpack_from("<4xi", data, at))
-        return at + 24 + 8 * len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
-
-    def image(data: bytes, at: int) -> int:
-        end = data.find(b"\0", at + 64)  # of the name
-        if end < 0:
-            raise struct.error
-        return end + 9 + _POINT2D.itemsize * _count(data, end + 1)
-
-    def point(data: bytes, at: int) -> int:
-        return at + 51 + 8 * _count(data, at + 43)
-
-    ends: dict[str, Callable[[bytes, int], int]] = {"cameras": camera, "images": image, "points3D": point}
-    for name, end in ends.items():
-        data = read_bytes(folder / f"{name}.bin")
-        at = 8
-        for _ in range(_count(data, 0)):
-            at = end(data, at)
-        if at != len(data):
-            raise ValueError(f"{name}.bin does not have the size that its counts say")
+    data = read_bytes(file)
+    at = 8
+    for _ in range(_count(data, 0)):
+        at = end(data, at)
+    if at != len(data):
+        raise ValueError(f"{file.name} does not have the size that its counts say")
 
 
 def _count(data: bytes, at: int) -> int:

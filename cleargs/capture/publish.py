@@ -110,7 +110,9 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
     for frame, camera in zip(frames, found, strict=True):
         if camera is None:
             alike = common.get((frame.width, frame.height))
-            camera = alike.most_common(1)[0][0] if alike else guessed_camera(frame.width, frame.height)
+            camera = (
+                alike.most_common(1)[0][0] if alike else guessed_camera("PINHOLE", frame.width, frame.height)
+            )
         cameras.append(camera)
     return cameras
 

@@ -9,30 +9,26 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.cameras import Camera, Pose, guessed_camera
 from cleargs.capture.child import run_child
-from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
+from cleargs.capture.matching import remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.poses import Similarity, normalise
 from cleargs.capture.prepare import WorkFrame
+from cleargs.capture.sfm_worker import OUTCOME, Job, Outcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
-from cleargs.record import Record
 from cleargs.untrusted import FAULTS, cause, read_json
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
-
-OUTCOME = "outcome.json"
-"""In the folder of the model: what COLMAP's process says of it, an `Outcome`."""
 
 WARN_REGISTERED = 0.60
 """Below this share of frames with a pose the user is warned."""
@@ -43,29 +39,13 @@ _ADVICE = (
 )
 
 
-class Outcome(Record):
-    """Origin of a model, as COLMAP's process notes it."""
-
-    placed: dict[str, str]
-    """How SfM placed each working image, or why it did not; empty where the input brought poses."""
-    missed_px: float | None
-    """Median reprojection error at the input's poses; None where it brought none."""
-    refined: bool
-    """Whether they were adjusted."""
-
-
 @dataclass(frozen=True)
 class Reconstruction:
     """A sparse model in the normalised world; image names are those of the working images."""
 
     model: SparseModel
     similarity: Similarity
-    missed: float | None
-    """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
-    refined: bool
-    """Whether they were adjusted."""
-    placed: dict[str, str]
-    """Working image -> how its pose was found, or why there is none."""
+    outcome: Outcome
 
 
 def reconstruct(
@@ -88,7 +68,7 @@ def reconstruct(
         model, outcome = _run(frames, None, folder, config, seed, threads, reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity, None, False, outcome.placed)
+        return Reconstruction(_moved(model, similarity), similarity, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
     similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
     adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
@@ -99,7 +79,8 @@ def reconstruct(
     if adopted is not None and len(adopted.error):
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
-            return Reconstruction(adopted, similarity, missed, False, _placed_by_input(frames, refined=False))
+            placed = _placed_by_input(frames, refined=False)
+            return Reconstruction(adopted, similarity, Outcome(placed=placed, missed_px=missed))
     poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
     model, outcome = _run(posed, poses, folder, config, seed, threads, reporter)
     if not len(model.point_ids):
@@ -121,7 +102,8 @@ def reconstruct(
         )
     if adopted is not None and len(adopted.error) and not refined:
         model = adopted
-    return Reconstruction(model, similarity, missed, refined, _placed_by_input(frames, refined))
+    placed = _placed_by_input(frames, refined)
+    return Reconstruction(model, similarity, Outcome(placed=placed, missed_px=missed, refined=refined))
 
 
 def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
@@ -143,26 +125,27 @@ def _run(
     """Let COLMAP do its work, unless a killed run got as far as the model."""
     if (found := _resumed(folder, reporter)) is not None:
         return found
-    masked = any(frame.masked for frame in frames)
-    job = {
-        **_job(frames, poses, config),
-        "folder": str(folder.resolve()),
-        "images": str((folder / "images").resolve()),
-        "masks": str((folder / "masks").resolve()) if masked else None,
-        "seed": seed,
-        "threads": threads,
-    }
-    write_json(folder / "job.json", job)
+    write_json(
+        folder / "job.json", job_of(frames, poses, folder, config, seed, threads).model_dump(mode="json")
+    )
     run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", reporter)
     return _read(folder / "model")
 
 
-def _job(frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, config: SfmConfig) -> dict[str, Any]:
-    """What COLMAP gets: working images, their cameras, the poses if they are known, and settings.
+def job_of(
+    frames: Sequence[WorkFrame],
+    poses: Sequence[Pose] | None,
+    folder: Path,
+    config: SfmConfig,
+    seed: int,
+    threads: int,
+) -> Job:
+    """What COLMAP is to do with the working images in ``folder``.
 
     Without poses, frames of one size share a camera, or each frame has its own; an input image of each camera
     may state its focal length.
     """
+    folder = folder.resolve()
     if poses is not None:
         owners: list[object] = [frame.camera for frame in frames]
     elif config.shared_camera:
@@ -170,30 +153,27 @@ def _job(frames: Sequence[WorkFrame], poses: Sequence[Pose] | None, config: SfmC
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
-    first = [frames[owners.index(owner)] for owner in numbers]
-    cameras = [_starting_camera(frame, config) if poses is None else frame.camera for frame in first]
-    stated = [poses is None and frame.source.pts is None for frame in first]
+    cameras: list[Camera] = []
+    exif_images: list[Path | None] = []
+    for frame in (frames[owners.index(owner)] for owner in numbers):
+        known = frame.camera if poses is not None else None
+        cameras.append(known or guessed_camera(config.camera_model, frame.width, frame.height))
+        stated = poses is None and frame.source.pts is None
+        exif_images.append(frame.source.path.resolve() if stated else None)
     matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses or ()]
-    return {
-        "names": [frame.image for frame in frames],
-        "cameras": [asdict(camera) for camera in cameras if camera is not None],
-        "camera_of": [numbers[owner] for owner in owners],
-        "poses": None if poses is None else matrices,
-        "exif_images": [
-            str(frame.source.path.resolve()) if may else None
-            for frame, may in zip(first, stated, strict=True)
-        ],
-        **config.model_dump(
-            include={"max_features", "exhaustive_below", "overlap", "loop_candidates", "refine_above"}
-        ),
-    }
-
-
-def _starting_camera(frame: WorkFrame, config: SfmConfig) -> Camera:
-    """COLMAP's first guess: focal length 1.2 long sides, no distortion."""
-    focal = 1.2 * max(frame.width, frame.height)
-    guess = pycolmap.Camera.create_from_model_name(1, config.camera_model, focal, frame.width, frame.height)
-    return Camera(config.camera_model, frame.width, frame.height, tuple(guess.params.tolist()))
+    return Job(
+        folder=folder,
+        images=folder / "images",
+        masks=folder / "masks" if any(frame.masked for frame in frames) else None,
+        names=[frame.image for frame in frames],
+        cameras=cameras,
+        camera_of=[numbers[owner] for owner in owners],
+        poses=None if poses is None else matrices,
+        exif_images=exif_images,
+        config=SfmConfig(**config.model_dump(include=set(SfmConfig.model_fields))),
+        seed=seed,
+        threads=threads,
+    )
 
 
 def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | None:
@@ -210,8 +190,7 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | 
             remove(model)
     if database.exists() and not _sound(database):
         reporter.warn("the damaged features of an interrupted run are found again")
-        for leftover in folder.glob("database.db*"):
-            leftover.unlink()
+        remove_database(database)
     return None
 
 

@@ -19,8 +19,8 @@ from cleargs.progress import SilentReporter
 PREAMBLE = """
 import os, sys, time
 from pathlib import Path
-from cleargs.capture.child import ChildChannel
-channel = ChildChannel.open()
+from cleargs.capture.child import reports_to_parent
+report = reports_to_parent()
 """
 
 
@@ -49,7 +49,7 @@ def test_a_traceback_becomes_an_error(module: Path) -> None:
 
 
 def test_a_named_error_arrives(module: Path) -> None:
-    module.write_text(PREAMBLE + "channel.phase('x', 2)\nchannel.error('why', 'what')\nsys.exit(3)")
+    module.write_text(PREAMBLE + "report(phase='x', total=2)\nreport(error='why', hint='what')\nsys.exit(3)")
     with pytest.raises(StageError, match="why") as caught:
         run(module)
     assert caught.value.hint == "what"
@@ -57,7 +57,7 @@ def test_a_named_error_arrives(module: Path) -> None:
 
 def test_prints_do_not_disturb_the_reports(module: Path) -> None:
     module.write_text(
-        PREAMBLE + "print('hello')\nchannel.phase('x', 2)\nos.system('echo hi')\nchannel.done(2)"
+        PREAMBLE + "print('hello')\nreport(phase='x', total=2)\nos.system('echo hi')\nreport(done=2)"
     )
     run(module)
     assert "hello" in module.with_suffix(".log").read_text()
@@ -150,7 +150,7 @@ def test_a_full_disk_is_the_cause(module: Path, monkeypatch: pytest.MonkeyPatch)
     """COLMAP and SQLite fail at whatever they were doing, and speak of that."""
     usage = child.shutil.disk_usage(module.parent)
     monkeypatch.setattr(child.shutil, "disk_usage", lambda path: usage._replace(free=2**20))
-    module.write_text(PREAMBLE + "channel.error('no features were found', 'other images')\nsys.exit(3)")
+    module.write_text(PREAMBLE + "report(error='no features were found', hint='other images')\nsys.exit(3)")
     with pytest.raises(StoreError, match="no space left") as caught:
         run(module)
     assert "free some space" in caught.value.hint
