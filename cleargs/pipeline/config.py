@@ -6,18 +6,18 @@ A document has one table a stage, and beside them ``seed``. What a stage may be 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import allowed, inner_model, suggestion
+from cleargs.pipeline.settings import settings_of, suggestion
 from cleargs.untrusted import FAULTS, cause, read_text
 
 RECIPES = "cleargs.workflows"
@@ -150,75 +150,54 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     models = {name: dag.load(name).CONFIG for name in dag.names}
     for name in document:
         if name != "seed" and name not in models:
-            raise _unknown(name, "", {"seed": None, **models}, models)
+            raise _unknown(name, models)
     sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
             sections[name] = model.model_validate(document.get(name, {}), context=sections)
         except ValidationError as error:
-            raise _setting_error(name, model, models, error) from error
+            raise _setting_error(name, models, error) from error
     return Config(seed, sections)
 
 
-# -- errors that teach -------------------------------------------------------------------------------------
-
-
 def _setting_error(
-    section: str, model: type[BaseModel], models: Mapping[str, type[BaseModel]], error: ValidationError
+    section: str, models: Mapping[str, type[BaseModel]], error: ValidationError
 ) -> ConfigError:
     """The first complaint of pydantic as one line of cause and one of remedy."""
     first = error.errors(include_url=False)[0]
-    parts = [str(part) for part in first["loc"]]
+    name = ".".join([section, *map(str, first["loc"])])
     if first["type"] == "retired":
         gone = first["ctx"]
-        name = ".".join([section, *parts, gone["name"]])
-        return ConfigError(f"{name} = {gone['value']!r} is no setting any more", hint=gone["hint"])
-    owner, field = _locate(model, parts)
-    if owner is None and not parts[-1].isdigit():
-        parts.pop()  # which member of a union pydantic tried
-    name = ".".join([section, *parts])
+        return ConfigError(
+            f"{name}.{gone['name']} = {gone['value']!r} is no setting any more", hint=gone["hint"]
+        )
     if first["type"] == "extra_forbidden":
-        siblings = owner.model_fields if owner is not None else {}
-        return _unknown(parts[-1], ".".join([section, *parts[:-1]]) + ".", siblings, models)
-    message = first["msg"].removeprefix("Value error, ")
+        return _unknown(name, models)
+    known = {setting.name: setting for setting in settings_of(section, models[section])}
     if first["type"] == "model_type":
+        inner = next(full for full in known if full.startswith(f"{name}."))
         return ConfigError(
             f"{name} = {first['input']!r} cannot be used",
-            hint=f"{name} is a table of settings: name one of them, {name}.{_first_name(model, parts)} say",
+            hint=f"{name} is a table of settings: name one of them, {inner} say",
         )
-    if not parts:
-        return ConfigError(f"{section}: {message}", hint=f"change the settings of [{section}]")
+    message = first["msg"].removeprefix("Value error, ")
+    # Below a setting pydantic names the item of a list, or which member of a union it tried.
+    setting = next((known[place] for place in _places(name) if place in known), None)
+    if setting is None:
+        return ConfigError(f"{name}: {message}", hint=f"change the settings of [{name}]")
     # A validator of ours says more than the type does.
-    range_ = allowed(field) if field is not None and first["type"] != "value_error" else ""
-    hint = f"allowed: {range_}" if range_ else message[:1].lower() + message[1:]
-    return ConfigError(f"{name} = {first['input']!r} cannot be used", hint=hint)
+    own = first["type"] == "value_error"
+    hint = message[:1].lower() + message[1:] if own else f"allowed: {setting.allowed}"
+    return ConfigError(f"{setting.name} = {first['input']!r} cannot be used", hint=hint)
 
 
-def _unknown(
-    name: str, prefix: str, siblings: Iterable[str], models: Mapping[str, type[BaseModel]]
-) -> ConfigError:
+def _unknown(name: str, models: Mapping[str, type[BaseModel]]) -> ConfigError:
     """The error for a name that is no setting, with the one that was probably meant."""
-    siblings = list(siblings)
-    hint = suggestion(name, prefix, siblings, models)
-    known = f"known: {', '.join(prefix + known for known in siblings)}; see cleargs settings"
-    return ConfigError(f"there is no setting {prefix}{name}", hint=hint or known)
+    settings = (setting.name for section, model in models.items() for setting in settings_of(section, model))
+    known = dict.fromkeys(place for full in ("seed", *settings) for place in _places(full))
+    return ConfigError(f"there is no setting {name}", hint=suggestion(name, known))
 
 
-def _first_name(model: type[BaseModel], parts: Sequence[str]) -> str:
-    """The first setting of the table at ``parts`` below ``model``."""
-    _, field = _locate(model, parts)
-    inner = model if field is None else inner_model(field) or model
-    return next(iter(inner.model_fields))
-
-
-def _locate(model: type[BaseModel], parts: Sequence[str]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
-    """The model that holds the last of ``parts``, and its field; None where the path leaves the models."""
-    owner: type[BaseModel] | None = model
-    field: FieldInfo | None = None
-    for part in parts:
-        if owner is None:
-            break
-        field = owner.model_fields.get(part)
-        if part != parts[-1]:
-            owner = inner_model(field) if field is not None else None
-    return owner, field
+def _places(name: str) -> Iterator[str]:
+    """The stage of a dotted name, then its tables, then the name."""
+    return accumulate(name.split("."), "{}.{}".format)

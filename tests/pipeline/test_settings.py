@@ -22,7 +22,7 @@ from cleargs.pipeline.config import (
 from cleargs.pipeline.dag import Dag, installed, load_stage
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
-from cleargs.pipeline.settings import SYNONYMS, names_of, settings_of
+from cleargs.pipeline.settings import settings_of
 
 
 @pytest.fixture
@@ -98,28 +98,16 @@ def test_errors_teach(dag: Dag, text: str, cause: str, hint: str) -> None:
 @pytest.mark.parametrize(
     ("text", "hint"),
     [
-        ("g0.iterations=3000", "did you mean g0.steps?"),
-        ("iterations=3000", "did you mean g0.steps?"),
-        ("consolidate.iterations=30", "did you mean consolidate.distil.steps?"),
         ("rivr.steps=30", "did you mean rivr.distil.steps?"),
-        ("ingest.resolution=640", "did you mean ingest.max_size?"),
-        ("g0.max_gaussians=3", "did you mean g0.budget?"),
-        ("random_seed=3", "did you mean seed?"),
+        ("g0.expert=embedded", "did you mean rivr.expert?"),
+        ("sed=3", "did you mean seed?"),
         ("g0.threads=3", "that is an option: --threads"),
     ],
 )
-def test_a_name_from_elsewhere_suggests_by_meaning(text: str, hint: str) -> None:
+def test_a_name_from_elsewhere_is_found(text: str, hint: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_document(installed(), parse_override(text))
     assert error.value.hint == hint
-
-
-def test_every_synonym_leads_to_a_setting() -> None:
-    names = {
-        full.rpartition(".")[2] for name in installed().names for full in names_of(load_stage(name).CONFIG)
-    }
-    assert set(SYNONYMS) <= names | {"seed"}
-    assert not {word for words in SYNONYMS.values() for word in words} & {"steps", "max_size", "budget"}
 
 
 def test_every_setting_has_a_meaning_and_a_range() -> None:
