@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
-from cleargs.progress import LogReporter, Reporter, SilentReporter, SilentTask, Task
+from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
 from cleargs.splat.budget import Quality
 from cleargs.splat.effort import decided
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.uint8] | NDArray[np.float32]
 
-Progress = Reporter | Callable[[str], object] | None
+Progress = Reporter | Say | None
 """Where progress and remarks go: to the logger ``cleargs`` (None), to a function that takes lines, or to a
 `cleargs.progress.Reporter`."""
 
@@ -284,28 +283,12 @@ def evaluate_scene(
         )
 
 
-class _Lines(SilentReporter):
-    """Tells a function, line by line."""
-
-    def __init__(self, say: Callable[[str], object]) -> None:
-        self._say = say
-
-    @contextmanager
-    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        yield SilentTask()
-        self._say(f"{label}: done")
-
-    def info(self, text: str) -> None:
-        self._say(text)
-
-    def warn(self, text: str) -> None:
-        self._say(f"warning: {text}")
-
-
 def _reporter(progress: Progress) -> Reporter:
     if progress is None:
-        return LogReporter()
-    return _Lines(progress) if callable(progress) else progress
+        return log_reporter()
+    if callable(progress):
+        return LineReporter(progress, lambda text: progress(f"warning: {text}"), progress)
+    return progress
 
 
 def _toml(value: Any) -> str:

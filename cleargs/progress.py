@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Protocol
+
+from cleargs.text import printable
+
+Say = Callable[[str], object]
+"""Is told a line."""
 
 PREVIEW = "preview.png"
 """A picture of the work so far, which a stage may leave among its checkpoints."""
@@ -77,6 +83,26 @@ class Rate:
         return (done - begin[1]) / (now - begin[0]) if begin is not None and now > begin[0] else None
 
 
+Show = Callable[[int, str, float | None], None]
+"""Is told of a task: the steps done, the note, and the seconds left."""
+
+
+class CountedTask:
+    """Counted work; each change calls ``show``."""
+
+    def __init__(self, total: int | None, show: Show) -> None:
+        self.done, self.note = 0, ""
+        self._show, self._pace = show, Pace(total)
+
+    def advance(self, steps: int = 1) -> None:
+        self.update(done=self.done + steps)
+
+    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
+        self.done = self.done if done is None else done
+        self.note = self.note if note is None else printable(note)
+        self._show(self.done, self.note, self._pace.seconds_left(self.done, share))
+
+
 class SilentTask:
     """A task nobody watches."""
 
@@ -99,20 +125,26 @@ class SilentReporter:
     def warn(self, text: str) -> None: ...
 
 
-class LogReporter(SilentReporter):
-    """The reporter of the library: remarks go to the logger ``cleargs``, where a program routes them."""
+class LineReporter:
+    """A reporter that passes lines on to functions: remarks, warnings, and each task that is done."""
 
-    def __init__(self, name: str = "cleargs") -> None:
-        self._logger = logging.getLogger(name)
+    def __init__(self, info: Say, warn: Say, done: Say) -> None:
+        self._info, self._warn, self._done = info, warn, done
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         begin = time.monotonic()
         yield SilentTask()
-        self._logger.debug("%s: done in %.1f s", label, time.monotonic() - begin)
+        self._done(f"{label}: done in {time.monotonic() - begin:.1f} s")
 
     def info(self, text: str) -> None:
-        self._logger.info("%s", text)
+        self._info(text)
 
     def warn(self, text: str) -> None:
-        self._logger.warning("%s", text)
+        self._warn(text)
+
+
+def log_reporter() -> LineReporter:
+    """The reporter of the library: lines go to the logger ``cleargs``, where a program routes them."""
+    logger = logging.getLogger("cleargs")
+    return LineReporter(*(partial(log, "%s") for log in (logger.info, logger.warning, logger.debug)))

@@ -10,7 +10,7 @@ import pytest
 
 from cleargs import api, progress
 from cleargs.errors import InputError
-from cleargs.progress import LogReporter, Pace, Rate
+from cleargs.progress import Pace, Rate, log_reporter
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,7 +53,7 @@ def test_no_less_than_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_remarks_of_the_library_are_logged(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reporter = LogReporter()
+    reporter = log_reporter()
     caplog.set_level(logging.DEBUG, "cleargs")
     reporter.info("rva: starts")
     reporter.warn("100 % of %s")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.progress import Pace, Reporter, SilentReporter, Task
+from cleargs.progress import CountedTask, Reporter, SilentReporter, Task
 from cleargs.text import printable
 
 if TYPE_CHECKING:
@@ -26,22 +26,6 @@ def make_reporter(quiet: bool = False) -> Reporter:
     if quiet:
         return QuietReporter()
     return BarReporter() if sys.stderr.isatty() else LineReporter()
-
-
-class CountedTask:
-    """Counted work; each change calls ``show`` with the steps done, the note and the seconds left."""
-
-    def __init__(self, total: int | None, show: Callable[[int, str, float | None], None]) -> None:
-        self.done, self.note = 0, ""
-        self._show, self._pace = show, Pace(total)
-
-    def advance(self, steps: int = 1) -> None:
-        self.update(done=self.done + steps)
-
-    def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
-        self.done = self.done if done is None else done
-        self.note = self.note if note is None else printable(note)
-        self._show(self.done, self.note, self._pace.seconds_left(self.done, share))
 
 
 class QuietReporter(SilentReporter):

@@ -9,9 +9,7 @@ from typing import cast
 
 from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
-
-Say = Callable[[str], None]
-
+from cleargs.progress import Say
 
 def _same_pace(say: Say | None) -> float:
     return 1.0

@@ -16,7 +16,7 @@ from pydantic import Field
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.pipeline.store import writer_lives
-from cleargs.progress import PREVIEW, Pace, Reporter, Task
+from cleargs.progress import PREVIEW, CountedTask, Reporter, Show, Task
 from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
 
@@ -86,45 +86,33 @@ class _NotingReporter:
     """Passes on, and notes the task that advanced last."""
 
     def __init__(self, reporter: Reporter, path: Path, first: AtWork) -> None:
-        self._reporter, self._path = reporter, path
+        self._reporter, self._path, self._first = reporter, path, first
         self.info, self.warn = reporter.info, reporter.warn
-        self.write(first)
+        self._write(first)
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
+        def show(done: int, note: str, left: float | None) -> None:
+            if time.monotonic() - self._noted >= EVERY:
+                now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
+                self._write(self._first.model_copy(update=now))
+
         with self._reporter.task(label, total) as task:
-            state = self._state.model_copy(update={"label": label, "total": total, "done": 0, "note": ""})
-            yield _NotingTask(task, state, self)
+            yield _NotingTask(task, total, show)
 
-    def tell(self, state: AtWork) -> None:
-        """Note ``state``, unless the last note is too young."""
-        if time.monotonic() - self._noted >= EVERY:
-            self.write(state)
-
-    def write(self, state: AtWork) -> None:
-        """Note ``state``."""
-        self._state, self._noted = state, time.monotonic()
+    def _write(self, state: AtWork) -> None:
+        self._noted = time.monotonic()
         with suppress(StoreError):
             write_json(self._path, state.model_dump())
 
 
-class _NotingTask:
+class _NotingTask(CountedTask):
     """One task, passed on and noted."""
 
-    def __init__(self, task: Task, state: AtWork, reporter: _NotingReporter) -> None:
-        self._task, self._state, self._reporter, self._pace = task, state, reporter, Pace(state.total)
-
-    def advance(self, steps: int = 1) -> None:
-        self._task.advance(steps)
-        self._tell(None, done=self._state.done + steps)
+    def __init__(self, task: Task, total: int | None, show: Show) -> None:
+        super().__init__(total, show)
+        self._task = task
 
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         self._task.update(done=done, note=note, share=share)
-        changes = {"done": done, "note": note}
-        self._tell(share, **{name: value for name, value in changes.items() if value is not None})
-
-    def _tell(self, share: float | None, **changes: object) -> None:
-        state = self._state.model_copy(update=changes)
-        left = self._pace.seconds_left(state.done, share)
-        self._state = state.model_copy(update={"seconds_left": left})
-        self._reporter.tell(self._state)
+        super().update(done=done, note=note, share=share)
