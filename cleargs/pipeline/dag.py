@@ -11,6 +11,7 @@ from cleargs.errors import InputError, did_you_mean
 from cleargs.pipeline.stage import Stage
 from cleargs.progress import Say
 
+
 def _same_pace(say: Say | None) -> float:
     return 1.0
 
