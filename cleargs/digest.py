@@ -22,9 +22,10 @@ RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
 
 
-def canonical_json(value: Any) -> str:
-    """JSON with sorted keys and no spaces: equal values give equal text. NaN and infinities are refused."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+def json_digest(value: Any) -> str:
+    """sha256 of ``value`` as JSON with sorted keys and no spaces; NaN and infinities are refused."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def file_digest(path: Path) -> str:
@@ -35,7 +36,7 @@ def file_digest(path: Path) -> str:
 
 def tree_digest(files: Mapping[str, str]) -> str:
     """One digest for many files: ``files`` maps each relative path (POSIX) to the digest of its content."""
-    return hashlib.sha256(canonical_json(dict(files)).encode()).hexdigest()
+    return json_digest(dict(files))
 
 
 def files_under(path: Path) -> dict[str, Path]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic_core import to_jsonable_python
+
 import cleargs
-from cleargs.digest import DigestMemo, canonical_json
+from cleargs.digest import DigestMemo, json_digest
 from cleargs.files import is_partial, write_json
 from cleargs.record import Record
 from cleargs.untrusted import FAULTS, read_json
@@ -45,7 +45,7 @@ class KeyParts(Record):
     @property
     def key(self) -> str:
         """sha256 of the canonical JSON, hexadecimal."""
-        return hashlib.sha256(canonical_json(self.model_dump(mode="json")).encode()).hexdigest()
+        return json_digest(self.model_dump(mode="json"))
 
 
 class FileRecord(Record):
@@ -91,10 +91,6 @@ class Manifest(Record):
         """Size of all files together."""
         return sum(record.size for record in self.files.values())
 
-    def is_part(self, name: str, paths: Iterable[str]) -> bool:
-        """Whether the file ``name`` is one of ``paths``, or in a folder of them."""
-        return any(name == path or name.startswith(path.rstrip("/") + "/") for path in paths)
-
     def under(self, path: str) -> dict[str, str]:
         """Digests of the file ``path``, or of all files in the folder ``path``; empty without either."""
         if path in self.files:
@@ -115,7 +111,7 @@ def versions() -> dict[str, str]:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write ``manifest`` into ``folder`` atomically, sealed by a digest of its own content."""
     content = manifest.model_dump(mode="json")
-    write_json(folder / MANIFEST, {**content, "seal": _seal(content)})
+    write_json(folder / MANIFEST, {**content, "seal": json_digest(content)})
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -126,7 +122,7 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         content = read_json(folder / MANIFEST)
         seal = content.pop("seal")
-        if seal != _seal(content):
+        if seal != json_digest(content):
             raise ValueError("the manifest was changed")
         return Manifest.model_validate(content)
     except FileNotFoundError:
@@ -162,18 +158,14 @@ def published_files(folder: Path) -> dict[str, Path]:
     }
 
 
-def damage(folder: Path, manifest: Manifest, memo: DigestMemo) -> str | None:
-    """Why the files in ``folder`` are not those of ``manifest``, or None when they are.
-
-    Sizes are always read; digests come through ``memo``, and one that differs is computed afresh first.
-    """
-    return next(damages(folder, manifest, manifest.files, memo), None)
-
-
 def damages(
     folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, afresh: bool = False
 ) -> Iterator[str]:
-    """What is wrong with the files ``names`` in ``folder``; with ``afresh`` each of them is read."""
+    """What makes the files ``names`` in ``folder`` others than those of ``manifest``.
+
+    Sizes are always read; digests come through ``memo``, and one that differs is computed again first. With
+    ``afresh`` each file is read.
+    """
     for name in names:
         record, file = manifest.files[name], folder / name
         try:
@@ -194,18 +186,8 @@ def damages(
 
 def plain_json(value: Any) -> Any:
     """``value`` as JSON holds it: numpy scalars as numbers, tuples as lists, NaN and infinities as null."""
-    if isinstance(value, Mapping):
-        return {str(name): plain_json(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain_json(item) for item in value]
-    if hasattr(value, "tolist"):  # numpy arrays and scalars, torch tensors
-        return plain_json(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    return str(value)
 
+    def plain(unknown: Any) -> Any:
+        return unknown.tolist() if hasattr(unknown, "tolist") else str(unknown)
 
-def _seal(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(canonical_json(content).encode()).hexdigest()
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=plain)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from benchmarks.comparison.choices import Choice, Choices, judge_choices
 from benchmarks.comparison.roles import Roles, count_roles
 from benchmarks.comparison.scenes import EVALUATION_VERSION, Made, Recipe, judge
 from benchmarks.comparison.tables import Results
-from cleargs.digest import canonical_json
+from cleargs.digest import json_digest
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import write_bytes
@@ -132,7 +131,7 @@ def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
         "truth": store.memo.digests_of(truth),
         "metrics": sorted(distances),
     }
-    path = out / "choices" / f"{hashlib.sha256(canonical_json(parts).encode()).hexdigest()}.json"
+    path = out / "choices" / f"{json_digest(parts)}.json"
     try:
         rows = TypeAdapter(tuple[Choice, ...]).validate_json(read_bytes(path))
     except (OSError, ValidationError):  # not made yet, or damaged

@@ -7,7 +7,6 @@ by content in ``OUT/evaluations``.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,7 +18,7 @@ from pydantic import ValidationError
 from benchmarks.comparison.cells import Cell, ViewSet
 from benchmarks.comparison.equal_work import Work, decide_work, variant_config
 from benchmarks.comparison.variants import Variant
-from cleargs.digest import canonical_json
+from cleargs.digest import json_digest
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation
@@ -291,7 +290,7 @@ def evaluated(
         "poses": view_set.poses,
         "options": recipe.options.model_dump(mode="json"),
     }
-    folder = out / "evaluations" / hashlib.sha256(canonical_json(parts).encode()).hexdigest()
+    folder = out / "evaluations" / json_digest(parts)
     path = folder / "eval.json"
     try:
         kept = Evaluation.model_validate_json(read_bytes(path))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
@@ -194,7 +194,7 @@ class Runner:
         for upstream, paths in self.dag.load(name).INPUTS.items():
             manifest = done[upstream]
             folder = self.store.folder(upstream, manifest.key)
-            names = [file for file in manifest.files if manifest.is_part(file, paths)]
+            names = [str(PurePosixPath(path, file)) for path in paths for file in manifest.under(path)]
             damaged = next(damages(folder, manifest, names, self.store.memo, afresh=True), None)
             if damaged is not None:
                 raise StoreError(

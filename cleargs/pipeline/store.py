@@ -30,7 +30,7 @@ from cleargs.files import disk_error, is_partial, sync, sync_tree, write_bytes
 from cleargs.manifest import (
     MANIFEST,
     Manifest,
-    damage,
+    damages,
     hidden_link,
     read_manifest,
     write_manifest,
@@ -123,7 +123,7 @@ class Store:
             return Entry(folder, None, str(error))
         if manifest.key != key or manifest.stage != stage:
             return Entry(folder, None, "the manifest belongs to another folder")
-        return Entry(folder, manifest, damage(folder, manifest, self.memo))
+        return Entry(folder, manifest, next(damages(folder, manifest, manifest.files, self.memo), None))
 
     # -- working ---------------------------------------------------------------------------------------
 
