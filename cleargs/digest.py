@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from cleargs.errors import InputError
@@ -68,9 +67,7 @@ class DigestMemo:
     def __enter__(self) -> DigestMemo:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.flush()
         if self._database is not None:
             self._database.close()

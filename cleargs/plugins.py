@@ -10,7 +10,6 @@ version of its distribution alone: that version enters the key of every stage wh
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from typing import Any, Literal
 
@@ -27,49 +26,30 @@ def installed_version(distribution: str) -> str:
         return "absent"
 
 
-@dataclass(frozen=True)
-class Plugin:
-    """A part that another package brings."""
-
-    name: str
-    entry: EntryPoint
-
-    @property
-    def distribution(self) -> tuple[str, str]:
-        """Name and version of the package."""
-        found = self.entry.dist
-        return ("unknown", "unknown") if found is None else (found.name, found.version)
-
-    def load(self) -> Any:
-        """What the entry point names. Raises InputError where it cannot be imported."""
-        try:
-            return self.entry.load()
-        except Exception as error:
-            package, version = self.distribution
-            raise InputError(
-                f"{self.name} of {package} {version} cannot be loaded: {type(error).__name__}: {error}",
-                hint=f"repair or uninstall {package}, or name another part",
-            ) from error
-
-
-def plugins(socket: Socket) -> dict[str, Plugin]:
+def plugins(socket: Socket) -> dict[str, EntryPoint]:
     """Name -> part that the installed packages bring for a socket; of two of a name, the first by package."""
-    found = entry_points(group=f"cleargs.{socket}")
-    parts = sorted((Plugin(entry.name, entry) for entry in found), key=lambda part: part.distribution)
-    return {part.name: part for part in reversed(parts)}
+    parts = sorted(entry_points(group=f"cleargs.{socket}"), key=package_of, reverse=True)
+    return {part.name: part for part in parts}
 
 
-def plugin(socket: Socket, name: str) -> Plugin | None:
-    """The part of that name; None where no package brings one."""
-    return plugins(socket).get(name)
+def package_of(part: EntryPoint) -> tuple[str, str]:
+    """Name and version of the package that brings ``part``."""
+    return ("unknown", "unknown") if part.dist is None else (part.dist.name, part.dist.version)
 
 
 def load_part(socket: Socket, name: str) -> Any:
     """What the entry point of that name refers to. Raises InputError where there is none, or it is broken."""
-    found = plugin(socket, name)
-    if found is None:
+    part = plugins(socket).get(name)
+    if part is None:
         raise InputError(f"no installed package brings {name!r}", hint=f"install it: cleargs.{socket}")
-    return found.load()
+    try:
+        return part.load()
+    except Exception as error:
+        package, version = package_of(part)
+        raise InputError(
+            f"{name} of {package} {version} cannot be loaded: {type(error).__name__}: {error}",
+            hint=f"repair or uninstall {package}, or name another part",
+        ) from error
 
 
 def require_known(socket: Socket, name: str, shipped: Iterable[str]) -> str:

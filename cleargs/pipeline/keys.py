@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from cleargs.manifest import KeyParts
 from cleargs.pipeline.stage import Device, Stage
-from cleargs.plugins import Socket, installed_version, plugin
+from cleargs.plugins import Socket, installed_version, package_of, plugins
 
 UPSTREAM = "of "
 """How the name of a table begins that holds the settings of another stage."""
@@ -60,9 +60,9 @@ def plugin_versions(config: BaseModel, prefix: str = "") -> dict[str, str]:
         if isinstance(value, BaseModel):
             versions |= plugin_versions(value, f"{prefix}{name}.")
         elif isinstance(extra, dict) and "plugin" in extra and value != field.default:
-            found = plugin(cast(Socket, extra["plugin"]), value)
+            found = plugins(cast(Socket, extra["plugin"])).get(value)
             if found is not None:
-                distribution, version = found.distribution
+                distribution, version = package_of(found)
                 versions[f"{distribution} for {prefix}{name}={value}"] = version
     return versions
 
