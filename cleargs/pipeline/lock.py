@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from cleargs.files import disk_error
+from cleargs.files import disk_errors
 from cleargs.progress import Reporter
 
 
@@ -22,11 +22,9 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     while True:
-        try:
+        with disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except OSError as error:
-            raise disk_error(error, path) from error
         try:
             held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
             if held and not _still_there(path, handle):

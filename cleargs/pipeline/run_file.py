@@ -10,7 +10,7 @@ from typing import Any, TypeGuard, cast
 import tomli_w
 
 from cleargs.errors import ConfigError, InputError
-from cleargs.files import disk_error, write_bytes
+from cleargs.files import disk_errors, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import settings
@@ -49,12 +49,10 @@ class Run:
 def write_run_file(run: Run) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
     path, text = run.folder / RUN_FILE, _text(run).encode()
-    try:
+    with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:
             write_bytes(path, text)
-    except OSError as error:
-        raise disk_error(error, path) from error
 
 
 def _text(run: Run) -> str:

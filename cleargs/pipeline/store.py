@@ -26,7 +26,7 @@ from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import StoreError
-from cleargs.files import disk_error, is_partial, sync, sync_tree, write_bytes
+from cleargs.files import disk_errors, is_partial, sync, sync_tree, write_bytes
 from cleargs.manifest import (
     MANIFEST,
     Manifest,
@@ -47,6 +47,10 @@ ROOTS = "roots"
 
 SECONDS = "seconds"
 """File in a work folder: how long the tries before took."""
+
+
+Kind = Literal["finished", "unfinished", "kept", "rubbish"]
+"""What a folder holds that nothing needs."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +190,7 @@ class Store:
         try. What a partial ``entry`` already holds is carried over once.
         """
         work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
-        try:
+        with disk_errors(work.folder):
             if not alone:
                 left, work = work, Work(work.folder.with_name(work.folder.name + self._own()))
                 with suppress(OSError):  # nothing is there, or another process took it
@@ -200,8 +204,6 @@ class Store:
             for file in work.checkpoints.rglob("*"):
                 if is_partial(file) and not file.is_dir():
                     file.unlink()
-        except OSError as error:
-            raise disk_error(error, work.folder) from error
         return work
 
     def publish(self, work: Work, manifest: Manifest) -> Manifest:
@@ -211,7 +213,7 @@ class Store:
         returned. A partial, damaged or differing one makes room.
         """
         final = self.folder(manifest.stage, manifest.key)
-        try:
+        with disk_errors(final):
             write_manifest(work.out, manifest)
             sync_tree(work.out)
             final.parent.mkdir(parents=True, exist_ok=True)
@@ -231,8 +233,6 @@ class Store:
                 self.discard(work.folder)
                 return winner.usable
             sync(final.parent)
-        except OSError as error:
-            raise disk_error(error, final) from error
         for name, record in manifest.files.items():
             self.memo.remember(final / name, record.digest)
         if not manifest.missing:
@@ -244,12 +244,8 @@ class Store:
         """Take ``folder`` away in one step, then delete it at leisure."""
         rubbish = self.root / "work" / f".rubbish-{folder.name}-{os.getpid()}"
         rubbish.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with disk_errors(folder), suppress(FileNotFoundError):
             folder.rename(rubbish)
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise disk_error(error, folder) from error
         shutil.rmtree(rubbish, ignore_errors=True)
 
     def kept(self, stage: str) -> Path:
@@ -271,13 +267,11 @@ class Store:
                 f"{link} is a folder, not a link into the store", hint="move it away, or choose another -o"
             )
         temporary = run / f".{stage}.link-{os.getpid()}"
-        try:
+        with disk_errors(link):
             temporary.unlink(missing_ok=True)
             temporary.symlink_to(target)
             temporary.replace(link)
             hidden_link(run, stage).unlink(missing_ok=True)
-        except OSError as error:
-            raise disk_error(error, link) from error
 
     def unlink(self, run: Path, stage: str) -> None:
         """Let ``RUN/<stage>`` show nothing. What it showed stays in the store, and known to `last_shown`."""
@@ -291,11 +285,9 @@ class Store:
         name = hashlib.sha256(str(run).encode()).hexdigest()[:16]
         note = self.root / ROOTS / name
         if not note.exists() and not self._only_readable():
-            try:
+            with disk_errors(note):
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
-            except OSError as error:
-                raise disk_error(error, note) from error
 
     # -- clearing --------------------------------------------------------------------------------------
 
@@ -314,22 +306,22 @@ class Store:
                     hint="when no run works there, delete the folders that --dry-run lists",
                 )
             linked = self._linked(stages)
-            found = [
-                Garbage(folder, "finished", _size(folder))
+            folders: list[tuple[Path, Kind]] = [
+                (folder, "finished")
                 for stage in stages
                 for folder in sorted((self.root / stage).glob("*"))
                 if folder.resolve() not in linked
             ]
             for folder in sorted((self.root / "work").glob("*")):
-                if folder.name.startswith(".rubbish-"):
-                    found.append(Garbage(folder, "rubbish", _size(folder)))
-                elif checkpoints:
-                    found.append(Garbage(folder, "unfinished", _size(folder)))
-            if checkpoints:
-                found += [
-                    Garbage(folder, "kept", _size(folder))
-                    for folder in sorted((self.root / "kept").glob("*"))
-                ]
+                folders.append((folder, "rubbish" if folder.name.startswith(".rubbish-") else "unfinished"))
+            folders += [(folder, "kept") for folder in sorted((self.root / "kept").glob("*"))]
+            found = [
+                Garbage(
+                    folder, kind, sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+                )
+                for folder, kind in folders
+                if checkpoints or kind in ("finished", "rubbish")
+            ]
             if not dry_run:
                 for garbage in found:
                     self.discard(garbage.folder)
@@ -351,7 +343,7 @@ class Garbage:
     """A folder that nothing needs."""
 
     folder: Path
-    kind: Literal["finished", "unfinished", "kept", "rubbish"]
+    kind: Kind
     bytes: int
 
 
@@ -359,10 +351,6 @@ def writer_lives(work: Path) -> bool:
     """Return True if a process works in the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
     return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")
-
-
-def _size(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
 def _keep_only(out: Path, patterns: Sequence[str]) -> None:
