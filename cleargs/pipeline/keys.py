@@ -81,33 +81,35 @@ def differences(
     lines = []
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
-    old_settings, new_settings = dict(settings(old.config)), dict(settings(new.config))
-    for name in sorted(old_settings.keys() | new_settings.keys()):
-        before, after = old_settings.get(name, "(none)"), new_settings.get(name, "(none)")
-        if before != after:
-            own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
-            lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
-    for where, before, after in (
-        ("input", _input_digests(old), _input_digests(new)),
-        ("external", old.externals, new.externals),
-    ):
-        for name in sorted(before.keys() | after.keys()):
-            if before.get(name) != after.get(name):
-                changed = _changed_files(old_files.get(name, {}), new_files.get(name, {}))
-                lines.append(f"{where} {name}{changed}")
-    for name in sorted(old.libraries.keys() | new.libraries.keys()):
-        before, after = old.libraries.get(name, "(none)"), new.libraries.get(name, "(none)")
-        if before != after:
-            lines.append(f"library {name}: {before} -> {after}")
+    for name, before, after in _changes(dict(settings(old.config)), dict(settings(new.config))):
+        own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
+        lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
+    inputs = [("input", name) for name, _, _ in _changes(_input_digests(old), _input_digests(new))]
+    externals = [("external", name) for name, _, _ in _changes(old.externals, new.externals)]
+    for where, name in inputs + externals:
+        lines.append(f"{where} {name}{_changed_files(old_files.get(name, {}), new_files.get(name, {}))}")
+    for name, before, after in _changes(old.libraries, new.libraries):
+        lines.append(f"library {name}: {before} -> {after}")
     for name in ("seed", "device", "precision", "schema_version"):
         if getattr(old, name) != getattr(new, name):
             lines.append(f"{name.replace('_', ' ')}: {getattr(old, name)} -> {getattr(new, name)}")
     return lines
 
 
-def _input_digests(parts: KeyParts) -> dict[str, str | None]:
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Name, value before and value after of each entry that differs; "(none)" where it is not there."""
+    for name in sorted(old.keys() | new.keys()):
+        before, after = old.get(name, "(none)"), new.get(name, "(none)")
+        if before != after:
+            yield name, before, after
+
+
+def _input_digests(parts: KeyParts) -> dict[str, str]:
     return {
-        f"{stage}/{path}": digest for stage, paths in parts.inputs.items() for path, digest in paths.items()
+        f"{stage}/{path}": digest
+        for stage, paths in parts.inputs.items()
+        for path, digest in paths.items()
+        if digest is not None
     }
 
 
@@ -126,7 +128,7 @@ def _show(value: Any) -> str:
 
 def _changed_files(old: Mapping[str, str], new: Mapping[str, str], limit: int = 3) -> str:
     """The first few changed files as ": a.png changed, b.png added"; " changed" for a single file."""
-    names = sorted(name for name in old.keys() | new.keys() if name and old.get(name) != new.get(name))
+    names = [name for name, _, _ in _changes(old, new) if name]
     if not names:
         return " changed"
     words = {(True, True): "changed", (True, False): "removed", (False, True): "added"}

@@ -6,6 +6,7 @@ import resource
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -83,7 +84,6 @@ class Planner:
     store: Store
     threads: int
     reporter: Reporter
-    _pace: float | None = field(default=None, repr=False)
     _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
     def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
@@ -107,17 +107,11 @@ class Planner:
             libraries=library_versions(stage, self.run.device) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
-        inherited = tuple(
-            dict.fromkeys(
-                line
-                for upstream in stage.INPUTS
-                for line in (
-                    *done[upstream].inherited,
-                    *(f"{upstream}: {missing}" for missing in done[upstream].missing),
-                )
-            )
-        )
-        return Recipe(parts, origins, self._externals(name), folders, inherited)
+        inherited: dict[str, None] = {}  # in order, each once
+        for upstream in stage.INPUTS:
+            inherited |= dict.fromkeys(done[upstream].inherited)
+            inherited |= dict.fromkeys(f"{upstream}: {missing}" for missing in done[upstream].missing)
+        return Recipe(parts, origins, self._externals(name), folders, tuple(inherited))
 
     def inputs(
         self, name: str, done: Mapping[str, Manifest]
@@ -164,12 +158,10 @@ class Planner:
         changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
-    @property
+    @cached_property
     def pace(self) -> float:
         """By which estimates are multiplied: this machine's time over that of the one they were made on."""
-        if self._pace is None:
-            self._pace = self.dag.pace(None)
-        return self._pace
+        return self.dag.pace(None)
 
     def at_measured_pace(self, plans: list[StagePlan]) -> list[StagePlan]:
         """``plans`` with the costs on this machine, whose pace is measured now unless it is known.
@@ -179,8 +171,8 @@ class Planner:
         costs = [plan.estimate.minutes for plan in plans if plan.estimate is not None]
         if self.run.device != "cpu" or sum(costs) < WORTH_MEASURING_MIN:
             return plans
-        before, self._pace = self.pace, self.dag.pace(self.reporter.info)
-        factor = self._pace / before
+        before, self.pace = self.pace, self.dag.pace(self.reporter.info)
+        factor = self.pace / before
         return [
             plan if plan.estimate is None else replace(plan, estimate=plan.estimate.at_pace(factor))
             for plan in plans
@@ -278,10 +270,8 @@ class Planner:
             recipe = self.recipe(name, done)
             entry = self.store.find(name, recipe.key)
             usable = entry.usable if entry is not None else None
-            if name in force:
-                plans.append(StagePlan(name, "missing", ("forced",), self.estimate(name, done), recipe))
-            elif usable is None:
-                reasons = self.reasons(recipe, entry)
+            if name in force or usable is None:
+                reasons = ("forced",) if name in force else self.reasons(recipe, entry)
                 plans.append(StagePlan(name, "missing", reasons, self.estimate(name, done), recipe))
             elif usable.missing:
                 plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), recipe))

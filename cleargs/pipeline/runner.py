@@ -35,7 +35,6 @@ from cleargs.pipeline.plan import (
     redo_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_place, write_run_file
-from cleargs.pipeline.stage import StageResult
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
@@ -225,9 +224,8 @@ class Runner:
             "cpu_seconds": round(usage.cpu_seconds, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
         }
-        if any(
-            recipe.origins[role] != digests for role, digests in self.planner.external_digests(name).items()
-        ):
+        now = self.planner.external_digests(name)
+        if now != {role: recipe.origins[role] for role in now}:
             self.store.discard(work.folder)
             raise StageError(
                 f"the input changed while {name} was reading it", hint="the same command starts it again"
@@ -239,30 +237,12 @@ class Runner:
                     f"{name} ended without its outputs {', '.join(absent)}",
                     hint=f"this is a fault of the stage; please report it with {self.run.folder / RUN_FILE}",
                 )
-        manifest = self._manifest(recipe, result, work.out, started, cost)
-        published = self.store.publish(work, manifest)
-        if forced and entry is not None and entry.manifest is not None:
-            if entry.manifest.digest == manifest.digest:
-                self.reporter.info(f"{name}: made again, with the same digests")
-            else:
-                self.reporter.warn(f"{name}: made again, with other digests than before")
-        # An equal result that was there already keeps its own times; this outcome tells those of today.
-        return published.model_copy(update=dict(cost))
-
-    def _manifest(
-        self,
-        recipe: Recipe,
-        result: StageResult,
-        out: Path,
-        started: datetime,
-        cost: Mapping[str, float],
-    ) -> Manifest:
         files = {
             name: FileRecord(size=file.stat().st_size, digest=file_digest(file))
-            for name, file in published_files(out).items()
+            for name, file in published_files(work.out).items()
         }
-        return Manifest(
-            stage=recipe.parts.stage,
+        manifest = Manifest(
+            stage=name,
             key=recipe.key,
             status="partial" if result.missing or recipe.inherited else "complete",
             missing=result.missing,
@@ -273,12 +253,18 @@ class Runner:
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            seconds=cost["seconds"],
-            cpu_seconds=cost["cpu_seconds"],
-            peak_memory_gb=cost["peak_memory_gb"],
             device=self.run.device,
             summary=plain_json(result.summary),
+            **cost,
         )
+        published = self.store.publish(work, manifest)
+        if forced and entry is not None and entry.manifest is not None:
+            if entry.manifest.digest == manifest.digest:
+                self.reporter.info(f"{name}: made again, with the same digests")
+            else:
+                self.reporter.warn(f"{name}: made again, with other digests than before")
+        # An equal result that was there already keeps its own times; this outcome tells those of today.
+        return published.model_copy(update=dict(cost))
 
     def _with_inherited(self, manifest: Manifest, inherited: tuple[str, ...]) -> Manifest:
         """``manifest`` saying what is missing upstream *now*.
