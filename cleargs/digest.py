@@ -14,8 +14,7 @@ from typing import Any
 
 from cleargs.errors import InputError
 from cleargs.files import External
-from cleargs.text import is_utf8
-from cleargs.untrusted import open_regular
+from cleargs.untrusted import open_regular, require_utf8
 
 RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
@@ -143,12 +142,6 @@ def named_files(place: External) -> dict[str, Path]:
     if isinstance(place, Mapping):
         return dict(place)
     return files_under(place) if place.is_dir() else {"": place}
-
-
-def require_utf8(path: Path) -> None:
-    """Raise InputError where the name of ``path`` is not UTF-8: no table or manifest could hold it."""
-    if not is_utf8(str(path)):
-        raise InputError(f"the name of {path} is not UTF-8", hint="rename it")
 
 
 def _state(path: Path) -> tuple[str, tuple[int, int, int, int]]:

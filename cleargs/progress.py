@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Protocol
 
-from cleargs.text import printable
+from cleargs.untrusted import printable
 
 Say = Callable[[str], object]
 """Is told a line."""

@@ -1,4 +1,5 @@
-"""Files that somebody else wrote: opened only where they are regular, read only up to a stated size.
+"""Files that somebody else wrote: opened only where they are regular, read only up to a stated size, and
+their text made harmless for a terminal.
 
 A FIFO or a device in place of a file would block its reader, or never end; a size, a count or a depth that a
 file only claims would take all memory.
@@ -11,9 +12,12 @@ import json
 import os
 import stat
 import struct
+import unicodedata
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
+
+from cleargs.errors import InputError
 
 MAX_BYTES = 4 * 2**30
 """Most bytes of a file that is read as a whole (an image, a sparse model, a scene, a network)."""
@@ -33,6 +37,13 @@ FAULTS: tuple[type[Exception], ...] = (
 )
 """What decoding a file of the wrong form may raise. Readers catch these where they say what they read."""
 
+
+_HARMFUL = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode categories that a terminal acts on, or cannot show: control characters, halves of surrogates, line
+and paragraph separators."""
+
+_BIDI = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+"""They reorder what stands around them, so that a name may read as another."""
 
 TOO_DEEP = "it is nested too deeply"
 
@@ -95,3 +106,29 @@ def cause(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"{error.args[0]!r} is missing" if error.args else "something is missing"
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def printable(text: str, keep: str = "") -> str:
+    r"""``text`` with control, bidirectional and undecodable characters (but those in ``keep``) as ``\u001b``.
+
+    Names come from files: an escape sequence in one could write the clipboard, clear the screen or forge a
+    line. The form is JSON's, so that escaped JSON is the same document.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        character if character in keep or not _acts(character) else f"\\u{ord(character):04x}"
+        for character in text
+    )
+
+
+def _acts(character: str) -> bool:
+    return unicodedata.category(character) in _HARMFUL or character in _BIDI
+
+
+def require_utf8(path: Path | str) -> None:
+    """Raise InputError where the name of ``path`` is not UTF-8: no table and no report could hold it."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"the name of {path} is not UTF-8", hint="rename it") from error

@@ -237,10 +237,12 @@ def quality(
     from benchmarks.speed.quality_cost import QualityPlan, run
     from benchmarks.speed.quality_report import plot_quality, quality_markdown
     from cleargs.files import write_bytes, write_json
-    from cleargs.pipeline.config import named_value
+    from cleargs.pipeline.config import parse_override
+    from cleargs.pipeline.keys import settings
     from cleargs.splat.kernels.cpu.backend import warm_up
 
-    plan = QualityPlan(captures, qualities, dict(map(named_value, overrides)), until, threads_or_all(threads))
+    changed = dict(item for text in overrides for item in settings(parse_override(text)))
+    plan = QualityPlan(captures, qualities, changed, until, threads_or_all(threads))
     warm_up()
     benchmark = run(plan, out, make_reporter(quiet))
     text, values = quality_markdown(benchmark), benchmark.as_json()

@@ -12,9 +12,9 @@ from importlib import import_module
 import click
 
 import cleargs
-from cleargs.errors import CleargsError, InputError
+from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag, installed
-from cleargs.text import is_utf8, printable
+from cleargs.untrusted import printable, require_utf8
 
 INTERRUPTED = 130
 
@@ -121,7 +121,8 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
-        _check_names(arguments)
+        for argument in arguments:
+            require_utf8(argument)
         code = program.main(arguments, prog_name=program.name, standalone_mode=False, obj=dag or installed())
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
@@ -143,13 +144,6 @@ def invoke(arguments: list[str], dag: Dag | None = None, program: click.Group = 
 def _interrupted() -> int:
     click.echo("interrupted; finished work is kept, and the same command resumes from there", err=True)
     return INTERRUPTED
-
-
-def _check_names(arguments: Sequence[str]) -> None:
-    """Raise InputError for an argument that is not UTF-8: no table, manifest or report could hold it."""
-    for argument in arguments:
-        if not is_utf8(argument):
-            raise InputError(f"the name of {argument} is not UTF-8", hint="rename it")
 
 
 def explanation(error: Exception) -> tuple[int, str, str]:

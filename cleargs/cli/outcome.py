@@ -12,7 +12,7 @@ import click
 from cleargs.cli.common import print_json
 from cleargs.pipeline.plan import StagePlan, cost_line
 from cleargs.pipeline.runner import Outcome
-from cleargs.text import printable
+from cleargs.untrusted import printable
 
 DONE_IN_PART = 3
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cleargs.progress import CountedTask, Reporter, SilentReporter, Task
-from cleargs.text import printable
+from cleargs.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -11,7 +11,7 @@ import threading
 import time
 from types import FrameType
 
-from cleargs.text import printable
+from cleargs.untrusted import printable
 
 GRACE_S = 1.0
 """Time that the ordinary way out may take after Ctrl-C."""

@@ -103,23 +103,17 @@ def parse_toml(text: str, name: str) -> Document:
         ) from error
 
 
-def named_value(text: str) -> tuple[str, Any]:
-    """``a.b=value`` as name and value. The value is TOML; what is no TOML value is taken as a string."""
+def parse_override(text: str) -> Document:
+    """``a.b=value`` as a document. The value is TOML; what is no TOML value is taken as a string."""
     name, equals, value = text.partition("=")
     parts = [part.strip() for part in name.split(".")]
     if not equals or not all(parts):
         raise ConfigError(
             f"--set {text!r} is not of the form a.b=value", hint="write --set rva.tau_R=0.7, say"
         )
-    return ".".join(parts), _toml_value(value.strip())
-
-
-def parse_override(text: str) -> Document:
-    """``a.b=value`` as a document."""
-    name, document = named_value(text)
-    for part in reversed(name.split(".")):
+    document = {parts.pop(): _toml_value(value.strip())}
+    for part in reversed(parts):
         document = {part: document}
-    assert isinstance(document, dict)
     return document
 
 

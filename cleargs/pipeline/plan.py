@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from cleargs.digest import require_utf8, tree_digest
+from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
@@ -20,6 +20,7 @@ from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store
 from cleargs.progress import Reporter
+from cleargs.untrusted import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
 """What the libraries reserve before any work is done."""
