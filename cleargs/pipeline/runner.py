@@ -129,15 +129,10 @@ class Runner:
             self.store.add_root(self.run.folder)
             self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
-                if upstream in self._all_upstream(name):
-                    done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
+                done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
             outcome = self._bring(name, done, forced=force)
             self._unlink_outdated()
         return outcome
-
-    def _all_upstream(self, name: str) -> set[str]:
-        direct = set(self.dag.load(name).INPUTS)
-        return direct.union(*(self._all_upstream(upstream) for upstream in direct))
 
     def _finished(
         self, upstream: str, done: Mapping[str, Manifest], name: str, *, allow_partial: bool

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 from contextlib import suppress
 from pathlib import Path
 
-_STATUS = Path("/proc/self/status")
-_CLEAR = Path("/proc/self/clear_refs")
-_RESET_PEAK = "5"
 _UNIT = 1 if sys.platform == "darwin" else 1024  # bytes of a unit of ru_maxrss
 
 
@@ -22,9 +20,8 @@ class Usage:
 
     def __init__(self) -> None:
         with suppress(OSError):
-            _CLEAR.write_text(_RESET_PEAK)
-        self._before = _cpu_seconds()
-        self._children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+            Path("/proc/self/clear_refs").write_text("5")  # sets the mark back
+        self._before, self._children = _cpu_seconds(), _children_peak()
 
     @property
     def cpu_seconds(self) -> float:
@@ -34,11 +31,8 @@ class Usage:
     @property
     def peak_memory_gb(self) -> float:
         """Largest resident memory, GB (1e9 bytes); a child counts where it was larger than any before."""
-        peak = _high_water()
-        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        if children > self._children:
-            peak = max(peak, children * _UNIT)
-        return peak / 1e9
+        children = _children_peak()
+        return max(_own_peak(), children if children > self._children else 0) / 1e9
 
 
 def _cpu_seconds() -> float:
@@ -46,10 +40,14 @@ def _cpu_seconds() -> float:
     return sum(used.ru_utime + used.ru_stime for used in both)
 
 
-def _high_water() -> int:
+def _children_peak() -> int:
+    """Bytes."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * _UNIT
+
+
+def _own_peak() -> int:
     """Bytes."""
     with suppress(OSError):
-        for line in _STATUS.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+        if found := re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()):
+            return int(found[1]) * 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _UNIT
