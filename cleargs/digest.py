@@ -126,14 +126,12 @@ class DigestMemo:
             ) from error
 
     def _lookup(self, name: str) -> tuple[int, int, int, int, str] | None:
-        if self._database is None:
-            return None
-        try:
-            row: tuple[int, int, int, int, str] | None = self._database.execute(
-                "SELECT size, mtime_ns, ctime_ns, inode, digest FROM contents WHERE path = ?", (name,)
-            ).fetchone()
-        except sqlite3.Error:
-            return None
+        row: tuple[int, int, int, int, str] | None = None
+        with suppress(sqlite3.Error):
+            if self._database is not None:
+                row = self._database.execute(
+                    "SELECT size, mtime_ns, ctime_ns, inode, digest FROM contents WHERE path = ?", (name,)
+                ).fetchone()
         return row
 
 

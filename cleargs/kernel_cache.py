@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -13,21 +14,14 @@ def cache_folder(name: str) -> Path:
     Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
     or ``~/.cache``), else, when none can be written to, a fresh temporary folder.
     """
-    candidates = []
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        candidates.append(Path(chosen))
-    if shared := os.environ.get("XDG_CACHE_HOME"):
-        candidates.append(Path(shared) / "cleargs")
-    candidates.append(Path("~/.cache/cleargs"))
-    for candidate in candidates:
-        try:
-            folder = candidate.expanduser() / name
+    own = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "cleargs")
+    for candidate in filter(None, (os.environ.get("NUMBA_CACHE_DIR"), own)):
+        with suppress(OSError, RuntimeError):  # RuntimeError: expanduser without a home
+            folder = Path(candidate).expanduser() / name
             folder.parent.mkdir(parents=True, exist_ok=True)
             folder.mkdir(mode=0o700, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-        except (OSError, RuntimeError):  # RuntimeError: expanduser without a home
-            continue
     return Path(tempfile.mkdtemp(prefix=f"cleargs-{name}-"))
 
 

@@ -131,9 +131,6 @@ def run(context: StageContext[G0Config]) -> StageResult:
     observations = load_observations(ingest)
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
 
-    def say(remark: str) -> None:
-        context.reporter.info(f"G0: {remark}")
-
     config = decided(config, views)
     gaussians = starting_gaussians(
         sparse,
@@ -142,7 +139,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
         at_most=config.budget,
         sh_degree=config.sh_degree,
         seed=context.seed,
-        say=say,
+        say=lambda remark: context.reporter.info(f"G0: {remark}"),
     )
     exposure, spread = _exposure(config, views, sparse)
     formation = CaptureFormation(views, config.formation, exposure=exposure, lr_exposure=config.lr_exposure)

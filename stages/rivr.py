@@ -186,9 +186,7 @@ def _degraded(context: StageContext[RivrConfig], frames: int) -> int:
     from cleargs.parquet import read_table
     from cleargs.rva.tables import FRAMES
 
-    if "rva" not in context.inputs:
-        return frames // 2
-    with suppress(StoreError):
+    with suppress(KeyError, StoreError):
         roles = read_table(context.inputs["rva"] / "frames.parquet", FRAMES).column("role").to_pylist()
         return sum(role != "strong" for role in roles)
     return frames // 2
