@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, TypeGuard, cast
+from typing import Any
 
 import tomli_w
 
@@ -88,42 +88,38 @@ def _toml_line(name: str, value: Any) -> str:
     return tomli_w.dumps({name: value}).rstrip()
 
 
-def kept_settings(folder: Path) -> Document | None:
-    """The settings in the ``run.toml`` of ``folder``, unchecked; None when there is no run.
-
-    Raises ConfigError when the file is damaged.
-    """
-    if not (folder / RUN_FILE).is_file():
-        return None
-    document = read_toml(folder / RUN_FILE)
-    return {name: value for name, value in document.items() if name not in ("input", "device", "store")}
-
-
 @dataclass(frozen=True)
-class Place:
-    """What the ``run.toml`` of an earlier call says beside its settings; None for what it does not say."""
+class Noted:
+    """What the ``run.toml`` of an earlier call says; None for what it does not say."""
 
+    settings: Document = field(default_factory=dict)
+    """Unchecked."""
     source: Path | None = None
     store: Path | None = None
     device: Device | None = None
 
 
-def noted_place(folder: Path) -> Place:
-    """Where the run in ``folder`` was made; an empty answer when there is no run, or its file is damaged."""
+def noted_run(folder: Path) -> Noted:
+    """What `write_run_file` noted in ``folder``; nothing when there is no run.
+
+    Raises ConfigError when the file is damaged.
+    """
+    if not (folder / RUN_FILE).is_file():
+        return Noted()
+    document = read_toml(folder / RUN_FILE)
+    source, store, device = (document.pop(name, None) for name in ("input", "store", "device"))
+    sound = all(path is None or (isinstance(path, str) and "\0" not in path) for path in (source, store))
+    if not sound or device not in (None, "cpu", "cuda"):
+        raise _damaged(folder)
+    return Noted(document, Path(source) if source else None, Path(store) if store else None, device)
+
+
+def noted_source(folder: Path) -> Path | None:
+    """The capture that the run in ``folder`` was made from; None when there is no run, or it is damaged."""
     try:
-        document = read_toml(folder / RUN_FILE)
+        return noted_run(folder).source
     except ConfigError:
-        return Place()
-    source, store, device = (document.get(name) for name in ("input", "store", "device"))
-    return Place(
-        Path(source) if _is_path(source) else None,
-        Path(store) if _is_path(store) else None,
-        device if device in ("cpu", "cuda") else None,
-    )
-
-
-def _is_path(value: Any) -> TypeGuard[str]:
-    return isinstance(value, str) and "\0" not in value
+        return None
 
 
 def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:
@@ -136,17 +132,13 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
         raise InputError(
             f"{folder} is no run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"
         )
-    document = read_toml(folder / RUN_FILE)
-    source, noted_store = document.pop("input", None), document.pop("store", None)
-    noted_device = document.pop("device", "cpu")
-    noted_store = "" if noted_store is None else noted_store
-    paths_sound = all(isinstance(path, str) and "\0" not in path for path in (source, noted_store))
-    if not paths_sound or not source or noted_device not in ("cpu", "cuda"):
-        raise InputError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")
-    return Run(
-        folder,
-        Path(source),
-        check_document(dag, document),
-        store or (Path(noted_store) if noted_store else folder / STORE_FOLDER),
-        device or cast(Device, noted_device),
-    )
+    noted = noted_run(folder)
+    if noted.source is None:
+        raise _damaged(folder)
+    config = check_document(dag, noted.settings)
+    place = store or noted.store or folder / STORE_FOLDER
+    return Run(folder, noted.source, config, place, device or noted.device or "cpu")
+
+
+def _damaged(folder: Path) -> ConfigError:
+    return ConfigError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")

@@ -34,7 +34,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_place, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
@@ -259,7 +259,7 @@ class Runner:
             else:
                 self.reporter.warn(f"{name}: made again, with other digests than before")
         # An equal result that was there already keeps its own times; this outcome tells those of today.
-        return published.model_copy(update=dict(cost))
+        return published.model_copy(update=cost)
 
     def _with_inherited(self, manifest: Manifest, inherited: tuple[str, ...]) -> Manifest:
         """``manifest`` saying what is missing upstream *now*.
@@ -280,7 +280,7 @@ def check_same_input(run: Run, dag: Dag, store: Store) -> None:
 
     A capture that moved is the same when its content is.
     """
-    before = noted_place(run.folder).source
+    before = noted_source(run.folder)
     if before is None or before == run.source:
         return
     first = dag.names[0]

@@ -12,10 +12,10 @@ from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
-from cleargs.pipeline.config import Config, Document, check_document, load_config
+from cleargs.pipeline.config import Config, check_document, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import settings as settings_in
-from cleargs.pipeline.run_file import RUN_FILE, Device, Run, kept_settings, noted_place
+from cleargs.pipeline.run_file import RUN_FILE, Device, Noted, Run, noted_run, noted_source
 from cleargs.pipeline.store import STORE_FOLDER, Store
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
@@ -87,32 +87,28 @@ def asked_run(
     if not source.exists():
         raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
-        noted = noted_place(source).source
+        made_from = noted_source(source)
         raise InputError(
             f"{source} is a run, not a capture",
-            hint=f"give the capture that it was made from{f': {noted}' if noted else ''}",
+            hint=f"give the capture that it was made from{f': {made_from}' if made_from else ''}",
         )
-    folder = folder.absolute()
-    kept = None if reset or workflow is not None else _kept(dag, folder)
-    config = load_config(dag, workflow or "default" if kept is None else kept, overrides, seed)
-    before = noted_place(folder)
-    root = (store or before.store or folder / STORE_FOLDER).absolute()
-    chosen = resolve_device(before.device or device if device == "auto" else device, say)
-    if kept is not None and (line := _own_settings(dag, check_document(dag, kept))):
+    folder, forgets = folder.absolute(), reset or workflow is not None
+    noted, kept = Noted(), None
+    try:
+        noted = noted_run(folder)
+        # Checked, they hold no names that are gone: those would contradict what is set now.
+        kept = check_document(dag, noted.settings) if noted.settings and not forgets else None
+    except ConfigError as error:
+        if not forgets:
+            raise ConfigError(
+                f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
+            ) from error
+    config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
+    root = (store or noted.store or folder / STORE_FOLDER).absolute()
+    chosen = resolve_device(noted.device or device if device == "auto" else device, say)
+    if kept is not None and (line := _own_settings(dag, kept)):
         say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
     return Run(folder, source.absolute(), config, root, chosen)
-
-
-def _kept(dag: Dag, folder: Path) -> Document | None:
-    """The settings of the run in ``folder``; None without one. Raises ConfigError when they are damaged."""
-    try:
-        kept = kept_settings(folder)
-        # Checked, it has no names that are gone: they would contradict what is set now.
-        return None if kept is None else check_document(dag, kept).document()
-    except ConfigError as error:
-        raise ConfigError(
-            f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
-        ) from error
 
 
 def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:
