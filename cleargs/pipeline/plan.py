@@ -18,7 +18,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.stage import Estimate, StageContext
-from cleargs.pipeline.store import Entry, Store
+from cleargs.pipeline.store import Entry, Store, Work
 from cleargs.progress import Reporter
 from cleargs.untrusted import require_utf8
 
@@ -43,7 +43,6 @@ class Recipe:
 
     parts: KeyParts
     origins: Origins
-    externals: Mapping[str, External]
     inputs: Mapping[str, Path]
     """Upstream stage -> its finished folder."""
     inherited: tuple[str, ...]
@@ -112,7 +111,7 @@ class Planner:
         for upstream in stage.INPUTS:
             inherited |= dict.fromkeys(done[upstream].inherited)
             inherited |= dict.fromkeys(f"{upstream}: {missing}" for missing in done[upstream].missing)
-        return Recipe(parts, origins, self._externals(name), folders, tuple(inherited))
+        return Recipe(parts, origins, folders, tuple(inherited))
 
     def inputs(
         self, name: str, done: Mapping[str, Manifest]
@@ -194,29 +193,20 @@ class Planner:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
             else:
                 expected[upstream] = self._estimate(upstream, done)
-        nowhere = self.store.root / "work" / "estimate"
-        out, checkpoints = nowhere / "out", nowhere / "checkpoints"
-        context = self.context(name, inputs, self._externals(name), out, checkpoints)
+        context = self.context(name, inputs, Work(self.store.root / "work" / "estimate"))
         self._estimates[known] = stage.estimate(replace(context, expected=expected))
         return self._estimates[known]
 
-    def context(
-        self,
-        name: str,
-        inputs: Mapping[str, Path],
-        externals: Mapping[str, External],
-        out: Path,
-        checkpoints: Path,
-    ) -> StageContext[Any]:
+    def context(self, name: str, inputs: Mapping[str, Path], work: Work) -> StageContext[Any]:
         """All that the stage ``name`` is told."""
         return StageContext(
             config=self.run.config.sections[name],
             settings={other: self.run.config.sections[other] for other in self.dag.load(name).SETTINGS},
             source=self.run.source,
             inputs=inputs,
-            externals=externals,
-            out=out,
-            checkpoints=checkpoints,
+            externals=self._externals(name),
+            out=work.out,
+            checkpoints=work.checkpoints,
             kept=self.store.kept(name),
             seed=self.run.config.seed,
             device=self.run.device,

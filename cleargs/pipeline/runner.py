@@ -204,7 +204,7 @@ class Runner:
         work = self.store.open_work(
             recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
         )
-        context = self.planner.context(name, recipe.inputs, recipe.externals, work.out, work.checkpoints)
+        context = self.planner.context(name, recipe.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:
