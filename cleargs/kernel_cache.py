@@ -14,7 +14,7 @@ def cache_folder(name: str) -> Path:
     Below ``NUMBA_CACHE_DIR`` where that is set, else below the user's cache folder (``XDG_CACHE_HOME``
     or ``~/.cache``), else, when none can be written to, a fresh temporary folder.
     """
-    own = os.path.join(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "cleargs")
+    own = f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/cleargs"
     for candidate in filter(None, (os.environ.get("NUMBA_CACHE_DIR"), own)):
         with suppress(OSError, RuntimeError):  # RuntimeError: expanduser without a home
             folder = Path(candidate).expanduser() / name
