@@ -104,7 +104,7 @@ def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P]
     covered[seen[reference].indices] = True
     total = seen @ weight
     gained = seen @ np.where(covered, 0.0, weight)
-    return np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0)
+    return np.asarray(np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0))
 
 
 def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> O [N] in [0, 1]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -25,17 +24,6 @@ from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_s
 
 _IMAGE = "<|image_pad|>"
 _ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
-
-
-@dataclass(frozen=True)
-class _Loaded:
-    """A model folder in memory (types of transformers and llguidance, which have no stubs here)."""
-
-    model: Any
-    tokenizer: Any
-    images: Any
-    vocabulary: Any
-    grammar: str
 
 
 class QwenFolder(QwenEvaluator):
@@ -77,8 +65,11 @@ class QwenFolder(QwenEvaluator):
             ) from error
 
     @cached_property
-    def _loaded(self) -> _Loaded:
-        """Raises InputError as `check`, and when the weights cannot be loaded."""
+    def _loaded(self) -> tuple[Any, Any, Any, Any]:
+        """The model, its tokenizer, its image processor, and what matches replies to the schema.
+
+        Raises InputError as `check`, and when the weights cannot be loaded.
+        """
         self.check()
         import llguidance
         import llguidance.hf
@@ -98,14 +89,15 @@ class QwenFolder(QwenEvaluator):
         grammar = llguidance.LLMatcher.grammar_from_json_schema(
             reply_schema(), defaults={"whitespace_flexible": False}
         )
-        return _Loaded(model.to(self._device).eval(), tokenizer, images, vocabulary, grammar)
+        matcher = llguidance.LLMatcher(vocabulary, grammar)
+        return model.to(self._device).eval(), tokenizer, images, matcher
 
     def score(self, picture: Picture) -> Floats:
         """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._config.local_threads)
         try:
-            text = _generate(self._loaded, picture, self._config.max_tokens)
+            text = self._reply(picture)
         finally:
             torch.set_num_threads(threads)
         try:
@@ -113,34 +105,34 @@ class QwenFolder(QwenEvaluator):
         except ReplyError as fault:  # a reply cut off at max_tokens
             raise UnscoredError(f"the reply cannot be used: {fault}") from None
 
-
-def _generate(loaded: _Loaded, picture: Picture, max_tokens: int) -> str:
-    """The model's reply to the prompt about ``picture``; a valid object unless it runs out of tokens."""
-    seen = loaded.images(images=[picture.rgb], return_tensors="pt")
-    pads = int(seen["image_grid_thw"].prod()) // loaded.images.merge_size**2
-    chat = (
-        f"<|im_start|>user\n<|vision_start|>{_IMAGE * pads}<|vision_end|>"
-        f"{prompt_text(masked=picture.masked)}<|im_end|>\n<|im_start|>assistant\n"
-    )
-    tokens = loaded.tokenizer(chat, return_tensors="pt", add_special_tokens=False)
-    ids = tokens["input_ids"].to(loaded.model.device)
-    with torch.inference_mode():
-        written = loaded.model.generate(
-            input_ids=ids,
-            attention_mask=torch.ones_like(ids),
-            mm_token_type_ids=(ids == loaded.tokenizer.convert_tokens_to_ids(_IMAGE)).int(),
-            pixel_values=seen["pixel_values"].to(loaded.model.device, loaded.model.dtype),
-            image_grid_thw=seen["image_grid_thw"].to(loaded.model.device),
-            logits_processor=[_SchemaMask(loaded, ids.shape[1])],
-            max_new_tokens=max_tokens,
-            eos_token_id=loaded.tokenizer.eos_token_id,
-            pad_token_id=loaded.tokenizer.eos_token_id,
-            do_sample=False,
-            temperature=None,
-            top_p=None,
-            top_k=None,
+    def _reply(self, picture: Picture) -> str:
+        """The reply to the prompt about ``picture``; a valid object unless the model runs out of tokens."""
+        model, tokenizer, images, matcher = self._loaded
+        seen = images(images=[picture.rgb], return_tensors="pt")
+        pads = int(seen["image_grid_thw"].prod()) // images.merge_size**2
+        chat = (
+            f"<|im_start|>user\n<|vision_start|>{_IMAGE * pads}<|vision_end|>"
+            f"{prompt_text(masked=picture.masked)}<|im_end|>\n<|im_start|>assistant\n"
         )
-    return str(loaded.tokenizer.decode(written[0, ids.shape[1] :], skip_special_tokens=True))
+        ids = tokenizer(chat, return_tensors="pt", add_special_tokens=False)["input_ids"].to(model.device)
+        matcher.reset()
+        with torch.inference_mode():
+            written = model.generate(
+                input_ids=ids,
+                attention_mask=torch.ones_like(ids),
+                mm_token_type_ids=(ids == tokenizer.convert_tokens_to_ids(_IMAGE)).int(),
+                pixel_values=seen["pixel_values"].to(model.device, model.dtype),
+                image_grid_thw=seen["image_grid_thw"].to(model.device),
+                logits_processor=[_SchemaMask(matcher, ids.shape[1])],
+                max_new_tokens=self._config.max_tokens,
+                eos_token_id=tokenizer.eos_token_id,
+                pad_token_id=tokenizer.eos_token_id,
+                do_sample=False,
+                temperature=None,
+                top_p=None,
+                top_k=None,
+            )
+        return str(tokenizer.decode(written[0, ids.shape[1] :], skip_special_tokens=True))
 
 
 class _SchemaMask:
@@ -149,10 +141,8 @@ class _SchemaMask:
     llguidance's own masking kernel goes through torch.compile and so wants a C++ compiler; this does not.
     """
 
-    def __init__(self, loaded: _Loaded, prompt_length: int) -> None:
-        from llguidance import LLMatcher
-
-        self._matcher = LLMatcher(loaded.vocabulary, loaded.grammar)
+    def __init__(self, matcher: Any, prompt_length: int) -> None:
+        self._matcher = matcher
         self._consumed = prompt_length
 
     def __call__(self, input_ids: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:  # [1, T], [1, V]
