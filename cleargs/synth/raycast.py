@@ -9,14 +9,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
-from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
-from cleargs.synth.room import BOX, LEVEL_STARTS, LEVELS, SIZE, SPHERE, TEXELS_PER_METRE, Balloon, Room
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy, phone_lens
+from cleargs.synth.path import Setting, orbit
+from cleargs.synth.room import (
+    BOX,
+    LEVEL_STARTS,
+    LEVELS,
+    SIZE,
+    SPHERE,
+    TEXELS_PER_METRE,
+    Balloon,
+    Room,
+    make_balloon,
+    make_room,
+)
 
 configure_numba("raycast")
 
@@ -380,3 +393,10 @@ class RoomWorld:
             image, depth, share,
         )  # fmt: skip
         return image, depth, share
+
+
+def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
+    """The procedural room of ``seed``, in metres, and a walk around its table."""
+    room = make_room(seed)
+    world, course, lens = RoomWorld(room), orbit(room.focus, frames, seed), phone_lens(width, height)
+    return Setting("room", world, course, lens, partial(world.film, make_balloon(room, seed)))
