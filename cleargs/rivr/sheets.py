@@ -9,8 +9,7 @@ from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import write_rgb
 from cleargs.rivr.candidates import CANDIDATES
-from cleargs.rivr.distillation import Snapshot
-from cleargs.rivr.rounds import observation
+from cleargs.rivr.distillation import Snapshot, observation
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import View
 
