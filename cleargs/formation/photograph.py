@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure, affine_backward, apply_affine
-from cleargs.formation.frame import FrameFormation, margin_for, widened
+from cleargs.formation.frame import FrameFormation, margin_for
+from cleargs.formation.motion import widened
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -98,21 +99,16 @@ class FormedView:
         self.needs_depth = self.formation is not None
 
     def forward(self, render: Render) -> Tensor:
-        photograph = self._photograph(render)
-        if self.doubt is not None:
-            self._counts = self.doubt.counts(photograph)
-        return photograph
-
-    def _photograph(self, render: Render) -> Tensor:
-        image = render.image
+        photograph, device = render.image, render.image.device
         if self.affine is not None:
             self._rendered = render.image
-            image = apply_affine(image, self.affine)
-        if self.formation is None:
-            return image
-        self._warp = self.warp(render)
-        linear, self._to_linear = through_curve(image, linear_curve(image.device), CHANNELS)
-        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(image.device))
+            photograph = apply_affine(photograph, self.affine)
+        if self.formation is not None:
+            self._warp = self.warp(render)
+            linear, self._to_linear = through_curve(photograph, linear_curve(device), CHANNELS)
+            photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
+        if self.doubt is not None:
+            self._counts = self.doubt.counts(photograph)
         return photograph
 
     def warp(self, render: Render) -> Warp:
