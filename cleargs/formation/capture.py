@@ -11,6 +11,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
-from cleargs.formation.photograph import Doubt, FormedView
+from cleargs.formation.photograph import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.views import View
@@ -159,7 +160,8 @@ class CaptureFormation:
                 motion = frame
         doubt = None
         if begun and self._config.unexplained > 0.0:
-            doubt = Doubt(target, mask, self._config.unexplained)
+            tolerance = self._config.unexplained
+            doubt = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
         if motion is None and affine is None and doubt is None:
             return None
         return FormedView(

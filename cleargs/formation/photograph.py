@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -43,42 +43,38 @@ NONE = 1e-6
 """Difference, and share of the pixels, that stands for none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Doubt:
-    """What a frame must be explained as, and how well, lest its pixels count less."""
+def pixel_weights(
+    photograph: Tensor,  # [H, W, 3] sRGB
+    target: Tensor,  # [H, W, 3] sRGB
+    mask: Tensor | None,  # [H, W], True counts
+    tolerance: float,
+) -> Tensor:
+    """How much each pixel counts, [H, W] in (0, 1], of a frame taken as ``target``, which ``photograph`` must
+    explain.
 
-    target: Tensor
-    """The frame as taken, [H, W, 3] sRGB."""
-    mask: Tensor | None
-    """[H, W], True counts."""
-    tolerance: float
-    """Difference in sRGB, of [0, 1], up to which every pixel counts."""
+        w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
 
-    def counts(self, photograph: Tensor) -> Tensor:
-        """How much each pixel counts, [H, W] in (0, 1], where the scene gives ``photograph`` [H, W, 3] sRGB.
-
-            w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
-
-        r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
-        rho, w is 1 to the bit. Differences are pooled as in Sabour et al., "RobustNeRF" (2023).
-        """
-        height, width = photograph.shape[:2]
-        per_pixel = CELLS / max(height, width)
-        cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
-        counted = torch.ones_like(photograph[..., 0]) if self.mask is None else self.mask.float()
-        difference = (photograph - self.target).permute(2, 0, 1) * counted
-        shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
-        unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
-        ordinary = (ORDINARY * unexplained.median()).clamp_min(self.tolerance)
-        here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
-        return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
+    r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
+    rho, w is 1 to the bit. Differences, in sRGB of [0, 1], are pooled as in Sabour et al., "RobustNeRF"
+    (2023).
+    """
+    height, width = photograph.shape[:2]
+    per_pixel = CELLS / max(height, width)
+    cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
+    counted = torch.ones_like(photograph[..., 0]) if mask is None else mask.float()
+    difference = (photograph - target).permute(2, 0, 1) * counted
+    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
+    unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
+    ordinary = (ORDINARY * unexplained.median()).clamp_min(tolerance)
+    here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
+    return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
 
 
 @dataclass(eq=False)
 class FormedView:
     """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    With a ``doubt``, pixels that stay unexplained teach less.
+    ``doubt`` says how much each pixel [H, W] of a photograph counts (see `pixel_weights`); None: all alike.
     """
 
     camera: Camera
@@ -88,7 +84,7 @@ class FormedView:
     affines: AffineOptimiser | None = None
     formation: FrameFormation | None = None
     factor: float = 1.0
-    doubt: Doubt | None = None
+    doubt: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         self._photo = self.camera
@@ -108,7 +104,7 @@ class FormedView:
             linear, self._to_linear = through_curve(photograph, linear_curve(device), CHANNELS)
             photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
         if self.doubt is not None:
-            self._counts = self.doubt.counts(photograph)
+            self._counts = self.doubt(photograph)
         return photograph
 
     def warp(self, render: Render) -> Warp:

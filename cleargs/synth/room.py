@@ -100,10 +100,8 @@ PRIMITIVE = np.dtype(
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
         ("bound", np.float64),  # radius of the bounding sphere
-        (
-            "shade",
-            np.float64,
-        ),  # radius of a ball of its volume, that hides ambient light; 0: it casts no shadow
+        # Radius of a ball of its volume, that hides ambient light; 0: it casts no shadow.
+        ("shade", np.float64),
     ]
 )
 
