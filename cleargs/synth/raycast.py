@@ -324,13 +324,8 @@ def _render(
     last = primitives.shape[0] - 1
     for row in prange(height):
         items = primitives.copy() if track.shape[0] else primitives
-        origin, ray, colour, start, scratch = (
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros((10, 3)),
-        )
+        origin, ray, colour, start = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        scratch = np.zeros((10, 3))
         for column in range(width):
             for number in range(passes):
                 pose = poses[number, row]
