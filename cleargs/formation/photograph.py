@@ -182,15 +182,14 @@ def evaluate_views(
     formations: Mapping[int, FrameFormation] | None = None,
     *,
     engine: Rasteriser | None = None,
-    cache: ImageCache | None = None,
 ) -> list[Fit]:
     """How well the scene shows every view as photographed, in their order, at full size."""
     engine = engine or rasteriser_for(str(scene.gaussians.device))
-    cache = cache or ImageCache(0, scene.gaussians.device)
+    images = ImageCache(0, scene.gaussians.device)
     formations = formations or {}
     fits = []
     for view in views:
-        target, mask = cache.get(view)
+        target, mask = images.get(view)
         image = photograph(scene, view, exposure, formations.get(view.frame_id), engine=engine)
         unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
         unseen = unseen if mask is None else unseen & mask

@@ -49,16 +49,6 @@ EXPLAINED = "explained: "
 """How the reason of such a frame begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Restoration:
-    """D_t, and what it was made from."""
-
-    image: Image
-    source: Source
-    deblurred: Deblurred | None = None
-    """The raw frame without its motion, where that is the source."""
-
-
 @dataclass(frozen=True)
 class Rules:
     """How a frame is restored, how its candidates are made, and how one of them is chosen.
@@ -80,14 +70,17 @@ class Rules:
     margin: float
     gate: GateConfig
 
-    def restoration(self, view: View, render: Image, scene: Snapshot) -> Restoration:
-        """D_t in the light of the render R_t; what ``scene`` says of the frame's camera is undone."""
+    def restored(self, view: View, render: Image, scene: Snapshot) -> tuple[Image, Source, Deblurred | None]:
+        """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
+
+        What ``scene`` says of the frame's camera is undone.
+        """
         if not self.use_observation:
-            return Restoration(self._restored(render), "render")
+            return self._restored(render), "render", None
         deblurred = scene.deblur(view) if self.undo_motion else None
         if deblurred is None:
-            return Restoration(self._restored_observation(view), "observation")
-        return Restoration(self._restored(deblurred.image), "deblurred", deblurred)
+            return self._restored_observation(view), "observation", None
+        return self._restored(deblurred.image), "deblurred", deblurred
 
     def _restored(self, image: Image) -> Image:
         return self.expert.restore(image, threads=self.threads)
@@ -131,7 +124,8 @@ def run_round(
                 row, image = repair(number, view, exr, scene, rules)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
-            task.update(done=len(rows), note=_tally(rows))
+            tally = ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())
+            task.update(done=len(rows), note=tally)
     return rows
 
 
@@ -144,10 +138,10 @@ def repair(
     whoever resumes from the file sees what was scored.
     """
     rendered = scene.render(view)
-    restoration = rules.restoration(view, rendered, scene)
+    restored, source, deblurred = rules.restored(view, rendered, scene)
     explained = scene.explained(view)
     observed, mask = observation(view)
-    layers = {"render": to_layer(rendered), "restored": to_layer(restoration.image)}
+    layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     if rules.use_fused:
         fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)
         layers["fused"] = to_layer(fused)
@@ -158,19 +152,16 @@ def repair(
         {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
         for scorer in (rules.primary, rules.tiebreak)
     )
-    raw_scores: tuple[float, float] | tuple[None, None] = (None, None)
+    raw: list[float] = []
     kept: str | None = None
     if rules.keep_raw:
-        raw_scores = (
-            _score(rules.primary, observed, rules.threads),
-            _score(rules.tiebreak, observed, rules.threads),
-        )
+        raw = [_score(scorer, observed, rules.threads) for scorer in (rules.primary, rules.tiebreak)]
         if explained is not None and explained.weight >= TRUSTED:
             kept = f"{EXPLAINED}{described(explained.formation)}"
         elif (
             view.weight > 0.0  # without its repair a frame of no weight would be lost
-            and unbeaten(raw_scores[0], primary, rules.margin)
-            and unbeaten(raw_scores[1], tiebreak, rules.margin)
+            and unbeaten(raw[0], primary, rules.margin)
+            and unbeaten(raw[1], tiebreak, rules.margin)
             and hardly_changes(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
@@ -181,7 +172,6 @@ def repair(
         else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
     )
     masked = all_masked(mask)
-    deblurred = restoration.deblurred
     row = Selection(
         round=number,
         frame_id=view.frame_id,
@@ -190,13 +180,13 @@ def repair(
         primary_render=primary["render"],
         primary_restored=primary["restored"],
         primary_fused=primary.get("fused"),
-        primary_observed=raw_scores[0],
+        primary_observed=raw[0] if raw else None,
         tiebreak_metric=rules.tiebreak.name,
         tiebreak_render=tiebreak["render"],
         tiebreak_restored=tiebreak["restored"],
         tiebreak_fused=tiebreak.get("fused"),
-        tiebreak_observed=raw_scores[1],
-        restored_from=restoration.source,
+        tiebreak_observed=raw[1] if raw else None,
+        restored_from=source,
         blur_px=None if deblurred is None else float(np.float32(deblurred.formation.blur_px)),
         skew_px=None if deblurred is None else float(np.float32(deblurred.formation.skew_px)),
         chosen="observed" if kept else choice.chosen,
@@ -258,7 +248,3 @@ def pseudo_view(target: View, row: Selection, out: Path) -> View:
 def _score(scorer: Scorer, image: Image, threads: int) -> float:
     """In single precision, as the EXR holds it."""
     return float(np.float32(scorer.score(image, threads=threads)))
-
-
-def _tally(rows: Sequence[Selection]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())
