@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cleargs import G0Config
     from cleargs.evaluate.config import EvalOptions
     from cleargs.evaluate.eval_report import Evaluation
-    from cleargs.rivr.rounds import Deblurred
+    from cleargs.rivr.distillation import Deblurred
     from cleargs.splat.camera import Camera
     from cleargs.splat.config import TrainConfig
     from cleargs.splat.formation import Formation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -163,7 +164,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             "chosen": chosen_counts(repairs) | {"observed": len(kept)},
             "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
             "scorer": scorer.name,
-            "held_back": verdict.summary(),
+            "held_back": asdict(verdict),
             "published": better if repairs or kept else "G0",
             "psnr_unseen": final.psnr_unseen(supervision.real),
         }

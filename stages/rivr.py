@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -24,7 +24,7 @@ from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
     from cleargs.rivr.distillation import Snapshot
-    from cleargs.rivr.rounds import Restorations, Rules
+    from cleargs.rivr.rounds import Rules
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
     from cleargs.splat.views import View
@@ -200,7 +200,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import Snapshot, publish
     from cleargs.rivr.harm import judge_harm
-    from cleargs.rivr.rounds import Restorations, Rules, forget_others
+    from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
     from cleargs.rivr.targets import load_supervision
@@ -214,25 +214,21 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
     rules = Rules(
+        expert=expert,
         primary=load_scorer(config.primary_scorer, networks_on),
         tiebreak=load_scorer(config.tiebreak_scorer, networks_on),
-        margin=config.margin,
-        gate=config.gate,
-        fuse_sigma=config.fuse_sigma,
-        use_fused=config.use_fused,
-        keep_raw=config.keep_raw,
+        cache=context.checkpoints / "restored",
         threads=threads,
-    )
-
-    restored = Restorations(
-        lambda image: expert.restore(image, threads=threads),
-        context.checkpoints / "restored",
         use_observation=config.use_observation,
         undo_motion=config.undo_motion,
+        use_fused=config.use_fused,
+        keep_raw=config.keep_raw,
+        fuse_sigma=config.fuse_sigma,
+        margin=config.margin,
+        gate=config.gate,
     )
-
     g0 = Snapshot(context.inputs["g0"], context.device)
-    rows, trainings, current = _repair_and_distil(context, supervision, targets, restored, rules, g0)
+    rows, trainings, current = _repair_and_distil(context, supervision, targets, rules, g0)
     write_selection(context.out / "selection.parquet", rows)
     if 2 * (refused := refused_repairs(rows)) > len(rows):
         reporter.warn(
@@ -255,7 +251,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         summary={
             "expert": expert.name,
             "rounds": [round_figures(number, rows) for number in sorted({row.round for row in rows})],
-            "held_back": verdict.summary(),
+            "held_back": asdict(verdict),
             "published": "distilled scene" if verdict.harm is None else "G0",
             "psnr_unseen": final.psnr_unseen(supervision.real),
         }
@@ -266,7 +262,6 @@ def _repair_and_distil(
     context: StageContext[RivrConfig],
     supervision: Supervision,
     targets: Sequence[View],
-    restored: Restorations,
     rules: Rules,
     g0: Snapshot,
 ) -> tuple[list[Selection], list[Path], Snapshot]:
@@ -290,9 +285,7 @@ def _repair_and_distil(
             found = run_round(
                 number,
                 group.targets,
-                current.render,
-                partial(restored, deblur=current.deblur),
-                current.explained,
+                current,
                 rules,
                 context.out,
                 reporter,

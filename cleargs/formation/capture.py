@@ -11,6 +11,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import NUMBERS, FrameFormation, explain, packed, unpacked
-from cleargs.formation.photograph import Doubt, FormedView
+from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
+from cleargs.formation.photograph import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.views import View
@@ -142,11 +143,12 @@ class CaptureFormation:
         begun = progress >= self._config.start
         searched = self._config.enabled and view.kind == "real"
         if searched and not begun:
-            if progress >= ROLLING_START and self._untested(frame_id) and not self._rolls():
+            untested = frame_id in self._tested and self._frames[frame_id].skew_gain is None
+            if progress >= ROLLING_START and untested and not self._rolls():
                 gain = explained().skew_gain
                 self._frames[frame_id] = replace(self._frames[frame_id], skew_gain=gain)
             searched = self._rolls()
-        if searched and self._due(frame_id):
+        if searched and self._frames[frame_id].draws % self._config.every == 0:
             self._frames[frame_id] = explained()
         weight = view.weight
         motion = None
@@ -158,7 +160,8 @@ class CaptureFormation:
                 motion = frame
         doubt = None
         if begun and self._config.unexplained > 0.0:
-            doubt = Doubt(target, mask, self._config.unexplained)
+            tolerance = self._config.unexplained
+            doubt = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
         if motion is None and affine is None and doubt is None:
             return None
         return FormedView(
@@ -182,8 +185,7 @@ class CaptureFormation:
 
     def state(self) -> dict[str, Tensor]:
         """The numbers of all frames, and the affines with their moments."""
-        rows = [packed(frame) for frame in self._frames.values()]
-        state = {"frames": torch.tensor(np.array(rows, np.float64).reshape(len(rows), NUMBERS))}
+        state = {"frames": torch.from_numpy(packed(self._frames.values()))}
         if self._affines is not None:
             for name, array in self._affines.arrays().items():
                 state[f"exposure.{name}"] = torch.from_numpy(array)
@@ -191,8 +193,7 @@ class CaptureFormation:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Resume from what `state` gave."""
-        rows = state["frames"].numpy()
-        self._frames = {frame.frame_id: frame for frame in map(unpacked, rows)}
+        self._frames = {frame.frame_id: frame for frame in unpacked(state["frames"].numpy())}
         if self._affines is not None:
             prefix = "exposure."
             self._affines.restore(
@@ -205,14 +206,8 @@ class CaptureFormation:
             return "exposure is not finite"
         return None
 
-    def _due(self, frame_id: int) -> bool:
-        return self._frames[frame_id].draws % self._config.every == 0
-
     def _rolls(self) -> bool:
         return rolls(self._frames.values())
-
-    def _untested(self, frame_id: int) -> bool:
-        return frame_id in self._tested and self._frames[frame_id].skew_gain is None
 
 
 def _tested_frames(count: int) -> list[int]:

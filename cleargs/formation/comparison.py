@@ -6,13 +6,13 @@ part in a fit: they judge which model explains the frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis
+from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
@@ -125,14 +125,7 @@ class Level:
         depth, alpha = reduced(sight.depth), reduced(sight.alpha)
         self.median = _median_depth(sight)
         self.nearness = _nearness(depth, alpha, self.median)
-        self._camera = replace(
-            sight.camera,
-            width=width,
-            height=height,
-            cx=sight.camera.cx + margin,
-            cy=sight.camera.cy + margin,
-        )
-        self._basis = flow_basis(self._camera, self.nearness)
+        self._basis = flow_basis(widened(sight.camera, margin), self.nearness)
         self.scale = size[0] / width
         rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
         self._down = (rows / sight.camera.height - 0.5).astype(np.float32)
@@ -143,14 +136,15 @@ class Level:
         """How well a motion explains the pixels that judge."""
         total = max(self._total, 1.0)
         still = self._misfit(FrameMotion(), FINE, self._judging) / total
-        misfit = (
-            still if model == "none" else self._misfit(motion, _samples_for(model), self._judging) / total
-        )
+        misfit = still
+        if model != "none":
+            times = DISC if model == "defocus" else FINE
+            misfit = self._misfit(motion, times, self._judging) / total
         return Explanation(model, motion, misfit, still)
 
-    def cost(self, motion: FrameMotion, times: Floats | None = None) -> float:
+    def cost(self, motion: FrameMotion, times: Floats = FINE) -> float:
         """What is left on the pixels that fit."""
-        return self._misfit(motion, FINE if times is None else times, self._fitting)
+        return self._misfit(motion, times, self._fitting)
 
     def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
         fields = self.fields(motion)
@@ -184,10 +178,6 @@ class Level:
             OUTLIER,
             active,
         )
-
-
-def _samples_for(model: Model) -> Floats:
-    return DISC if model == "defocus" else FINE
 
 
 def _judging(shape: tuple[int, ...]) -> NDArray[np.bool_]:

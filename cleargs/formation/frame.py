@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from cleargs.formation.comparison import Explanation, Sight, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
-from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model
+from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
 from cleargs.formation.search import preferred, refine, search
 from cleargs.formation.warp import displacement_fields
 from cleargs.splat.camera import Camera
@@ -28,9 +30,7 @@ MARGIN_SHARE = 0.25
 LENS = ("disc_px", "focus", "median_depth")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
 """Numbers of a frame's motion beyond its twists, and of the frame, as checkpoints and tables hold them."""
-
-NUMBERS = 3 + 3 * TWIST + len(LENS) + len(MEASURED) + 1
-"""How many numbers of a frame a checkpoint holds."""
+TWISTS, AXES = ("pose", "blur", "skew"), ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,9 @@ def explain(
     untold = frame.skew_gain is None or frame.skew_gain > config.accept
     missed = rolling and _admitted(frame.model, rolling=False) and untold
     warm = warm and _admitted(frame.model, rolling) and not missed
-    margin = margin_for(frame.reach_px * factor, camera) if warm else _search_margin(camera)
+    # The motions that a search will find are not known yet.
+    reach = frame.reach_px * factor if warm else 0.05 * max(camera.width, camera.height)
+    margin = margin_for(reach, camera)
     rendered = render(widened(camera, margin))
     sight = sight_of(rendered, affine, target, mask, camera, margin)
     known = _scaled(frame.motion, factor)
@@ -127,19 +129,6 @@ def _skew_gain(found: list[Explanation]) -> float:
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
-
-
-def widened(camera: Camera, margin: int) -> Camera:
-    """The camera with ``margin`` more pixels on every side."""
-    if margin == 0:
-        return camera
-    return replace(
-        camera,
-        width=camera.width + 2 * margin,
-        height=camera.height + 2 * margin,
-        cx=camera.cx + margin,
-        cy=camera.cy + margin,
-    )
 
 
 def sight_of(
@@ -209,29 +198,42 @@ def margin_for(reach: float, camera: Camera) -> int:
     return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
 
 
-def _search_margin(camera: Camera) -> int:
-    """The margin for a search, whose motions are not known yet."""
-    return margin_for(0.05 * max(camera.width, camera.height), camera)
+def as_row(frame: FrameFormation) -> dict[str, Any]:
+    """The frame by the names that ``formation.parquet`` gives to its numbers."""
+    motion = frame.motion
+    row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws")}
+    for name in TWISTS:
+        row |= {f"{name}_{axis}": float(v) for axis, v in zip(AXES, getattr(motion, name), strict=True)}
+    row |= {name: getattr(motion, name) for name in LENS}
+    return row | {name: getattr(frame, name) for name in (*MEASURED, "skew_gain")}
 
 
-def packed(frame: FrameFormation) -> NDArray[np.float64]:
-    """Return the numbers of a frame for a checkpoint, `NUMBERS` in all."""
-    gain = -1.0 if frame.skew_gain is None else frame.skew_gain
-    head = [frame.frame_id, MODELS.index(frame.model), frame.draws]
-    rest = [getattr(frame.motion, name) for name in LENS] + [getattr(frame, name) for name in MEASURED]
-    return np.concatenate([head, frame.motion.vector, [*rest, gain]])
-
-
-def unpacked(row: NDArray[np.float64]) -> FrameFormation:
-    """Return the frame of which `packed` gave these numbers."""
-    frame_id, model, draws = (int(value) for value in row[:3])
-    vector, rest = row[3 : 3 + 3 * TWIST], [float(value) for value in row[3 + 3 * TWIST :]]
-    disc_px, focus, median_depth, *measured, gain = rest
+def from_row(row: Mapping[str, Any]) -> FrameFormation:
+    """The frame of which `as_row` gave this; without ``draws``, as before the first one."""
+    vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
     return FrameFormation(
-        frame_id,
-        FrameMotion(disc_px=disc_px, focus=focus, median_depth=median_depth).with_vector(vector),
-        MODELS[model],
-        skew_gain=gain if gain >= 0.0 else None,
-        draws=draws,
-        **dict(zip(MEASURED, measured, strict=True)),
+        row["frame_id"],
+        FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),
+        row["model"],
+        draws=row.get("draws", 0),
+        **{name: row[name] for name in (*MEASURED, "skew_gain")},
     )
+
+
+def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
+    """The frames for a checkpoint, [F, numbers of one]."""
+    rows = []
+    for frame in frames:
+        gain = -1.0 if frame.skew_gain is None else frame.skew_gain
+        row = as_row(frame) | {"model": MODELS.index(frame.model), "skew_gain": gain}
+        rows.append(list(row.values()))
+    return np.array(rows, np.float64).reshape(len(rows), len(as_row(FrameFormation(0))))
+
+
+def unpacked(numbers: NDArray[np.float64]) -> Iterator[FrameFormation]:
+    """The frames of which `packed` gave these numbers."""
+    names = tuple(as_row(FrameFormation(0)))
+    for row in (dict(zip(names, values, strict=True)) for values in numbers.tolist()):
+        gain = None if row["skew_gain"] < 0.0 else row["skew_gain"]
+        counts = {name: int(row[name]) for name in ("frame_id", "draws")}
+        yield from_row(row | counts | {"model": MODELS[int(row["model"])], "skew_gain": gain})

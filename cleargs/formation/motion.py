@@ -57,6 +57,19 @@ class FrameMotion:
         return replace(self, pose=pose, blur=blur, skew=skew)
 
 
+def widened(camera: Camera, margin: int) -> Camera:
+    """The camera with ``margin`` more pixels on every side."""
+    if margin == 0:
+        return camera
+    return replace(
+        camera,
+        width=camera.width + 2 * margin,
+        height=camera.height + 2 * margin,
+        cx=camera.cx + margin,
+        cy=camera.cy + margin,
+    )
+
+
 def flow_basis(
     camera: Camera,
     nearness: Floats,  # [H, W] median depth over depth

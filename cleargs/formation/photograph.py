@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure, affine_backward, apply_affine
-from cleargs.formation.frame import FrameFormation, margin_for, widened
+from cleargs.formation.frame import FrameFormation, margin_for
+from cleargs.formation.motion import widened
 from cleargs.formation.warp import (
     Warp,
     displacement_fields,
@@ -42,42 +43,38 @@ NONE = 1e-6
 """Difference, and share of the pixels, that stands for none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Doubt:
-    """What a frame must be explained as, and how well, lest its pixels count less."""
+def pixel_weights(
+    photograph: Tensor,  # [H, W, 3] sRGB
+    target: Tensor,  # [H, W, 3] sRGB
+    mask: Tensor | None,  # [H, W], True counts
+    tolerance: float,
+) -> Tensor:
+    """How much each pixel counts, [H, W] in (0, 1], of a frame taken as ``target``, which ``photograph`` must
+    explain.
 
-    target: Tensor
-    """The frame as taken, [H, W, 3] sRGB."""
-    mask: Tensor | None
-    """[H, W], True counts."""
-    tolerance: float
-    """Difference in sRGB, of [0, 1], up to which every pixel counts."""
+        w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
 
-    def counts(self, photograph: Tensor) -> Tensor:
-        """How much each pixel counts, [H, W] in (0, 1], where the scene gives ``photograph`` [H, W, 3] sRGB.
-
-            w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
-
-        r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
-        rho, w is 1 to the bit. Differences are pooled as in Sabour et al., "RobustNeRF" (2023).
-        """
-        height, width = photograph.shape[:2]
-        per_pixel = CELLS / max(height, width)
-        cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
-        counted = torch.ones_like(photograph[..., 0]) if self.mask is None else self.mask.float()
-        difference = (photograph - self.target).permute(2, 0, 1) * counted
-        shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
-        unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
-        ordinary = (ORDINARY * unexplained.median()).clamp_min(self.tolerance)
-        here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
-        return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
+    r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
+    rho, w is 1 to the bit. Differences, in sRGB of [0, 1], are pooled as in Sabour et al., "RobustNeRF"
+    (2023).
+    """
+    height, width = photograph.shape[:2]
+    per_pixel = CELLS / max(height, width)
+    cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
+    counted = torch.ones_like(photograph[..., 0]) if mask is None else mask.float()
+    difference = (photograph - target).permute(2, 0, 1) * counted
+    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
+    unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
+    ordinary = (ORDINARY * unexplained.median()).clamp_min(tolerance)
+    here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
+    return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
 
 
 @dataclass(eq=False)
 class FormedView:
     """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    With a ``doubt``, pixels that stay unexplained teach less.
+    ``doubt`` says how much each pixel [H, W] of a photograph counts (see `pixel_weights`); None: all alike.
     """
 
     camera: Camera
@@ -87,7 +84,7 @@ class FormedView:
     affines: AffineOptimiser | None = None
     formation: FrameFormation | None = None
     factor: float = 1.0
-    doubt: Doubt | None = None
+    doubt: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         self._photo = self.camera
@@ -98,21 +95,16 @@ class FormedView:
         self.needs_depth = self.formation is not None
 
     def forward(self, render: Render) -> Tensor:
-        photograph = self._photograph(render)
-        if self.doubt is not None:
-            self._counts = self.doubt.counts(photograph)
-        return photograph
-
-    def _photograph(self, render: Render) -> Tensor:
-        image = render.image
+        photograph, device = render.image, render.image.device
         if self.affine is not None:
             self._rendered = render.image
-            image = apply_affine(image, self.affine)
-        if self.formation is None:
-            return image
-        self._warp = self.warp(render)
-        linear, self._to_linear = through_curve(image, linear_curve(image.device), CHANNELS)
-        photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(image.device))
+            photograph = apply_affine(photograph, self.affine)
+        if self.formation is not None:
+            self._warp = self.warp(render)
+            linear, self._to_linear = through_curve(photograph, linear_curve(device), CHANNELS)
+            photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
+        if self.doubt is not None:
+            self._counts = self.doubt(photograph)
         return photograph
 
     def warp(self, render: Render) -> Warp:
@@ -190,15 +182,14 @@ def evaluate_views(
     formations: Mapping[int, FrameFormation] | None = None,
     *,
     engine: Rasteriser | None = None,
-    cache: ImageCache | None = None,
 ) -> list[Fit]:
     """How well the scene shows every view as photographed, in their order, at full size."""
     engine = engine or rasteriser_for(str(scene.gaussians.device))
-    cache = cache or ImageCache(0, scene.gaussians.device)
+    images = ImageCache(0, scene.gaussians.device)
     formations = formations or {}
     fits = []
     for view in views:
-        target, mask = cache.get(view)
+        target, mask = images.get(view)
         image = photograph(scene, view, exposure, formations.get(view.frame_id), engine=engine)
         unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
         unseen = unseen if mask is None else unseen & mask

@@ -12,15 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.comparison import (
-    COARSE,
-    DISC,
-    LEVELS,
-    Explanation,
-    Level,
-    Sight,
-    scales,
-)
+from cleargs.formation.comparison import COARSE, DISC, LEVELS, Explanation, Level, Sight, scales
 from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
 
 WARM_STEPS = 2
@@ -76,13 +68,7 @@ def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Expla
     return [levels[-1].judged("none", still), *(levels[-1].judged(name, found[name]) for name in found)]
 
 
-def refine(
-    sight: Sight,
-    model: Model,
-    motion: FrameMotion,
-    *,
-    pose: bool = False,
-) -> list[Explanation]:
+def refine(sight: Sight, model: Model, motion: FrameMotion, *, pose: bool = False) -> list[Explanation]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
     level = Level(sight, scales(sight)[-1])
     still = FrameMotion(median_depth=level.median)

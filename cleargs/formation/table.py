@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from cleargs.formation.capture import CaptureFormation
-from cleargs.formation.frame import LENS, MEASURED, FrameFormation
-from cleargs.formation.motion import FrameMotion
+from cleargs.formation.frame import AXES, FrameFormation, as_row, from_row
 from cleargs.parquet import column, read_table, write_table
 
-_AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 _TWISTS = {
     "pose": "of the scene past the camera from the pose as given to that at the middle of the exposure",
     "blur": "of the scene past the camera from the start to the end of a row's exposure",
@@ -29,7 +25,7 @@ def _twist(name: str) -> list[pa.Field]:
             pa.float64(),
             f"{axis} {_TWISTS[name]}, px: t times fx / median depth, r times fx",
         )
-        for axis in _AXES
+        for axis in AXES
     ]
 
 
@@ -69,7 +65,12 @@ FORMATION = pa.schema(
 def write_formation(path: Path, formation: CaptureFormation, weights: Mapping[int, float]) -> None:
     """Write ``formation.parquet``; ``weights``: of the raw frames, as RVA gave them."""
     rows = [
-        _row(frame, weights[frame_id], formation.weight(frame_id))
+        as_row(frame)
+        | {
+            "explained": frame.explained,
+            "weight_before": weights[frame_id],
+            "weight_after": formation.weight(frame_id),
+        }
         for frame_id, frame in formation.frames.items()
     ]
     write_table(path, pa.Table.from_pylist(rows, FORMATION), FORMATION)
@@ -81,27 +82,5 @@ def read_formation(path: Path) -> tuple[dict[int, FrameFormation], dict[int, flo
     Raises StoreError when it is missing or damaged.
     """
     rows = read_table(path, FORMATION).to_pylist()
-    return {row["frame_id"]: _frame(row) for row in rows}, {
-        row["frame_id"]: row["weight_after"] for row in rows
-    }
-
-
-def _row(frame: FrameFormation, before: float, after: float) -> dict[str, Any]:
-    motion = frame.motion
-    row = {name: getattr(frame, name) for name in FORMATION.names if hasattr(frame, name)}
-    row |= {name: getattr(motion, name) for name in LENS}
-    for name in _TWISTS:
-        row |= {f"{name}_{axis}": float(v) for axis, v in zip(_AXES, getattr(motion, name), strict=True)}
-    return row | {"weight_before": before, "weight_after": after}
-
-
-def _frame(row: dict[str, Any]) -> FrameFormation:
-    twists = np.array([[row[f"{name}_{axis}"] for axis in _AXES] for name in _TWISTS])
-    motion = FrameMotion(**{name: row[name] for name in LENS})
-    return FrameFormation(
-        row["frame_id"],
-        motion.with_vector(twists.ravel()),
-        row["model"],
-        skew_gain=row["skew_gain"],
-        **{name: row[name] for name in MEASURED},
-    )
+    weights = {row["frame_id"]: row["weight_after"] for row in rows}
+    return {row["frame_id"]: from_row(row) for row in rows}, weights

@@ -77,6 +77,11 @@ def write_view(
     _write(path, pixels, (*_CHANNELS, "A", "Z"), (HALF, HALF, HALF, HALF, FLOAT), {})
 
 
+def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
+    """Write one float channel Z, atomically. Raises StoreError when the disk is full or not writable."""
+    _write(path, np.asarray(depth[..., None], np.float32), ("Z",), (FLOAT,), {})
+
+
 def _write(
     path: Path,
     pixels: NDArray[Any],  # [H, W, C]
@@ -86,12 +91,13 @@ def _write(
 ) -> None:
     """Write ``pixels``; ``formats`` are those of the channels, empty where all are half floats."""
     height, width, count = pixels.shape
-    spec = ImageSpec(width, height, count, HALF)
+    spec = ImageSpec(width, height, count, formats[0] if formats else HALF)
     spec.channelnames = channels
     if formats:
         spec.channelformats = formats
     spec.attribute("compression", "zip")
-    spec.attribute("oiio:ColorSpace", "lin_rec709")
+    if count > 1:  # depth alone has no colour
+        spec.attribute("oiio:ColorSpace", "lin_rec709")
     spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
     for name, value in attributes.items():
         spec.attribute(name, value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -98,13 +99,19 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
     return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
 
 
-def write_rgb(path: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:  # [H, W, 3]
+def write_rgb(
+    path: Path,
+    image: NDArray[np.uint8] | NDArray[np.float32],  # [H, W, 3]
+    *,
+    quality: int | None = None,
+) -> None:
     """Write an RGB image atomically in the format of its ending. Floats are sRGB, clipped to [0, 1].
 
-    Raises StoreError when the disk is full or not writable.
+    ``quality`` is that of a JPEG. Raises StoreError when the disk is full or not writable.
     """
     rgb = image if image.dtype == np.uint8 else to_uint8(image)
-    _encode(path, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8))
+    options = [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality]
+    _encode(path, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8), options)
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:  # [H, W]
@@ -151,8 +158,8 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
     return np.ascontiguousarray(image[::down, ::across])
 
 
-def _encode(path: Path, image: NDArray[np.uint8]) -> None:
-    ok, data = cv2.imencode(path.suffix, image)
+def _encode(path: Path, image: NDArray[np.uint8], options: Sequence[int] = ()) -> None:
+    ok, data = cv2.imencode(path.suffix, image, options)
     if not ok:
         raise ValueError(f"cannot encode {path.suffix}")
     write_bytes(path, data.tobytes())

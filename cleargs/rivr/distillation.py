@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Literal
 
 import numpy as np
 import pyarrow as pa
 import torch
+from torch import Tensor
 
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
-from cleargs.formation.exposure import Exposure, apply_affine, read_exposure, write_exposure
+from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
 from cleargs.formation.photograph import FormedView, evaluate_views, photograph, pooled_unseen
 from cleargs.formation.table import read_formation, write_formation
@@ -23,7 +26,6 @@ from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import Image, hide_masked
 from cleargs.rivr.harm import Fidelity
-from cleargs.rivr.rounds import Deblurred, Explained, observation
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig, TrainConfig
@@ -32,12 +34,41 @@ from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Render
-from cleargs.splat.views import View
+from cleargs.splat.views import Mask, View
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
 EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"
 REJECTED = "rejected.ply"
 CHECKPOINT = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Deblurred:
+    """A raw frame without what its camera did to it."""
+
+    image: Image
+    """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
+    formation: FrameFormation
+    """What was undone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A raw frame as the training explains it."""
+
+    image: Image
+    """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
+    formation: FrameFormation
+    weight: float
+    """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
+
+
+def observation(view: View) -> tuple[Image, Mask | None]:
+    """O_t as float32 sRGB, and its mask."""
+    pixels, mask = view.load()
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.float32) / np.float32(255.0), mask
+    return pixels.astype(np.float32), mask
 
 
 class Snapshot:
@@ -49,26 +80,20 @@ class Snapshot:
         self._device = device
         self.scene = read_ply(folder / SCENE).to(device)
         self._written_exposure = read_exposure(folder / EXPOSURE)
+        self.exposure = self._written_exposure if self._written_exposure.enabled else None
+        """The affines of the frames; None where compensation is off."""
         self.formations, self._weights = read_formation(folder / FORMATION)
         self._engine = rasteriser_for(device)
-
-    @property
-    def exposure(self) -> Exposure | None:
-        """The affines of the frames; None where compensation is off."""
-        return self._written_exposure if self._written_exposure.enabled else None
 
     def render(self, view: View) -> Image:
         """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
         image: Image = photograph(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
-    def photograph(self, view: View) -> Image:
+    def _photographed(self, view: View) -> Tensor:
         """The scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
-        image: Image = (
-            photograph(self.scene, view, self.exposure, formation, engine=self._engine).cpu().numpy()
-        )
-        return image
+        return photograph(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[View]) -> float | None:
         """PSNR in dB of the pixels of ``views`` that no training saw; None where there are none."""
@@ -81,7 +106,7 @@ class Snapshot:
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
-        return Explained(self.photograph(view), formation, self._weights[view.frame_id])
+        return Explained(self._photographed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: View) -> Deblurred | None:
         """The raw frame without what the camera did to it, found by comparing it with the scene; None where
@@ -121,8 +146,8 @@ class Snapshot:
             depth=True,
         )
 
-    def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity:
-        """How well the scene explains the held-back frames.
+    def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity | None:
+        """How well the scene explains the held-back frames; None without any.
 
         Raw frames may be blurred and skewed by the camera's motion. A sharp scene is not to be blamed for
         that: what is compared with a frame is the render with that frame's motion.
@@ -130,11 +155,10 @@ class Snapshot:
         values, scores = [], []
         for view in judges:
             render, (observed, mask) = self.render(view), observation(view)
-            photographed = self.photograph(view)
             counted = None if mask is None else torch.from_numpy(mask)
-            values.append(psnr(torch.from_numpy(photographed), torch.from_numpy(observed), counted))
+            values.append(psnr(self._photographed(view), torch.from_numpy(observed), counted))
             scores.append(scorer.score(hide_masked(render, observed, mask), threads=threads))
-        return Fidelity(tuple(values), tuple(scores))
+        return Fidelity(fmean(values), fmean(scores)) if judges else None
 
     def trained(
         self,
@@ -168,6 +192,8 @@ class Snapshot:
                 lr_exposure=config.lr_exposure,
                 known=self.formations,
             )
+            even = sum(view.kind == "pseudo" for view in views) / len(views)
+            share = even if pseudo_share == "even" else pseudo_share * repaired
             trainer = Trainer(
                 self.scene,
                 views,
@@ -175,7 +201,7 @@ class Snapshot:
                 seed=seed,
                 formation=formation,
                 moments=read_moments(self.folder / STATE, self.scene.gaussians),
-                pseudo_share=_pseudo_share(pseudo_share, views, repaired),
+                pseudo_share=share,
                 pseudo_weight=pseudo_weight,
                 device=self._device,
             )
@@ -208,10 +234,6 @@ def superseded(training: Path) -> None:
     """Drop from the folder of a finished training what only the last one is asked for: its state, which is
     three times as large as the scene."""
     (training / STATE).unlink(missing_ok=True)
-
-
-def _pseudo_share(share: float | Literal["even"], views: Sequence[View], repaired: float) -> float:
-    return sum(view.kind == "pseudo" for view in views) / len(views) if share == "even" else share * repaired
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from statistics import fmean
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -31,29 +30,20 @@ class HarmConfig(Settings):
     score_margin: float = Field(1.0, ge=0.0, le=100.0, description="mean primary score may fall by this much")
 
 
-@dataclass(frozen=True)
-class Fidelity:
-    """How well a scene explains the frames that were held back from repair."""
+class Fidelity(NamedTuple):
+    """How well a scene explains the frames that were held back from repair: means over them."""
 
-    psnr: tuple[float, ...]
-    """PSNR of each frame's render, with the frame's motion, against its raw observation, dB."""
-    score: tuple[float, ...]
-    """Primary score of each render, 0-100, higher is better."""
-
-    @property
-    def mean_psnr(self) -> float:
-        return fmean(self.psnr)
-
-    @property
-    def mean_score(self) -> float:
-        return fmean(self.score)
+    psnr: float
+    """PSNR of a frame's render, with the frame's motion, against its raw observation, dB."""
+    score: float
+    """Primary score of a render, 0-100, higher is better."""
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Whether a distilled scene may be published, with the figures that decided."""
 
-    frames: tuple[int, ...]
+    frames: list[int]
     """The frames held back; without any, nothing is judged."""
     psnr_before: float | None
     psnr_after: float | None
@@ -62,30 +52,22 @@ class Verdict:
     harm: str | None
     """What became worse by more than its margin; None: the distilled scene is published."""
 
-    def summary(self) -> dict[str, Any]:
-        """The verdict as JSON values."""
-        return asdict(self) | {"frames": list(self.frames)}
 
-
-def judge_harm(frames: Sequence[int], before: Fidelity, after: Fidelity, limits: HarmConfig) -> Verdict:
+def judge_harm(
+    frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
+) -> Verdict:
     """Compare a distilled scene with G0 on the held-back ``frames``.
 
     Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
     ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.
     Without frames there is no harm.
     """
-    if not frames:
-        return Verdict((), None, None, None, None, harm=None)
+    if before is None or after is None:
+        return Verdict([], None, None, None, None, harm=None)
     worse = []
-    if after.mean_psnr < before.mean_psnr - limits.psnr_margin:
-        worse.append(f"PSNR fell by {before.mean_psnr - after.mean_psnr:.2f} dB")
-    if after.mean_score < before.mean_score - limits.score_margin:
-        worse.append(f"primary score fell by {before.mean_score - after.mean_score:.2f}")
-    return Verdict(
-        frames=tuple(frames),
-        psnr_before=before.mean_psnr,
-        psnr_after=after.mean_psnr,
-        score_before=before.mean_score,
-        score_after=after.mean_score,
-        harm=" and ".join(worse) or None,
-    )
+    if after.psnr < before.psnr - limits.psnr_margin:
+        worse.append(f"PSNR fell by {before.psnr - after.psnr:.2f} dB")
+    if after.score < before.score - limits.score_margin:
+        worse.append(f"primary score fell by {before.score - after.score:.2f}")
+    harm = " and ".join(worse) or None
+    return Verdict(list(frames), before.psnr, after.psnr, before.score, after.score, harm)

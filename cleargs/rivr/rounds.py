@@ -6,7 +6,7 @@ It appears whole or not at all, so a round that was cut off resumes at the first
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,8 +16,9 @@ import numpy as np
 
 from cleargs.errors import StoreError
 from cleargs.files import remove
-from cleargs.formation.frame import FrameFormation, described
+from cleargs.formation.frame import described
 from cleargs.media.exr import LayeredImage, from_layer, read_exr, to_layer, write_exr
+from cleargs.models.expert import Expert
 from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import (
@@ -32,6 +33,7 @@ from cleargs.rivr.candidates import (
     hide_masked,
     unbeaten,
 )
+from cleargs.rivr.distillation import Deblurred, Snapshot, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
 from cleargs.splat.views import Mask, View
@@ -47,111 +49,68 @@ EXPLAINED = "explained: "
 """How the reason of such a frame begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Deblurred:
-    """A raw frame without what its camera did to it."""
+@dataclass(frozen=True)
+class Rules:
+    """How a frame is restored, how its candidates are made, and how one of them is chosen.
 
-    image: Image
-    """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
-    formation: FrameFormation
-    """What was undone."""
+    But for the objects and the threads these are fields of the stage's settings.
+    """
 
+    expert: Expert
+    primary: Scorer
+    tiebreak: Scorer
+    cache: Path
+    """Folder for the restorations of raw frames, each of which is made when it is first asked for."""
+    threads: int
+    use_observation: bool
+    undo_motion: bool
+    use_fused: bool
+    keep_raw: bool
+    fuse_sigma: float
+    margin: float
+    gate: GateConfig
 
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """A raw frame as the training explains it."""
+    def restored(self, view: View, render: Image, scene: Snapshot) -> tuple[Image, Source, Deblurred | None]:
+        """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
 
-    image: Image
-    """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
-    formation: FrameFormation
-    weight: float
-    """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
-
-
-@dataclass(frozen=True, eq=False)
-class Restoration:
-    """D_t, and what it was made from."""
-
-    image: Image
-    source: Source
-    deblurred: Deblurred | None = None
-    """The raw frame without its motion, where that is the source."""
-
-
-class Restorations:
-    """D_t of target frames. That of a raw frame is made when it is first asked for and kept in ``cache``."""
-
-    def __init__(
-        self, restore: Callable[[Image], Image], cache: Path, *, use_observation: bool, undo_motion: bool
-    ) -> None:
-        self._restore = restore
-        self._cache = cache
-        self._use_observation = use_observation
-        self._undo_motion = undo_motion
-
-    def __call__(self, view: View, render: Image, deblur: Callable[[View], Deblurred | None]) -> Restoration:
-        """D_t in the light of the render R_t; ``deblur`` undoes what the scene says of the frame's camera."""
-        if not self._use_observation:
-            return Restoration(self._restore(render), "render")
-        deblurred = deblur(view) if self._undo_motion else None
+        What ``scene`` says of the frame's camera is undone.
+        """
+        if not self.use_observation:
+            return self._restored(render), "render", None
+        deblurred = scene.deblur(view) if self.undo_motion else None
         if deblurred is None:
-            return Restoration(self._restored_observation(view, observation(view)[0]), "observation")
-        return Restoration(self._restore(deblurred.image), "deblurred", deblurred)
+            return self._restored_observation(view), "observation", None
+        return self._restored(deblurred.image), "deblurred", deblurred
 
-    def _restored_observation(self, view: View, observed: Image) -> Image:
+    def _restored(self, image: Image) -> Image:
+        return self.expert.restore(image, threads=self.threads)
+
+    def _restored_observation(self, view: View) -> Image:
         """As the cache gives it back, so that every round and every resumed run has the same bits."""
-        path = self._cache / f"{view.frame_id:06d}.exr"
+        path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
         except StoreError:  # not made yet, or not whole
-            self._cache.mkdir(exist_ok=True)
-            write_exr(path, LayeredImage({"restored": to_layer(self._restore(observed))}, {}))
+            self.cache.mkdir(exist_ok=True)
+            restored = to_layer(self._restored(observation(view)[0]))
+            write_exr(path, LayeredImage({"restored": restored}, {}))
             return from_layer(read_exr(path).layers["restored"])
-
-
-def observation(view: View) -> tuple[Image, Mask | None]:
-    """O_t as float32 sRGB, and its mask."""
-    pixels, mask = view.load()
-    if pixels.dtype == np.uint8:
-        return pixels.astype(np.float32) / np.float32(255.0), mask
-    return pixels.astype(np.float32), mask
-
-
-Renderer = Callable[[View], Image]
-"""The current scene at a view, through the frame's exposure: R_t."""
-Restorer = Callable[[View, Image], Restoration]
-"""D_t, given the view and its render R_t."""
-Explainer = Callable[[View], Explained | None]
-"""What the training found of a raw frame's camera."""
-
-
-@dataclass(frozen=True)
-class Rules:
-    """How candidates are made and one of them is chosen."""
-
-    primary: Scorer
-    tiebreak: Scorer
-    margin: float
-    gate: GateConfig
-    fuse_sigma: float
-    use_fused: bool
-    keep_raw: bool
-    threads: int
 
 
 def run_round(
     number: int,
     targets: Sequence[View],
-    render: Renderer,
-    restore: Restorer,
-    explain: Explainer,
+    scene: Snapshot,
     rules: Rules,
     out: Path,
     reporter: Reporter,
-    label: str = "candidates",
+    label: str,
 ) -> list[Selection]:
-    """Repair every target frame; EXRs go to ``out/round_NN/``. Frames that have theirs are left alone; an EXR
-    that is damaged, or of another frame or round, is made again, with a warning."""
+    """Repair every target frame in the light of ``scene``; EXRs go to ``out/round_NN/``.
+
+    Frames that have theirs are left alone; an EXR that is damaged, or of another frame or round, is made
+    again, with a warning.
+    """
     folder = f"round_{number:02d}"
     (out / folder).mkdir(exist_ok=True)
     rows = []
@@ -162,31 +121,27 @@ def run_round(
             if row is None or (row.round, row.frame_id) != (number, view.frame_id):
                 if (out / exr).exists():
                     reporter.warn(f"{exr}: what an earlier try left cannot be used and is made again")
-                rendered = render(view)
-                restoration = restore(view, rendered)
-                row, image = repair(number, view, exr, rendered, restoration, explain(view), rules)
+                row, image = repair(number, view, exr, scene, rules)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
-            task.update(done=len(rows), note=_tally(rows))
+            tally = ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())
+            task.update(done=len(rows), note=tally)
     return rows
 
 
 def repair(
-    number: int,
-    view: View,
-    exr: str,
-    rendered: Image,
-    restoration: Restoration,
-    explained: Explained | None,
-    rules: Rules,
+    number: int, view: View, exr: str, scene: Snapshot, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
     All work is on the images as the EXR will give them back (half floats, scene-linear), so that
     whoever resumes from the file sees what was scored.
     """
+    rendered = scene.render(view)
+    restored, source, deblurred = rules.restored(view, rendered, scene)
+    explained = scene.explained(view)
     observed, mask = observation(view)
-    layers = {"render": to_layer(rendered), "restored": to_layer(restoration.image)}
+    layers = {"render": to_layer(rendered), "restored": to_layer(restored)}
     if rules.use_fused:
         fused = fuse(from_layer(layers["render"]), from_layer(layers["restored"]), rules.fuse_sigma)
         layers["fused"] = to_layer(fused)
@@ -197,19 +152,16 @@ def repair(
         {name: _score(scorer, image, rules.threads) for name, image in shown.items()}
         for scorer in (rules.primary, rules.tiebreak)
     )
-    raw_scores: tuple[float, float] | tuple[None, None] = (None, None)
+    raw: list[float] = []
     kept: str | None = None
     if rules.keep_raw:
-        raw_scores = (
-            _score(rules.primary, observed, rules.threads),
-            _score(rules.tiebreak, observed, rules.threads),
-        )
+        raw = [_score(scorer, observed, rules.threads) for scorer in (rules.primary, rules.tiebreak)]
         if explained is not None and explained.weight >= TRUSTED:
             kept = f"{EXPLAINED}{described(explained.formation)}"
         elif (
             view.weight > 0.0  # without its repair a frame of no weight would be lost
-            and unbeaten(raw_scores[0], primary, rules.margin)
-            and unbeaten(raw_scores[1], tiebreak, rules.margin)
+            and unbeaten(raw[0], primary, rules.margin)
+            and unbeaten(raw[1], tiebreak, rules.margin)
             and hardly_changes(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
@@ -220,7 +172,6 @@ def repair(
         else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
     )
     masked = all_masked(mask)
-    deblurred = restoration.deblurred
     row = Selection(
         round=number,
         frame_id=view.frame_id,
@@ -229,13 +180,13 @@ def repair(
         primary_render=primary["render"],
         primary_restored=primary["restored"],
         primary_fused=primary.get("fused"),
-        primary_observed=raw_scores[0],
+        primary_observed=raw[0] if raw else None,
         tiebreak_metric=rules.tiebreak.name,
         tiebreak_render=tiebreak["render"],
         tiebreak_restored=tiebreak["restored"],
         tiebreak_fused=tiebreak.get("fused"),
-        tiebreak_observed=raw_scores[1],
-        restored_from=restoration.source,
+        tiebreak_observed=raw[1] if raw else None,
+        restored_from=source,
         blur_px=None if deblurred is None else float(np.float32(deblurred.formation.blur_px)),
         skew_px=None if deblurred is None else float(np.float32(deblurred.formation.skew_px)),
         chosen="observed" if kept else choice.chosen,
@@ -297,7 +248,3 @@ def pseudo_view(target: View, row: Selection, out: Path) -> View:
 def _score(scorer: Scorer, image: Image, threads: int) -> float:
     """In single precision, as the EXR holds it."""
     return float(np.float32(scorer.score(image, threads=threads)))
-
-
-def _tally(rows: Sequence[Selection]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in chosen_counts(rows).items())

@@ -9,8 +9,7 @@ from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import write_rgb
 from cleargs.rivr.candidates import CANDIDATES
-from cleargs.rivr.distillation import Snapshot
-from cleargs.rivr.rounds import observation
+from cleargs.rivr.distillation import Snapshot, observation
 from cleargs.rivr.tables import Selection
 from cleargs.splat.views import View
 
@@ -42,17 +41,13 @@ def write_before_after_sheet(
             Tile(after.render(view), "final"),
             Tile(observation(view)[0], "observed"),
         ]
-        if repaired:
-            line.append(_repair(repairs.get(view.frame_id), rivr))
+        if (row := repairs.get(view.frame_id)) is not None:
+            image = from_layer(read_exr(rivr / row.exr).layers[row.chosen])
+            line.append(Tile(image, f"repair: {row.chosen}, round {row.round}"))
+        elif repaired:
+            line.append(Tile(None, "no repair"))
         lines.append(line)
     write_rgb(path, contact_sheet(lines or [_nothing()]))
-
-
-def _repair(row: Selection | None, rivr: Path) -> Tile:
-    if row is None:
-        return Tile(None, "no repair")
-    image = from_layer(read_exr(rivr / row.exr).layers[row.chosen])
-    return Tile(image, f"repair: {row.chosen}, round {row.round}")
 
 
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:

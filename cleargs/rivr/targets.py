@@ -3,7 +3,7 @@ the trajectory, and those that are held back to measure whether repairing does h
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -36,19 +36,6 @@ class Appraisal:
     """Of the frame's raw supervision; 0: it is never loaded."""
 
 
-def target_frames(frames: Sequence[Appraisal], which: Targets, held_back: Collection[int]) -> list[int]:
-    """The frames that every round visits, in order.
-
-    frames: the registered training frames by frame_id. ``all`` takes each of them, ``degraded`` those whose
-    role is not ``strong``; ``held_back`` ones are never taken.
-    """
-    return [
-        frame.frame_id
-        for frame in frames
-        if frame.frame_id not in held_back and (which == "all" or frame.role != "strong")
-    ]
-
-
 def held_back_frames(frames: Sequence[Appraisal], share: float = 0.125) -> list[int]:
     """A share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many equal
     parts of the trajectory (ties: the one nearest to the part's middle); in order.
@@ -63,8 +50,12 @@ def held_back_frames(frames: Sequence[Appraisal], share: float = 0.125) -> list[
     if not references or share == 0.0:
         return []
     count = max(1, int(len(references) * share))
-    borders = [k * len(references) // count for k in range(count + 1)]
-    return [_best(references[start:end]).frame_id for start, end in pairwise(borders)]
+    return [_best(references[start:end]).frame_id for start, end in _parts(len(references), count)]
+
+
+def _parts(count: int, parts: int) -> Iterator[tuple[int, int]]:
+    """Start and end of each of so many nearly equal parts of ``count`` things in a row."""
+    return pairwise(k * count // parts for k in range(parts + 1))
 
 
 def _best(frames: Sequence[Appraisal]) -> Appraisal:
@@ -93,10 +84,9 @@ def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> 
     """
     frames = len(targets)
     count = 1 if size is None else max(1, -(-frames // size))
-    borders = [k * frames // count for k in range(count + 1)]
     return [
         Group(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
-        for start, end in pairwise(borders)
+        for start, end in _parts(frames, count)
     ]
 
 
@@ -121,8 +111,13 @@ class Supervision:
         return [self.views[frame_id] for frame_id in self.held_back]
 
     def targets(self, which: Targets) -> list[View]:
-        """The frames that every round repairs."""
-        return [self.views[frame_id] for frame_id in target_frames(self.appraisals, which, self.held_back)]
+        """The frames that every round repairs: ``all``, or those whose role is not ``strong``, but never the
+        held-back ones."""
+        return [
+            self.views[frame.frame_id]
+            for frame in self.appraisals
+            if frame.frame_id not in self.held_back and (which == "all" or frame.role != "strong")
+        ]
 
     def worst(self, frame_ids: Sequence[int], count: int) -> list[View]:
         """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from OpenImageIO import FLOAT, ImageOutput, ImageSpec
 
-from cleargs.errors import StoreError
-from cleargs.files import atomic_path, write_bytes, write_json
+from cleargs.files import write_json
 from cleargs.media.colour import srgb_from_linear
 from cleargs.parquet import column
 from cleargs.synth.optics import Array, Lens
@@ -63,30 +60,6 @@ def develop(
         shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
         image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
     return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
-
-
-def write_image(path: Path, image: NDArray[np.uint8], jpeg: int | None = None) -> None:
-    """Write RGB [H, W, 3] in the format of the ending, as JPEG of quality ``jpeg``. Raises StoreError."""
-    options = [] if jpeg is None else [cv2.IMWRITE_JPEG_QUALITY, jpeg]
-    ok, data = cv2.imencode(path.suffix, image[..., ::-1], options)
-    if not ok:
-        raise ValueError(f"cannot encode {path.suffix}")
-    write_bytes(path, data.tobytes())
-
-
-def write_depth(path: Path, depth: Array) -> None:
-    """Write depth [H, W] as an EXR of one float32 channel ``Z``. Raises StoreError."""
-    spec = ImageSpec(depth.shape[1], depth.shape[0], 1, FLOAT)
-    spec.channelnames = ("Z",)
-    spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # OpenImageIO stamps the present time unless there is one
-    with atomic_path(path) as temporary:
-        output = ImageOutput.create(str(temporary))
-        pixels = np.ascontiguousarray(depth[..., None], np.float32)
-        if output is None or not (
-            output.open(str(temporary), spec) and output.write_image(pixels) and output.close()
-        ):
-            raise StoreError(f"cannot write {path}", hint="check the free space and the permissions")
 
 
 def write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: Array) -> None:  # [F, 3, 4]

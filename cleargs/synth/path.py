@@ -7,7 +7,7 @@ exposure and the readout, and so frame quality varies along it. Poses are camera
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
-from cleargs.synth.optics import Array
+from cleargs.synth.optics import Aperture, Array, Lens, Shutter, World
 
 UP = np.array([0.0, 1.0, 0.0])
 DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
@@ -36,6 +36,19 @@ class Course(Protocol):
     def novel(self, share: float, rng: np.random.Generator) -> Array:
         """A pose [3, 4] off the course, near ``share``, that looks at what the course looks at."""
         ...
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a capture is made."""
+
+    name: str
+    world: World
+    course: Course
+    lens: Lens
+    film: Callable[[Shutter, Lens, Aperture], tuple[Array, Array]] | None = None
+    """The world with something that moves in it: light, and the share of the exposure in which a pixel sees
+    it. A trained scene has none."""
 
 
 def look_at(centres: Array, target: Array) -> Array:  # [..., 3], [3]

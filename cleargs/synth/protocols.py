@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
@@ -128,7 +129,8 @@ def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generato
     0.1 stops, as automatic exposure does.
     """
     count = len(motions)
-    spoilt = _one_of_two(count, rng)
+    pairs = np.arange(0, count - 1, 2)
+    spoilt = [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
     by_speed = sorted(spoilt, key=lambda number: -motions[number].blur(0.02))
     blurred = by_speed[: round(0.6 * len(by_speed))]
     defocused = sorted(by_speed[len(blurred) :])[::2]
@@ -149,12 +151,6 @@ def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generato
     return faults
 
 
-def _one_of_two(count: int, rng: np.random.Generator) -> list[int]:
-    """One of every two neighbouring numbers below ``count``."""
-    pairs = np.arange(0, count - 1, 2)
-    return [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
-
-
 def noisy_poses(
     poses: NDArray[np.float64],  # [F, 3, 4] camera to world
     protocol: Protocol,
@@ -162,8 +158,6 @@ def noisy_poses(
     seed: int,
 ) -> NDArray[np.float64]:  # [F, 3, 4]
     """The poses that the user is given, ``depth`` being the mean depth of the capture in world units."""
-    from scipy.spatial.transform import Rotation
-
     rng = np.random.default_rng([seed, Stream.POSE_NOISE])
     turns = np.radians(protocol.rotation_noise) * rng.standard_normal((len(poses), 3))
     shifts = protocol.translation_noise * depth * rng.standard_normal((len(poses), 3))

@@ -9,14 +9,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
-from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy
-from cleargs.synth.room import BOX, LEVELS, SIZE, SPHERE, TEXELS_PER_METRE, Balloon, Room
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy, phone_lens
+from cleargs.synth.path import Setting, orbit
+from cleargs.synth.room import (
+    BOX,
+    LEVEL_STARTS,
+    LEVELS,
+    SIZE,
+    SPHERE,
+    TEXELS_PER_METRE,
+    Balloon,
+    Room,
+    make_balloon,
+    make_room,
+)
 
 configure_numba("raycast")
 
@@ -26,7 +39,6 @@ LAMP = 1.9
 PENUMBRA, CONTACT = 0.1, 0.015
 """Half width of a shadow's soft rim: a share of the distance to what casts it, and metres."""
 OCCLUSION = 0.8
-_AT_REST = np.empty((0, 0, 3))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -111,14 +123,7 @@ def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv
 
 
 @njit(cache=True, error_model="numpy")
-def _sample(
-    texels: NDArray[np.float32],
-    offsets: NDArray[np.int64],
-    start: int,
-    uv: Array,
-    footprint: float,
-    colour: Array,
-) -> None:
+def _sample(texture: NDArray[np.float32], uv: Array, footprint: float, colour: Array) -> None:
     """Trilinear lookup; ``footprint`` is the size of a pixel on the surface, in metres."""
     level = min(max(math.log2(max(footprint * TEXELS_PER_METRE, 1e-6)), 0.0), LEVELS - 1.001)
     colour[0], colour[1], colour[2] = 0.0, 0.0, 0.0
@@ -135,7 +140,7 @@ def _sample(
             weight *= (y - row) if down else 1 - (y - row)
             texel = int(row + down) % side * side + int(column + right) % side
             for channel in range(3):
-                colour[channel] += weight * texels[start + offsets[mip] + texel, channel]
+                colour[channel] += weight * texture[LEVEL_STARTS[mip] + texel, channel]
 
 
 @njit(cache=True, error_model="numpy")
@@ -237,9 +242,7 @@ def _trace(
     ray: Array,
     pixel_angle: float,
     primitives: NDArray[np.void],
-    texels: NDArray[np.float32],
-    offsets: NDArray[np.int64],
-    stride: int,
+    textures: NDArray[np.float32],
     light: Array,
     colour: Array,
     scratch: Array,  # [10, 3], so that a ray allocates nothing
@@ -278,7 +281,7 @@ def _trace(
     _to_local(item, point, True, local_point)
     facing = max(abs(_dot(world_normal, ray)), 0.05)
     _texture_coordinates(item["kind"], local_point, best_normal, item["size"], local_ray)
-    _sample(texels, offsets, item["texture"] * stride, local_ray, best * pixel_angle / facing, colour)
+    _sample(textures[item["texture"]], local_ray, best * pixel_angle / facing, colour)
 
     lit, ambient = _light_at(point, world_normal, to_light, reach, primitives, hit, scratch[7:10])
     diffuse = max(_dot(world_normal, to_light), 0.0) * lit * LAMP / (1 + 0.25 * reach * reach)
@@ -310,9 +313,7 @@ def _render(
     cx: float,
     cy: float,
     primitives: NDArray[np.void],
-    texels: NDArray[np.float32],
-    offsets: NDArray[np.int64],
-    stride: int,
+    textures: NDArray[np.float32],
     light: Array,
     track: Array,  # [S, H, 3] where the last primitive is; [0, 0, 3]: where it says itself
     image: Array,
@@ -323,13 +324,8 @@ def _render(
     last = primitives.shape[0] - 1
     for row in prange(height):
         items = primitives.copy() if track.shape[0] else primitives
-        origin, ray, colour, start, scratch = (
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros((10, 3)),
-        )
+        origin, ray, colour, start = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        scratch = np.zeros((10, 3))
         for column in range(width):
             for number in range(passes):
                 pose = poses[number, row]
@@ -344,9 +340,7 @@ def _render(
                     ray[axis] = _dot(pose[axis], start) / norm
                     on_lens = pose[axis, 0] * lens[number, 0] + pose[axis, 1] * lens[number, 1]
                     origin[axis] = pose[axis, 3] + on_lens
-                distance, hit = _trace(
-                    origin, ray, 1 / fx, items, texels, offsets, stride, light, colour, scratch
-                )
+                distance, hit = _trace(origin, ray, 1 / fx, items, textures, light, colour, scratch)
                 if hit == last:
                     share[row, column] += 1 / passes
                 depth[row, column] += distance * focus / norm / passes
@@ -362,54 +356,42 @@ class RoomWorld:
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
         """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
-        return self._expose(shutter, lens, aperture, self.room.primitives, _AT_REST)[0]
+        return self._expose(shutter, lens, aperture)[0]
 
     def film(
         self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
     ) -> tuple[Array, Array]:
         """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
         [H, W] of the exposure in which a pixel sees it."""
-        times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
-        primitives = np.append(self.room.primitives, balloon.item)
-        image, _, share = self._expose(shutter, lens, aperture, primitives, balloon.centres(times))
+        image, _, share = self._expose(shutter, lens, aperture, balloon)
         return image, share
 
     def depth(self, pose: Array, lens: Lens) -> Array:
         """Exact depth through the pixel centres."""
-        poses = np.broadcast_to(pose, (1, lens.height, 3, 4))
-        middle, centre = np.full((1, 2), 0.5), np.zeros((1, 2))
-        return self._cast(poses, middle, centre, 1.0, lens, self.room.primitives, _AT_REST)[1]
+        middle = Shutter(pose[None], np.zeros((1, lens.height), np.intp))
+        return self._expose(middle, lens, PINHOLE)[1]
 
     def _expose(
-        self,
-        shutter: Shutter,
-        lens: Lens,
-        aperture: Aperture,
-        primitives: NDArray[np.void],
-        track: Array,
+        self, shutter: Shutter, lens: Lens, aperture: Aperture, balloon: Balloon | None = None
     ) -> tuple[Array, Array, Array]:
-        points = np.broadcast_to(aperture.points, (shutter.samples, 2))
-        jitter, poses = low_discrepancy(shutter.samples), shutter.poses[shutter.index]
-        return self._cast(poses, jitter, points, aperture.focus, lens, primitives, track)
-
-    def _cast(
-        self,
-        poses: Array,
-        jitter: Array,
-        points: Array,
-        focus: float,
-        lens: Lens,
-        primitives: NDArray[np.void],
-        track: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Image, depth, and share of the samples that see the last of ``primitives``; see `_render`."""
+        """Image, depth, and share of the samples that see the last primitive; see `_render`."""
+        primitives, track = self.room.primitives, np.empty((0, 0, 3))
+        if balloon is not None:
+            times = np.broadcast_to(shutter.times, len(shutter.poses))[shutter.index]
+            primitives, track = np.append(primitives, balloon.item), balloon.centres(times)
         size = lens.height, lens.width
         image, depth, share = np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
-        textures = self.room.textures
+        points = np.ascontiguousarray(np.broadcast_to(aperture.points, (shutter.samples, 2)))
         _render(
-            np.ascontiguousarray(poses), jitter, np.ascontiguousarray(points), focus,
-            lens.fx, lens.fy, lens.cx, lens.cy, primitives,
-            textures.texels, textures.level_offsets, textures.stride, self.room.light, track,
+            shutter.poses[shutter.index], low_discrepancy(shutter.samples), points, aperture.focus,
+            lens.fx, lens.fy, lens.cx, lens.cy, primitives, self.room.textures, self.room.light, track,
             image, depth, share,
         )  # fmt: skip
         return image, depth, share
+
+
+def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
+    """The procedural room of ``seed``, in metres, and a walk around its table."""
+    room = make_room(seed)
+    world, course, lens = RoomWorld(room), orbit(room.focus, frames, seed), phone_lens(width, height)
+    return Setting("room", world, course, lens, partial(world.film, make_balloon(room, seed)))

@@ -20,16 +20,9 @@ SIZE = 512
 """Side of the finest mip level, in texels."""
 TEXELS_PER_METRE = 256.0
 LEVELS = 8
-
-
-@dataclass(frozen=True)
-class TextureSet:
-    """Mip chains of all textures in one flat array, as the ray caster reads them."""
-
-    texels: NDArray[np.float32]  # [sum of SIZE^2 / 4^level over textures and levels, 3], linear RGB
-    level_offsets: NDArray[np.int64]  # [LEVELS] start of a level inside one texture
-    stride: int
-    """Texels of one texture, all levels together."""
+LEVEL_STARTS = tuple(sum((SIZE >> finer) ** 2 for finer in range(level)) for level in range(LEVELS))
+"""Where each mip level begins in the chain of a texture."""
+SURFACES, PRINTS = 8, 6
 
 
 def _noise(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> NDArray[np.float64]:
@@ -86,19 +79,16 @@ def _print(rng: np.random.Generator) -> NDArray[np.float64]:
     return canvas / 255 * (1 + 0.05 * _noise(rng, 0.5)[..., None])
 
 
-def make_textures(rng: np.random.Generator, surfaces: int, prints: int) -> TextureSet:
-    """``surfaces`` material textures followed by ``prints`` posters, with box-filtered mip levels."""
-    images = [_surface(rng) for _ in range(surfaces)] + [_print(rng) for _ in range(prints)]
-    chains, offsets, offset = [], [], 0
-    for level in range(LEVELS):
-        offsets.append(offset)
-        offset += (SIZE >> level) ** 2
-    for image in images:
-        current = np.clip(image, 0.01, 0.98)
+def make_textures(rng: np.random.Generator) -> NDArray[np.float32]:  # [textures, texels of all levels, 3]
+    """`SURFACES` material textures followed by `PRINTS` posters, with box-filtered mip levels; linear RGB."""
+    chains = []
+    for image in [_surface(rng) for _ in range(SURFACES)] + [_print(rng) for _ in range(PRINTS)]:
+        current, chain = np.clip(image, 0.01, 0.98), []
         for _ in range(LEVELS):
-            chains.append(current.reshape(-1, 3).astype(np.float32))
+            chain.append(current.reshape(-1, 3).astype(np.float32))
             current = (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]) / 4
-    return TextureSet(np.concatenate(chains), np.array(offsets, np.int64), offset)
+        chains.append(np.concatenate(chain))
+    return np.stack(chains)
 
 
 PRIMITIVE = np.dtype(
@@ -110,10 +100,8 @@ PRIMITIVE = np.dtype(
         ("texture", np.int64),
         ("gloss", np.float64),  # strength of the highlight, 0 for a matt surface
         ("bound", np.float64),  # radius of the bounding sphere
-        (
-            "shade",
-            np.float64,
-        ),  # radius of a ball of its volume, that hides ambient light; 0: it casts no shadow
+        # Radius of a ball of its volume, that hides ambient light; 0: it casts no shadow.
+        ("shade", np.float64),
     ]
 )
 
@@ -123,7 +111,7 @@ class Room:
     """A world the ray caster can draw: metres, y up, the floor at y = 0."""
 
     primitives: NDArray[np.void]  # [P] of PRIMITIVE; the first is the room itself, seen from inside
-    textures: TextureSet
+    textures: NDArray[np.float32]  # [T, texels of all levels, 3] linear RGB
     light: NDArray[np.float64]  # [3] position of the lamp
     focus: NDArray[np.float64]  # [3] what a visitor looks at
 
@@ -146,7 +134,6 @@ class Balloon:
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
 FLOOR = 0.004
 """Half the thickness of the floor's covering."""
-SURFACES, PRINTS = 8, 6
 
 
 def _primitive(
@@ -170,7 +157,7 @@ def _primitive(
 def make_room(seed: int) -> Room:
     """The room of ``seed``: the same layout idea, other furniture, textures and light."""
     rng = np.random.default_rng([seed, Stream.ROOM])
-    textures = make_textures(rng, SURFACES, PRINTS)
+    textures = make_textures(rng)
 
     def material() -> int:
         return int(rng.integers(SURFACES))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +16,13 @@ from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
+from cleargs.splat.types import Render
 from cleargs.splat.views import view_of
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
-from cleargs.synth.path import CameraCourse, camera_course
+from cleargs.synth.path import Setting, camera_course
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
-
-
-@dataclass(frozen=True)
-class RealCamera:
-    """A camera of the capture that a scene was trained on, in the scene's world."""
-
-    lens: Lens
-    pose: Array  # [3, 4] camera to world, OpenCV axes
 
 
 class SplatWorld:
@@ -55,45 +48,35 @@ class SplatWorld:
         for (number, right, down), share in shares.items():
             pose = shutter.poses[number].copy()
             pose[:, 3] += pose[:, :2] @ np.array([right, down])
-            moved = Lens(
-                lens.width,
-                lens.height,
-                lens.fx,
-                lens.fy,
-                lens.cx + lens.fx * right / aperture.focus,
-                lens.cy + lens.fy * down / aperture.focus,
+            moved = replace(
+                lens,
+                cx=lens.cx + lens.fx * right / aperture.focus,
+                cy=lens.cy + lens.fy * down / aperture.focus,
             )
+            picture = np.clip(self._rendered(pose, moved).image.numpy().astype(np.float64), 0, 1)
             rows = share > 0
-            total[rows] += share[rows, None, None] * linear_from_srgb(self._picture(pose, moved)[rows])
+            total[rows] += share[rows, None, None] * linear_from_srgb(picture[rows])
         return total
 
     def depth(self, pose: Array, lens: Lens) -> Array:
         """The expected depth of the render; 0 where it is mostly transparent."""
-        rendered = self._engine.forward(
-            self._scene.gaussians, _camera(pose, lens), antialias=self._scene.antialias, depth=True
-        )
+        rendered = self._rendered(pose, lens, depth=True)
         assert rendered.depth is not None
         alpha = rendered.alpha.numpy().astype(np.float64)
         mean = rendered.depth.numpy() / np.maximum(alpha, OPAQUE)
         return np.where(alpha >= OPAQUE, mean, 0.0)
 
-    def _picture(self, pose: Array, lens: Lens) -> Array:
-        """sRGB in [0, 1]."""
-        rendered = self._engine.forward(
-            self._scene.gaussians,
-            _camera(pose, lens),
-            background=self._scene.background,
-            antialias=self._scene.antialias,
+    def _rendered(self, pose: Array, lens: Lens, *, depth: bool = False) -> Render:
+        scene, camera = self._scene, _camera(pose, lens)
+        return self._engine.forward(
+            scene.gaussians, camera, background=scene.background, antialias=scene.antialias, depth=depth
         )
-        return np.clip(rendered.image.numpy().astype(np.float64), 0, 1)
 
 
-def open_scene(
-    path: Path, cameras: Path | None, frames: int, width: int, height: int
-) -> tuple[SplatWorld, CameraCourse, Lens, str]:
-    """The scene in ``path`` as a world, ``frames`` of its real cameras as a course, their lens, and its name.
+def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
+    """The scene in ``path``, in its own units, and a walk along ``frames`` of its real cameras.
 
-    The cameras are those that ``cameras`` names (`read_cameras`), else those of the run that ``path`` lies
+    The cameras are those that ``cameras`` names (`_read_cameras`), else those of the run that ``path`` lies
     in: RUN/STAGE/scene.ply. The lens fills ``width`` x ``height`` and is that of the first camera.
 
     Raises InputError when the file is no scene, empty, or the cameras are missing or too few.
@@ -107,46 +90,38 @@ def open_scene(
             hint="give --cameras DIR, a folder with a transforms.json in the scene's world",
         )
     world = SplatWorld(_read_scene(path))
-    real = read_cameras(run if cameras is None else cameras)
-    course = camera_course([camera.pose for camera in real], frames)
-    return world, course, real[0].lens.fitted(width, height), path.stem if cameras is not None else run.name
+    real = _read_cameras(run if cameras is None else cameras)
+    course = camera_course([pose for _, pose in real], frames)
+    name = path.stem if cameras is not None else run.name
+    return Setting(name, world, course, real[0][0].fitted(width, height))
 
 
-def read_cameras(source: Path) -> list[RealCamera]:
-    """Cameras in frame order: of a run, of a transforms.json, or of the folder that holds one.
+def _read_cameras(source: Path) -> list[tuple[Lens, Array]]:
+    """Lens and pose [3, 4] in frame order: of a run, of a transforms.json, or of the folder that holds one.
 
     Raises InputError when there are none.
     """
-    table = source / "ingest" / "frames.parquet"
-    if table.is_file():
-        return _cameras_of_run(table.parent)
+    ingest = source / "ingest"
+    if (ingest / "frames.parquet").is_file():
+        cameras = [view_of(frame, ingest, 0.0).camera for frame in load_frames(ingest) if frame.registered]
+        return [
+            (
+                Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
+                np.column_stack([camera.world_to_camera[:3, :3].T, camera.centre]),
+            )
+            for camera in cameras
+        ]
     transforms = source / "transforms.json" if source.is_dir() else source
     if not transforms.is_file():
         raise InputError(
             f"{source} holds no cameras", hint="give a transforms.json, a folder that holds one, or a run"
         )
-    return _cameras_of_transforms(transforms)
-
-
-def _cameras_of_run(ingest: Path) -> list[RealCamera]:
-    cameras = []
-    for frame in load_frames(ingest):
-        if frame.registered:
-            camera = view_of(frame, ingest, 0.0).camera
-            lens = Lens(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy)
-            pose = np.column_stack([camera.world_to_camera[:3, :3].T, camera.centre])
-            cameras.append(RealCamera(lens, pose))
-    return cameras
-
-
-def _cameras_of_transforms(path: Path) -> list[RealCamera]:
-    cameras = []
-    for frame in read_transforms(path, poses=True):
+    found = []
+    for frame in read_transforms(transforms, poses=True):
         assert frame.camera is not None and frame.pose is not None
-        (fx, fy), (cx, cy) = frame.camera.focal, frame.camera.centre
-        pose = np.column_stack([frame.pose.rotation.T, frame.pose.centre])
-        cameras.append(RealCamera(Lens(frame.camera.width, frame.camera.height, fx, fy, cx, cy), pose))
-    return cameras
+        lens = Lens(frame.camera.width, frame.camera.height, *frame.camera.focal, *frame.camera.centre)
+        found.append((lens, np.column_stack([frame.pose.rotation.T, frame.pose.centre])))
+    return found
 
 
 def _read_scene(path: Path) -> Scene:

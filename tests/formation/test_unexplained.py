@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.photograph import Doubt
+from cleargs.formation.photograph import pixel_weights
 
 HEIGHT, WIDTH = 108, 192
 TOLERANCE = 0.05
@@ -26,7 +26,7 @@ def disc() -> Tensor:
 
 
 def counts(photograph: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    return Doubt(target, mask, TOLERANCE).counts(photograph)
+    return pixel_weights(photograph, target, mask, TOLERANCE)
 
 
 def test_a_frame_with_nothing_unexplained_counts_whole_to_the_bit() -> None:

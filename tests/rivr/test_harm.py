@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 from cleargs.rivr.harm import Fidelity, HarmConfig, Verdict, judge_harm
 
 
 def verdict(psnr: float, score: float) -> Verdict:
-    before = Fidelity((30.0, 20.0), (60.0, 70.0))
-    after = Fidelity((30.0 + psnr, 20.0 + psnr), (60.0 + score, 70.0 + score))
+    before, after = Fidelity(25.0, 65.0), Fidelity(25.0 + psnr, 65.0 + score)
     return judge_harm([3, 9], before, after, HarmConfig(psnr_margin=0.5, score_margin=1.0))
 
 
@@ -28,9 +25,9 @@ def test_either_figure_can_reject() -> None:
     assert " and " in both.harm
 
 
-def test_the_figures_are_means_over_the_frames() -> None:
-    summary = verdict(-0.25, 1.0).summary()
-    assert summary["frames"] == [3, 9]
-    assert math.isclose(summary["psnr_before"], 25.0)
-    assert math.isclose(summary["psnr_after"], 24.75)
-    assert math.isclose(summary["score_after"], 66.0)
+def test_a_verdict_has_the_figures_that_decided() -> None:
+    assert verdict(-0.25, 1.0) == Verdict([3, 9], 25.0, 24.75, 65.0, 66.0, harm=None)
+
+
+def test_without_held_back_frames_there_is_no_harm() -> None:
+    assert judge_harm([], None, None, HarmConfig()) == Verdict([], None, None, None, None, harm=None)

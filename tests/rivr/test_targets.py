@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from cleargs.rivr.targets import Appraisal, held_back_frames, target_frames
+from cleargs.rivr.targets import Appraisal, Supervision, held_back_frames
 
 
 def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[Appraisal]:
@@ -22,12 +23,18 @@ def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[Apprai
 ROLES = ["strong", "geometric", "suppressed", "strong", "reactivated", "auxiliary"]
 
 
+def supervision() -> Supervision:
+    """Frame 13 is held back; a number stands for its view."""
+    views: Any = {frame_id: frame_id for frame_id in range(10, 16)}
+    return Supervision(views, appraised(ROLES), [13])
+
+
 def test_all_takes_every_frame_but_the_held_back() -> None:
-    assert target_frames(appraised(ROLES), "all", {13}) == [10, 11, 12, 14, 15]
+    assert supervision().targets("all") == [10, 11, 12, 14, 15]
 
 
 def test_degraded_leaves_the_strong_ones_out() -> None:
-    assert target_frames(appraised(ROLES), "degraded", {13}) == [11, 12, 14, 15]
+    assert supervision().targets("degraded") == [11, 12, 14, 15]
 
 
 @pytest.mark.parametrize(("strong", "expected"), [(1, 1), (7, 1), (8, 1), (16, 2), (23, 2), (24, 3)])

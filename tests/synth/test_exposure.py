@@ -13,8 +13,8 @@ from cleargs.splat.scene import Scene
 from cleargs.synth.image_motion import INSTANTS, ROW_STEP, FrameMotion, duration_for, follow
 from cleargs.synth.optics import MIN_SAMPLES, Aperture, Lens, Shutter, World, disc, phone_lens, still
 from cleargs.synth.path import frame_times, make_path
+from cleargs.synth.raycast import room_setting
 from cleargs.synth.splat_world import SplatWorld, _camera
-from cleargs.synth.synthetic_capture import room_setting
 
 WIDTH, HEIGHT = 96, 54
 EXPOSURE, READOUT = 0.06, 0.05

@@ -18,9 +18,9 @@ from cleargs.synth.optics import Shutter
 from cleargs.synth.path import FPS, frame_times, make_path
 from cleargs.synth.phone import LAG, METERED, Look, auto_exposure, coded, phone_look
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, plan
-from cleargs.synth.raycast import RoomWorld
+from cleargs.synth.raycast import RoomWorld, room_setting
 from cleargs.synth.room import make_balloon, make_room
-from cleargs.synth.synthetic_capture import make_capture, room_setting
+from cleargs.synth.synthetic_capture import make_capture
 
 WIDTH, HEIGHT, SEED = 96, 54, 3
 UNRELIABLE = 7.0

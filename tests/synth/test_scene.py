@@ -19,8 +19,8 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.synth.path import camera_course, look_at
-from cleargs.synth.splat_world import open_scene
+from cleargs.synth.path import CameraCourse, camera_course, look_at
+from cleargs.synth.splat_world import scene_setting
 from cleargs.synth.synthetic_capture import make_capture
 
 CAMERAS = 9
@@ -106,28 +106,29 @@ def test_cameras_of_a_transforms_file_will_do(tmp_path: Path) -> None:
     make_capture(tmp_path / "c", "sharp", frames=6, width=32, height=18, seed=0, reporter=SilentReporter())
     write_ply(tmp_path / "fox.ply", scene())
     with pytest.raises(InputError, match="does not lie in a run") as error:
-        open_scene(tmp_path / "fox.ply", None, 6, 32, 18)
+        scene_setting(tmp_path / "fox.ply", None, 6, 32, 18)
     assert "--cameras" in error.value.hint
     for cameras in (tmp_path / "c", tmp_path / "c" / "transforms.json"):
-        _, course, lens, name = open_scene(tmp_path / "fox.ply", cameras, 6, 64, 36)
-        assert name == "fox" and (lens.width, lens.height) == (64, 36)
-    assert course.steps == 5
+        setting = scene_setting(tmp_path / "fox.ply", cameras, 6, 64, 36)
+        lens = setting.lens
+        assert setting.name == "fox" and (lens.width, lens.height) == (64, 36)
+    assert isinstance(setting.course, CameraCourse) and setting.course.steps == 5
     with pytest.raises(InputError, match="7 frames cannot follow 6 cameras"):
-        open_scene(tmp_path / "fox.ply", tmp_path / "c", 7, 32, 18)
+        scene_setting(tmp_path / "fox.ply", tmp_path / "c", 7, 32, 18)
     with pytest.raises(InputError, match="holds no cameras"):
-        open_scene(tmp_path / "fox.ply", tmp_path / "nowhere", 6, 32, 18)
+        scene_setting(tmp_path / "fox.ply", tmp_path / "nowhere", 6, 32, 18)
 
 
 def test_refuses_what_is_not_a_scene(run: Path, tmp_path: Path) -> None:
     path = run / "g0" / "scene.ply"
     write_ply(path, scene(0))
     with pytest.raises(InputError, match="holds no Gaussians"):
-        open_scene(path, None, 4, 32, 18)
+        scene_setting(path, None, 4, 32, 18)
     mesh = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
     for content in (b"not a ply", mesh.encode() + bytes(4), b""):
         path.write_bytes(content)
         with pytest.raises(InputError, match="is not a Gaussian scene") as error:
-            open_scene(path, None, 4, 32, 18)
+            scene_setting(path, None, 4, 32, 18)
         assert "\n" not in str(error.value) and error.value.hint
     with pytest.raises(InputError):
-        open_scene(tmp_path / "missing.ply", None, 4, 32, 18)
+        scene_setting(tmp_path / "missing.ply", None, 4, 32, 18)

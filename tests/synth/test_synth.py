@@ -22,9 +22,9 @@ from cleargs.synth import raycast
 from cleargs.synth.optics import Lens
 from cleargs.synth.path import look_at
 from cleargs.synth.protocols import PROTOCOLS
-from cleargs.synth.raycast import RoomWorld
+from cleargs.synth.raycast import RoomWorld, room_setting
 from cleargs.synth.room import DEPTH, SPHERE, Room, make_room
-from cleargs.synth.synthetic_capture import make_capture, room_setting
+from cleargs.synth.synthetic_capture import make_capture
 
 SIZE = {"width": 96, "height": 54}
 
