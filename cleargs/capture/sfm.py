@@ -69,7 +69,8 @@ def reconstruct(
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
         return Reconstruction(_moved(model, similarity), similarity, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
-    similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
+    poses = [frame.source.pose for frame in posed if frame.source.pose is not None]
+    similarity = normalise(poses)
     adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
     if adopted is not None and adopted.dropped:
         reporter.warn(
@@ -80,8 +81,8 @@ def reconstruct(
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
             return Reconstruction(adopted, similarity, Outcome(placed=placed, missed_px=missed))
-    poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
-    model, outcome = _run(job_of(posed, poses, folder, config, seed, threads), reporter)
+    moved = [similarity.pose(pose) for pose in poses]
+    model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",

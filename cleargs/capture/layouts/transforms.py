@@ -101,11 +101,11 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
             from cleargs.media.image import read_rgb
 
             height, width = read_rgb(image).shape[:2]
-        fx = _focal(values, "x", width)
-        fy = _focal(values, "y", height)
-        if fx is None and fy is None:
+        fx, fy = _focal(values, "x", width), _focal(values, "y", height)
+        fx = fy if fx is None else fx
+        fy = fx if fy is None else fy
+        if fx is None or fy is None:
             raise ValueError("neither fl_x nor camera_angle_x is given")
-        fx, fy = _either(fx, fy), _either(fy, fx)
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         k1, k2, k3, k4, p1, p2 = (float(values.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     except FAULTS as error:
@@ -126,11 +126,6 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
     if k1 or k2 or p1 or p2:
         return Camera("OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2))
     return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
-
-
-def _either(focal: float | None, other: float | None) -> float:
-    """``focal``, or the other axis's where it is not given; 0 is given, and refused later."""
-    return other or 0.0 if focal is None else focal
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:
