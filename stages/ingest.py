@@ -120,11 +120,10 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 
 def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, make them upright and small, find or take their poses, undistort, publish."""
-    from cleargs.capture.holdout import held_out, holdout_hash
+    from cleargs.capture.choice import held_out, holdout_hash, sharpest
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
-    from cleargs.capture.sharpest import sharpest
     from cleargs.capture.sources import open_capture
     from cleargs.media.image import read_rgb
 

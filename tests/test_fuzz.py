@@ -23,11 +23,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cleargs.batch.sheet import read_scenes
-from cleargs.capture.cameras import Pose, pinhole
+from cleargs.capture.cameras import Pose, Similarity, pinhole
 from cleargs.capture.layouts.llff import read_poses_bounds
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.poses import Similarity
 from cleargs.capture.sources import externals
 from cleargs.errors import CleargsError
 from cleargs.files import write_json

@@ -14,9 +14,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, Pose
+from cleargs.capture.cameras import Camera, Pose, within_reach
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.poses import within_reach
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.untrusted import FAULTS, cause, open_regular, read_bytes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,18 +21,6 @@ from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
-
-
-@dataclass(frozen=True)
-class _View:
-    """A published frame."""
-
-    frame: WorkFrame
-    camera: Camera
-    image: ModelImage | None
-    """Observations in pixels of the published image; None when unregistered."""
-    placed: str
-    """How the pose was found, or why there is none."""
 
 
 def publish(
@@ -59,30 +47,31 @@ def publish(
     for file in (out / "images").iterdir():
         if file.name not in ours:
             remove(file)
-    views: list[_View] = []
+    flat: list[Camera] = []
+    numbers: dict[Camera, int] = {}
+    images: dict[int, ModelImage] = {}
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
-    undistorters: dict[Camera, Undistorter] = {}
-    cameras = _cameras(frames, model)
+    lenses = _cameras(frames, model)
+    undistorters = {lens: undistorter(lens, max_size) for lens in dict.fromkeys(lenses)}
     registered = {image.name: image for image in model.images.values()}
     with reporter.task("undistorting", len(frames)) as task:
-        for index, frame in enumerate(frames):
-            lens = cameras[index]
-            if lens not in undistorters:
-                undistorters[lens] = undistorter(lens, max_size)
+        for index, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
             undistortion = undistorters[lens]
+            flat.append(undistortion.pinhole)
             rgb = _write_picture(frame, undistortion, work, out, reporter)
-            image = registered.get(frame.image)
-            if image is not None:
-                image = _flattened(image, undistortion)
+            if frame.image in registered:
+                image = _flattened(registered[frame.image], undistortion)
                 if index not in test:
                     rows = np.searchsorted(model.point_ids, image.point_ids)
                     x, y = image.xy.astype(np.int64).T
                     sums[rows] += rgb[y, x]
                     samples[rows] += 1
-            views.append(_View(frame, undistortion.pinhole, image, placed[frame.image]))
+                number = numbers.setdefault(undistortion.pinhole, len(numbers) + 1)
+                images[index + 1] = replace(image, camera_id=number)
             task.advance()
-    counts = _track_lengths(views, model.point_ids)
+    seen = np.concatenate([image.point_ids for image in images.values()])
+    counts = np.bincount(np.searchsorted(model.point_ids, seen), minlength=len(model.point_ids))
     kept = (counts >= 2) & (samples >= 1)
     if not kept.any():
         raise StageError(
@@ -90,30 +79,35 @@ def publish(
             hint="record with more texture and overlap between frames",
         )
     rgb_mean = np.rint(sums[kept] / samples[kept, None]).astype(np.uint8)
-    published = _with_views(model, views).kept(kept)
-    _write_tables(out, views, test, published, rgb_mean, counts[kept])
+    cameras = {number: camera for camera, number in numbers.items()}
+    published = replace(model, cameras=cameras, images=images).kept(kept)
+    table = [
+        _frame_row(
+            index,
+            frame,
+            camera,
+            published.images.get(index + 1),
+            "test" if index in test else "train",
+            placed[frame.image],
+        )
+        for index, (frame, camera) in enumerate(zip(frames, flat, strict=True))
+    ]
+    write_table(out / "frames.parquet", pa.Table.from_pylist(table, FRAMES), FRAMES)
+    _write_points(out, published, rgb_mean, counts[kept].astype(np.int32))
     write_model(out / "colmap" / "sparse" / "0", published, rgb_mean)
     return published
 
 
 def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
     """The camera of each frame; an unregistered one takes its own, else the commonest of its size."""
-    found: list[Camera | None] = []
     by_name = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
-    for frame in frames:
-        found.append(by_name.get(frame.image, frame.camera))
-    common: dict[tuple[int, int], Counter[Camera]] = {}
-    for camera in found:
-        if camera is not None:
-            common.setdefault((camera.width, camera.height), Counter())[camera] += 1
+    found = [by_name.get(frame.image, frame.camera) for frame in frames]
+    common = Counter(camera for camera in found if camera is not None).most_common()
     cameras = []
     for frame, camera in zip(frames, found, strict=True):
-        if camera is None:
-            alike = common.get((frame.width, frame.height))
-            camera = (
-                alike.most_common(1)[0][0] if alike else guessed_camera("PINHOLE", frame.width, frame.height)
-            )
-        cameras.append(camera)
+        size = (frame.width, frame.height)
+        alike = (other for other, _ in common if (other.width, other.height) == size)
+        cameras.append(camera or next(alike, None) or guessed_camera("PINHOLE", *size))
     return cameras
 
 
@@ -140,39 +134,9 @@ def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
     return replace(image, xy=xy).kept(undistortion.inside(xy))
 
 
-def _track_lengths(views: Sequence[_View], point_ids: NDArray[np.int64]) -> NDArray[np.int32]:
-    counts = np.zeros(len(point_ids), np.int32)
-    for view in views:
-        if view.image is not None:
-            counts[np.searchsorted(point_ids, view.image.point_ids)] += 1
-    return counts
-
-
-def _with_views(model: SparseModel, views: Sequence[_View]) -> SparseModel:
-    """``model`` with the registered views as its images: image id = frame_id + 1, an id a distinct camera."""
-    ids: dict[Camera, int] = {}
-    images = {}
-    for index, view in enumerate(views):
-        if view.image is not None:
-            camera_id = ids.setdefault(view.camera, len(ids) + 1)
-            images[index + 1] = replace(view.image, camera_id=camera_id)
-    cameras = {camera_id: camera for camera, camera_id in ids.items()}
-    return replace(model, cameras=cameras, images=images)
-
-
-def _write_tables(
-    out: Path,
-    views: Sequence[_View],
-    test: set[int],
-    model: SparseModel,
-    rgb: NDArray[np.uint8],
-    track_length: NDArray[np.int32],
+def _write_points(
+    out: Path, model: SparseModel, rgb: NDArray[np.uint8], track_length: NDArray[np.int32]
 ) -> None:
-    rows = [
-        _frame_row(index, view, model.images.get(index + 1), "test" if index in test else "train")
-        for index, view in enumerate(views)
-    ]
-    write_table(out / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
     points = {
         "point_id": model.point_ids,
         **{name: model.xyz[:, axis] for axis, name in enumerate("xyz")},
@@ -189,15 +153,17 @@ def _write_tables(
     write_table(out / "observations.parquet", pa.table(observations, OBSERVATIONS), OBSERVATIONS)
 
 
-def _frame_row(index: int, view: _View, image: ModelImage | None, split: str) -> dict[str, object]:
-    (fx, fy), (cx, cy) = view.camera.focal, view.camera.centre
+def _frame_row(
+    index: int, frame: WorkFrame, camera: Camera, image: ModelImage | None, split: str, placed: str
+) -> dict[str, object]:
+    (fx, fy), (cx, cy) = camera.focal, camera.centre
     row: dict[str, object] = {
         "frame_id": index,
-        "name": view.frame.source.name,
-        "image": f"images/{view.frame.image}",
-        "time_s": view.frame.source.time_s,
-        "width": view.camera.width,
-        "height": view.camera.height,
+        "name": frame.source.name,
+        "image": f"images/{frame.image}",
+        "time_s": frame.source.time_s,
+        "width": camera.width,
+        "height": camera.height,
         "fx": fx,
         "fy": fy,
         "cx": cx,
@@ -205,10 +171,9 @@ def _frame_row(index: int, view: _View, image: ModelImage | None, split: str) ->
         "registered": image is not None,
         "n_points": 0 if image is None else len(image.point_ids),
         "split": split,
-        "placed": view.placed,
+        "placed": placed,
     }
     if image is not None:
-        pose = image.pose
-        row.update(zip(("qw", "qx", "qy", "qz"), pose.quaternion, strict=True))
-        row.update(zip(("tx", "ty", "tz"), pose.translation.tolist(), strict=True))
+        row.update(zip(("qw", "qx", "qy", "qz"), image.pose.quaternion, strict=True))
+        row.update(zip(("tx", "ty", "tz"), image.pose.translation.tolist(), strict=True))
     return row

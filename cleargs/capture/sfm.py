@@ -14,12 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.cameras import Camera, Pose, guessed_camera
+from cleargs.capture.cameras import Camera, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
-from cleargs.capture.poses import Similarity, normalise
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_worker import OUTCOME, Job, Outcome
 from cleargs.errors import InputError, StageError
@@ -65,12 +64,13 @@ def reconstruct(
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
-        model, outcome = _run(frames, None, folder, config, seed, threads, reporter)
+        model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
         return Reconstruction(_moved(model, similarity), similarity, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
-    similarity = normalise([frame.source.pose for frame in posed if frame.source.pose is not None])
+    poses = [frame.source.pose for frame in posed if frame.source.pose is not None]
+    similarity = normalise(poses)
     adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
     if adopted is not None and adopted.dropped:
         reporter.warn(
@@ -81,8 +81,8 @@ def reconstruct(
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
             return Reconstruction(adopted, similarity, Outcome(placed=placed, missed_px=missed))
-    poses = [similarity.pose(frame.source.pose) for frame in posed if frame.source.pose is not None]
-    model, outcome = _run(posed, poses, folder, config, seed, threads, reporter)
+    moved = [similarity.pose(pose) for pose in poses]
+    model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",
@@ -113,23 +113,14 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 
 
-def _run(
-    frames: Sequence[WorkFrame],
-    poses: Sequence[Pose] | None,
-    folder: Path,
-    config: SfmConfig,
-    seed: int,
-    threads: int,
-    reporter: Reporter,
-) -> tuple[SparseModel, Outcome]:
+def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, Outcome]:
     """Let COLMAP do its work, unless a killed run got as far as the model."""
-    if (found := _resumed(folder, reporter)) is not None:
+    if (found := _resumed(job.folder, reporter)) is not None:
         return found
-    write_json(
-        folder / "job.json", job_of(frames, poses, folder, config, seed, threads).model_dump(mode="json")
-    )
-    run_child("cleargs.capture.sfm_worker", folder / "job.json", folder / "colmap.log", reporter)
-    return _read(folder / "model")
+    file = job.folder / "job.json"
+    write_json(file, job.model_dump(mode="json"))
+    run_child("cleargs.capture.sfm_worker", file, job.folder / "colmap.log", reporter)
+    return _read(job.folder / "model")
 
 
 def job_of(

@@ -25,10 +25,9 @@ class Undistorter:
     pinhole: Camera
     """Camera of the published image."""
     _lens: Camera
-    _flat: Camera
-    """Pinhole at the lens's own focal length, before the reduction to the published size."""
     _map: tuple[NDArray[np.float32], NDArray[np.float32]] | None
-    """Where each pixel of the flat image lies in the lens's; None without distortion."""
+    """Where each pixel of the flat image, which is not reduced yet, lies in the lens's; None without
+    distortion."""
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W, 3]
         """Bicubic into the flat image, then area averaging to the published size; sRGB throughout."""
@@ -64,7 +63,7 @@ def undistorter(lens: Camera, max_size: int) -> Undistorter:
     """
     if lens.is_pinhole:
         flat = pinhole(lens.width, lens.height, *lens.focal, *lens.centre)
-        return Undistorter(flat.resized(*reduced_size(flat.width, flat.height, max_size)), lens, flat, None)
+        return Undistorter(flat.resized(*reduced_size(flat.width, flat.height, max_size)), lens, None)
     left, top, right, bottom = _covered(lens)
     fx, fy = lens.focal
     width, height = int((right - left) * fx), int((bottom - top) * fy)
@@ -80,7 +79,7 @@ def undistorter(lens: Camera, max_size: int) -> Undistorter:
     # OpenCV puts the centre of the first pixel at 0, COLMAP at 0.5.
     where = lens.colmap().img_from_cam(rays.reshape(-1, 3)).reshape(height, width, 2).astype(np.float32) - 0.5
     maps = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
-    return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, flat, maps)
+    return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, maps)
 
 
 def _covered(lens: Camera) -> tuple[float, float, float, float]:

@@ -107,8 +107,8 @@ def export(
         if file.exists() and not force:
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
+    from cleargs.capture.cameras import Similarity
     from cleargs.capture.model import moved, read_model, write_model
-    from cleargs.capture.poses import Similarity
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.splat.camera import cameras_json

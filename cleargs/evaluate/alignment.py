@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import Similarity
+from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate.eval_report import Alignment
 from cleargs.evaluate.refinement import rotation_between

@@ -14,8 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import Similarity, rigid_pose
+from cleargs.capture.cameras import Pose, Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose
 from cleargs.capture.capture import Capture
-from cleargs.capture.holdout import held_out
+from cleargs.capture.choice import held_out
 from cleargs.capture.layouts.llff import read_llff, read_poses_bounds
 from cleargs.capture.model import write_model
 from cleargs.capture.sources import externals, open_capture

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cleargs.capture import sharpest as module
-from cleargs.capture.sharpest import CHOICE, sharpest
+from cleargs.capture import choice as module
+from cleargs.capture.choice import CHOICE, sharpest
 from cleargs.capture.sources import open_capture
 from cleargs.media.encode import write_video
 from cleargs.progress import SilentReporter

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import Similarity
+from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.tables import FRAMES, load_frames
 from cleargs.digest import DigestMemo, file_digest
 from cleargs.evaluate.config import EvalOptions

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Camera as Lens
-from cleargs.capture.cameras import Pose
-from cleargs.capture.poses import Similarity
+from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate.alignment import align_cameras, umeyama
 from cleargs.evaluate.config import EvalOptions

@@ -92,8 +92,7 @@ def read_poses_bounds(path: Path) -> NDArray[np.float64]:  # [N, 17]
 def _frame(row: NDArray[np.float64], path: Path) -> SourceFrame:
     import numpy as np
 
-    from cleargs.capture.cameras import pinhole
-    from cleargs.capture.poses import rigid_pose
+    from cleargs.capture.cameras import pinhole, rigid_pose
 
     hint = f"correct its row of {POSES_BOUNDS}, remove both row and image, or set ingest.poses=sfm"
     # Columns: the camera's down, right and back axes in the world, its centre, and (height, width, focal).

@@ -33,22 +33,6 @@ class _Entry:
     """None where it names none, or there is none."""
 
 
-@dataclass(frozen=True)
-class _Listing:
-    """A transforms.json."""
-
-    common: Mapping[str, Any]
-    """All that stands beside ``frames``."""
-    entries: tuple[_Entry, ...]
-
-    @property
-    def files(self) -> dict[str, Path]:
-        """Every file that the entries name and that is there, by its name in the listing."""
-        images = {entry.values["file_path"]: entry.image for entry in self.entries}
-        masks = {entry.values.get("mask_path"): entry.mask for entry in self.entries}
-        return {str(name): file for name, file in {**masks, **images}.items() if file is not None}
-
-
 def detect(source: Path, *, poses: bool) -> bool:
     """See `Layout.detect`: it lists images, with or without poses."""
     return (source / "transforms.json").is_file()
@@ -57,7 +41,11 @@ def detect(source: Path, *, poses: bool) -> bool:
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
     """See `Layout.externals`. Raises InputError where the file cannot be read."""
     file = source / "transforms.json"
-    return {"transforms": file, "images": _read_listing(file).files, **mask_externals(source)}
+    _, entries = _read_listing(file)
+    images = {entry.values["file_path"]: entry.image for entry in entries}
+    masks = {entry.values.get("mask_path"): entry.mask for entry in entries}
+    found = {str(name): path for name, path in {**masks, **images}.items() if path is not None}
+    return {"transforms": file, "images": found, **mask_externals(source)}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
@@ -78,8 +66,8 @@ def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
 
     Raises InputError for damaged JSON, missing images, missing or NaN poses, unknown cameras.
     """
-    listing = _read_listing(path)
-    missing = [entry.values["file_path"] for entry in listing.entries if entry.image is None]
+    common, entries = _read_listing(path)
+    missing = [entry.values["file_path"] for entry in entries if entry.image is None]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise InputError(
@@ -87,7 +75,7 @@ def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
             hint="put the images where file_path says, or remove the entries",
         )
     frames = []
-    for entry in listing.entries:
+    for entry in entries:
         assert entry.image is not None
         # The ending may be left out, dots in the name are none, and Windows has other slashes.
         name = str(Path(entry.values["file_path"].replace("\\", "/")).with_name(entry.image.name))
@@ -96,7 +84,7 @@ def read_transforms(path: Path, *, poses: bool) -> list[SourceFrame]:
                 f"{name} names the mask {entry.values['mask_path']}, which does not exist",
                 hint="put the mask there, or remove mask_path",
             )
-        camera = _camera({**listing.common, **entry.values}, entry.image) if poses else None
+        camera = _camera({**common, **entry.values}, entry.image) if poses else None
         pose = _pose(entry.values, name) if poses else None
         frames.append(SourceFrame(name, entry.image, mask=entry.mask, camera=camera, pose=pose))
     return frames
@@ -113,11 +101,11 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
             from cleargs.media.image import read_rgb
 
             height, width = read_rgb(image).shape[:2]
-        fx = _focal(values, "x", width)
-        fy = _focal(values, "y", height)
-        if fx is None and fy is None:
+        fx, fy = _focal(values, "x", width), _focal(values, "y", height)
+        fx = fy if fx is None else fx
+        fy = fx if fy is None else fy
+        if fx is None or fy is None:
             raise ValueError("neither fl_x nor camera_angle_x is given")
-        fx, fy = _either(fx, fy), _either(fy, fx)
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         k1, k2, k3, k4, p1, p2 = (float(values.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     except FAULTS as error:
@@ -140,11 +128,6 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
     return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
-def _either(focal: float | None, other: float | None) -> float:
-    """``focal``, or the other axis's where it is not given; 0 is given, and refused later."""
-    return other or 0.0 if focal is None else focal
-
-
 def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:
     if values.get(f"fl_{axis}") is not None:
         return float(values[f"fl_{axis}"])
@@ -156,7 +139,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:
 def _pose(entry: Mapping[str, Any], name: str) -> Pose:
     import numpy as np
 
-    from cleargs.capture.poses import rigid_pose
+    from cleargs.capture.cameras import rigid_pose
 
     hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find the poses anew"
     if "transform_matrix" not in entry:
@@ -170,34 +153,32 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
     return rigid_pose(matrix, name, hint)
 
 
-def _read_listing(path: Path) -> _Listing:
-    """Read transforms.json. Raises InputError where it is damaged or an entry names no image."""
+def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
+    """All that stands next to ``frames`` in transforms.json, and the entries of ``frames``.
+
+    Raises InputError where it is damaged or an entry names no image.
+    """
     try:
         data = read_json(path)
         if not isinstance(data, dict) or "frames" not in data:
             raise ValueError("it has no 'frames'")
-        frames = data["frames"]
-        if not isinstance(frames, list) or not all(isinstance(entry, dict) for entry in frames):
+        frames = data.pop("frames")
+        if not isinstance(frames, list) or not all(isinstance(values, dict) for values in frames):
             raise ValueError("'frames' is not a list of objects")
-        for number, entry in enumerate(frames):
-            if not isinstance(entry.get("file_path"), str):
+        entries = []
+        for number, values in enumerate(frames):
+            if not isinstance(values.get("file_path"), str):
                 raise ValueError(f"frames[{number}] has no file_path")
-            if not isinstance(entry.get("mask_path", ""), str):
+            if not isinstance(values.get("mask_path", ""), str):
                 raise ValueError(f"frames[{number}] has a mask_path that is no text")
-        entries = tuple(
-            _Entry(
-                entry,
-                _find_image(path.parent, entry["file_path"]),
-                _find(path.parent, entry["mask_path"]) if "mask_path" in entry else None,
-            )
-            for entry in frames
-        )
+            mask = _find(path.parent, values["mask_path"]) if "mask_path" in values else None
+            entries.append(_Entry(values, _find_image(path.parent, values["file_path"]), mask))
+        return data, entries
     except FAULTS as error:
         raise InputError(
             f"cannot read {path}: {cause(error)}",
             hint="it must be a JSON object with a 'frames' list, as nerfstudio or instant-ngp write it",
         ) from error
-    return _Listing({name: value for name, value in data.items() if name != "frames"}, entries)
 
 
 def _find(root: Path, listed: str) -> Path | None:
