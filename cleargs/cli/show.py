@@ -3,24 +3,51 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from rich.console import Console
+from rich.table import Table
 
 from cleargs.cli.common import json_option, print_json, run_argument
-from cleargs.cli.tables import labelled, line_table, new_table, print_table, text_of
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, linked_manifest
+from cleargs.parquet import damage_told
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import at_work, preview_of
 from cleargs.pipeline.run_file import Run, read_run_file
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from rich.table import Table
+MAX_LISTED = 16
+"""Most items of a list that are spelt out."""
+
+HIDDEN = frozenset({"similarity", "holdout_hash", "round"})
+"""Figures for programs."""
+
+LABELS: Mapping[str, str] = {
+    "registered": "frames with a pose",
+    "test": "frames held out for testing",
+    "given_poses_missed_px": "median distance of features from their points at the given poses, px",
+    "stand_in": "frames that stand in for reliable ones",
+    "effective_frames": "equivalent frames of full weight",
+    "bins": "stretches of the trajectory",
+    "bins_uncovered_before": "stretches without a usable frame at first",
+    "psnr_strong": "training PSNR of the strong frames, dB",
+    "psnr_active": "training PSNR, dB",
+    "psnr_unseen": "PSNR of pixels that no training saw, dB",
+    "psnr_before": "PSNR in the first scene, dB",
+    "psnr_after": "PSNR now, dB",
+    "repairs_refused": "repairs refused by the gate",
+    "tie_breaks": "decided by the tie-break scorer",
+    "latest_rounds": "repairs by round",
+}
+"""Figure of a manifest -> its label, where its name is not enough."""
 
 PLOT = "rva-plot.png"
 """The picture of ``--plot`` in the run's folder, unless another is named."""
@@ -90,26 +117,34 @@ def show(
     as_json: bool,
 ) -> None:
     """Show what the stages of RUN found, or the tables of one STAGE."""
-    if plot and stage != "rva":
-        raise InputError("--plot draws the stage rva", hint=f"cleargs show {run} rva --plot")
-    if frame is not None and stage is not None:
-        raise InputError("--frame is about all stages", hint=f"cleargs show {run} --frame {frame}")
-    if stage is None and (columns or rows is not None):
-        raise InputError(
-            "--rows and --columns are about the tables of a stage", hint=f"cleargs show {run} rva --columns"
-        )
     pictured = plot or frame is not None
-    if output is not None and (not pictured or output.suffix.lower() != ".png"):
-        raise InputError(
-            "--output names the PNG of --plot or --frame", hint=f"cleargs show {run} rva --plot -o FILE.png"
-        )
+    for wrong, cause, example in (
+        (plot and stage != "rva", "--plot draws the stage rva", "rva --plot"),
+        (frame is not None and stage is not None, "--frame is about all stages", f"--frame {frame}"),
+        (
+            stage is None and (columns or rows is not None),
+            "--rows and --columns are about the tables of a stage",
+            "rva --columns",
+        ),
+        (
+            output is not None and (not pictured or output.suffix.lower() != ".png"),
+            "--output names the PNG of --plot or --frame",
+            "rva --plot -o FILE.png",
+        ),
+    ):
+        if wrong:
+            raise InputError(cause, hint=f"cleargs show {run} {example}")
     settings = read_run_file(run, dag)
     manifests = {name: linked_manifest(run, name) for name in dag.names}
     done = {name: manifest for name, manifest in manifests.items() if manifest is not None}
     if frame is not None:
         from cleargs.cli.show_frame import show_frame
 
-        show_frame(run, done, frame, output or run / f"frame-{frame:06d}.png", as_json)
+        picture = output or run / f"frame-{frame:06d}.png"
+        facts, lines = show_frame(run, done, frame, picture)
+        if not as_json:
+            _print(_line_table(f"frame {frame}", lines))
+        _tell(facts, picture, as_json)
     elif stage is None:
         if as_json:
             print_json({name: manifest and _facts(manifest) for name, manifest in manifests.items()})
@@ -122,12 +157,17 @@ def show(
 
         picture = output or run / PLOT
         plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
-        if as_json:
-            print_json({"stage": stage, "plot": str(picture)})
-        else:
-            click.echo(f"written: {picture}")
+        _tell({"stage": stage, "plot": str(picture)}, picture, as_json)
     else:
         _show_stage(run, done, stage, rows, columns, as_json)
+
+
+def _tell(facts: Mapping[str, Any], picture: Path, as_json: bool) -> None:
+    """Print ``facts``, or where the picture lies."""
+    if as_json:
+        print_json(facts)
+    else:
+        click.echo(f"written: {picture}")
 
 
 def _facts(manifest: Manifest) -> dict[str, Any]:
@@ -144,7 +184,7 @@ def _facts(manifest: Manifest) -> dict[str, Any]:
 
 def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
     """Print a line per stage, and the present work with its preview."""
-    table = new_table("stage", "state", "seconds", "MB", "files", "figures")
+    table = _new_table("stage", "state", "seconds", "MB", "files", "figures")
     for name, manifest in manifests.items():
         if manifest is None:
             table.add_row(name, "not done")
@@ -154,7 +194,7 @@ def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
         chosen = {key: found[key] for key in HEADLINES if key in found} or found
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
         table.add_row(name, manifest.status, *cells, text)
-    print_table(table)
+    _print(table)
     if None in manifests.values():
         click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
     if work := at_work(run.folder, run.store):
@@ -187,10 +227,10 @@ def _show_stage(
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)
     lines.append(("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}"))
-    print_table(line_table(f"{stage}: {manifest.status}", lines))
+    _print(_line_table(f"{stage}: {manifest.status}", lines))
     if frames is not None and not columns and rows is None:
         click.echo()
-        table = new_table(*frames[0] if frames else ())
+        table = _new_table(*frames[0] if frames else ())
         table.padding = (0, 1, 0, 0)  # all fits on 80 columns
         for column in table.columns:
             column.no_wrap = column.header != "reason"
@@ -199,25 +239,21 @@ def _show_stage(
             table.add_row(
                 *(f"{value:.2f}" if isinstance(value, float) else text_of(value) for value in values)
             )
-        print_table(table)
+        _print(table)
         return
     for name, data in tables.items():
         wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
         title = f"{name}: {data.num_rows} rows"
         if columns:
-            print_table(_column_table(title, data))
+            _print(_column_table(title, data))
         if wanted and data.num_rows:
-            print_table(_row_table("" if columns else title, data, wanted))
+            _print(_row_table("" if columns else title, data, wanted))
     if not columns:
         click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 
 
 def _read(path: Path) -> pa.Table:
     """Return a table of any columns. Raises StoreError when it cannot be read."""
-    import pyarrow.parquet as pq
-
-    from cleargs.parquet import damage_told
-
     with damage_told(path):
         return pq.read_table(path)
 
@@ -229,51 +265,84 @@ def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:
     where every row has its own).
     Numbers: ``min``, ``median``, ``mean``, ``max`` over the values that are neither null nor NaN.
     """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    described: dict[str, dict[str, Any]] = {}
+    described = {}
     for field in table.schema:
-        facts: dict[str, Any] = {"type": str(field.type), "nulls": table[field.name].null_count}
+        column = table[field.name]
+        facts = {"type": str(field.type), "nulls": column.null_count, **_figures(column.drop_null())}
         if meaning := (field.metadata or {}).get(b"meaning"):
             facts["meaning"] = meaning.decode()
-        values = table[field.name].drop_null()
-        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
-            finite = values.filter(pc.is_finite(values))
-            if len(finite):
-                facts |= pc.min_max(finite).as_py()
-                facts |= {"median": pc.quantile(finite, q=0.5)[0].as_py(), "mean": pc.mean(finite).as_py()}
-            else:
-                facts["distinct"] = 0
-        else:
-            counts = Counter(map(_word, values.to_pylist()))
-            if len(counts) > MAX_COUNTED or 2 < len(counts) == len(values) or pa.types.is_list(field.type):
-                facts["distinct"] = len(counts)
-            else:
-                facts["counts"] = dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
         described[field.name] = facts
     return described
 
 
-def _word(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+def _figures(values: pa.ChunkedArray) -> dict[str, Any]:
+    if pa.types.is_integer(values.type) or pa.types.is_floating(values.type):
+        finite = values.filter(pc.is_finite(values))
+        if not len(finite):
+            return {"distinct": 0}
+        median, mean = pc.quantile(finite, q=0.5)[0].as_py(), pc.mean(finite).as_py()
+        return {**pc.min_max(finite).as_py(), "median": median, "mean": mean}
+    counts = Counter(
+        str(value).lower() if isinstance(value, bool) else str(value) for value in values.to_pylist()
+    )
+    if len(counts) > MAX_COUNTED or 2 < len(counts) == len(values) or pa.types.is_list(values.type):
+        return {"distinct": len(counts)}
+    return {"counts": dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))}
 
 
 def sampled_rows(table: pa.Table, wanted: int) -> list[dict[str, Any]]:
     """``wanted`` rows (at most), evenly spread, the first and the last among them; the last for one."""
-    last = table.num_rows - 1
-    steps = min(wanted, table.num_rows) - 1
-    rows: list[dict[str, Any]] = table.take(
-        [round(index * last / steps) for index in range(steps + 1)] if steps > 0 else [last]
-    ).to_pylist()
+    places = np.linspace(table.num_rows - 1, 0, min(wanted, table.num_rows)).round().astype(int)
+    rows: list[dict[str, Any]] = table.take(places[::-1]).to_pylist()
     return rows
+
+
+def labelled(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Label and text of each figure: numbers of one kind in one line, other nested figures in their own."""
+    for name, value in summary.items():
+        label = prefix + LABELS.get(name, name.replace("_", " "))
+        if name in HIDDEN:
+            continue
+        if name in ("weights", "latest_rounds"):
+            word = "from" if name == "weights" else "in round"
+            yield label, ", ".join(f"{count} {word} {item}" for item, count in value.items() if count)
+        elif name == "harm":
+            yield label, value or "none"
+        elif isinstance(value, Mapping) and any(
+            key in LABELS or isinstance(item, Mapping | list) for key, item in value.items()
+        ):
+            yield from labelled(value, f"{label}: ")
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            for number, item in enumerate(value, 1):
+                yield from labelled(item, f"round {number}: ")
+        elif text := text_of(value):
+            yield label, text
+
+
+def text_of(value: Any) -> str:
+    """A value for a reader: four figures of a number, yes and no, "9 restored, 3 render" for counts."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.4g}"
+        case list():
+            return ", ".join(map(text_of, value[:MAX_LISTED])) + (" ..." if len(value) > MAX_LISTED else "")
+        case Mapping():
+            names = {name: name.replace("_", " ").replace("observed", "as filmed") for name in value}
+            if not all(isinstance(item, int) for item in value.values()):
+                return ", ".join(f"{names[name]} {text_of(item)}" for name, item in value.items())
+            return ", ".join(f"{count} {names[name]}" for name, count in value.items() if count) or "none"
+    return str(value)
 
 
 # -- on the terminal -----------------------------------------------------------------------------------------
 
 
 def _column_table(title: str, data: pa.Table) -> Table:
-    table = new_table("column", "min .. median .. max, or counts", "meaning", title=f"\n{title}")
+    table = _new_table("column", "min .. median .. max, or counts", "meaning", title=f"\n{title}")
     for column, facts in describe_table(data).items():
         if "counts" in facts:
             words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
@@ -289,7 +358,29 @@ def _column_table(title: str, data: pa.Table) -> Table:
 def _row_table(title: str, data: pa.Table, wanted: int) -> Table:
     """Some rows of a table, one per column of the terminal."""
     rows = [[text_of(value) for value in row.values()] for row in sampled_rows(data, wanted)]
-    table = new_table(title=title and f"\n{title}")
+    table = _new_table(title=title and f"\n{title}")
     for line in zip(data.column_names, *rows, strict=True):
         table.add_row(*line)
     return table
+
+
+def _new_table(*columns: str, title: str = "") -> Table:
+    """An empty table without lines; one without ``columns`` has labels in its first column."""
+    table = Table(*columns, box=None, header_style="bold", padding=(0, 2, 0, 0), pad_edge=False)
+    table.title, table.title_justify, table.show_header = title or None, "left", bool(columns)
+    if not columns:
+        table.add_column(no_wrap=True)
+    return table
+
+
+def _line_table(title: str, lines: Iterable[tuple[str, str]]) -> Table:
+    """A table with a label and a text per line."""
+    table = _new_table(title=title)
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def _print(table: Table) -> None:
+    """Print a table; brackets in names are no markup."""
+    Console(highlight=False, markup=False, emoji=False).print(table)

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+import numpy as np
 
-from cleargs.cli.common import print_json
-from cleargs.cli.tables import line_table, print_table, text_of
 from cleargs.errors import InputError
+from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import Manifest
-
-if TYPE_CHECKING:
-    from cleargs.report.frame_strip import FrameRow
+from cleargs.media.contact_sheet import Tile, contact_sheet
+from cleargs.media.image import write_rgb
+from cleargs.parquet import read_table
+from cleargs.report.frame_pictures import LAYERS, layers_of
+from cleargs.report.frame_strip import CHOICES, MEANINGS, FrameRow, last_scene, load_rows, scores_of
+from cleargs.report.web_scene import Renderer, camera_of
+from cleargs.rivr.gates import REFUSED
+from cleargs.rivr.tables import REPAIRS
+from cleargs.splat.ply import read_ply
 
 MAX_NAME_LENGTH = 14
 """Characters of a frame's name in a table."""
@@ -118,14 +123,12 @@ def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
 def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
     """The threshold of the two that the frame misses; "" for none."""
     if row["R"] < min_R:
-        return f"R < {text_of(min_R)}"
-    return f"B > {text_of(max_B)}" if row["B"] > max_B else ""
+        return f"R < {min_R:.4g}"
+    return f"B > {max_B:.4g}" if row["B"] > max_B else ""
 
 
 def _repair(row: Mapping[str, Any] | None) -> str:
     """RIVR's choice in a frame's last round: the layer that supervises, refused, or none."""
-    from cleargs.rivr.gates import REFUSED
-
     if row is None:
         return "none"
     if row["chosen"] == "observed":
@@ -137,54 +140,40 @@ def _repair(row: Mapping[str, Any] | None) -> str:
 # -- one frame -----------------------------------------------------------------------------------------------
 
 
-def show_frame(run: Path, done: Mapping[str, Manifest], frame_id: int, picture: Path, as_json: bool) -> None:
-    """Print everything about a frame, and write the picture of its layers. Raises InputError, StoreError."""
-    from cleargs.report.frame_strip import load_rows
+def show_frame(
+    run: Path, done: Mapping[str, Manifest], frame_id: int, picture: Path
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Write the picture of a frame's layers; returns all facts for programs, and lines for readers.
 
+    Raises InputError, StoreError.
+    """
     if "ingest" not in done:
         raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
     rows = {row.frame.frame_id: row for row in load_rows(run, done)}
     if frame_id not in rows:
         raise InputError(f"{run} has no frame {frame_id}", hint=f"choose one from {min(rows)} to {max(rows)}")
-    facts = _frame_facts(run, rows[frame_id], done)
-    layers = _write_layers(picture, run, done, rows[frame_id])
-    if as_json:
-        print_json({**facts, "layers": layers, "picture": str(picture)})
-    else:
-        print_table(line_table(f"frame {frame_id}", _lines(facts, run)))
-        click.echo(f"written: {picture}")
+    row = rows[frame_id]
+    facts = _frame_facts(run, row, done)
+    lines = list(_lines(row, facts, run))
+    return {**facts, "layers": _write_layers(picture, run, done, row), "picture": str(picture)}, lines
 
 
 def _frame_facts(run: Path, row: FrameRow, done: Mapping[str, Manifest]) -> dict[str, Any]:
     """All facts of a frame, as ``--json`` prints them."""
-    from cleargs.parquet import read_table
-    from cleargs.report.frame_strip import formation_meanings, last_scene
-    from cleargs.report.web_scene import camera_of
-    from cleargs.rivr.tables import REPAIRS, read_selection
-    from cleargs.rva.tables import FRAMES
-
-    frame = row.frame
-
-    def own(path: str, schema: Any) -> dict[str, Any] | None:
-        found: list[dict[str, Any]] = read_table(run / path, schema).to_pylist()
-        return next((line for line in found if line["frame_id"] == frame.frame_id), None)
-
-    judged = own("rva/frames.parquet", FRAMES) if "rva" in done else None
-    if judged is not None:
-        config = done["rva"].parts.config
-        judged |= {"reason": reason(judged, config), "worst_cue": worst_cue(judged)}
-    meanings = formation_meanings(run, last_scene(done))
-    rounds = read_selection(run / "rivr/selection.parquet") if "rivr" in done else []
+    frame, judged, repairs = row.frame, dict(row.judged), []
+    if judged:
+        judged |= {"reason": reason(judged, done["rva"].parts.config), "worst_cue": worst_cue(judged)}
+    if "consolidate" in done:
+        repairs = read_table(run / "consolidate/repairs.parquet", REPAIRS).to_pylist()
+    formation = row.formation.items()
     return {
         **asdict(frame),
         "centre": camera_of(frame).centre.tolist() if frame.registered else None,
-        "rva": judged,
+        "rva": judged or None,
         "exposure_stops": row.gain_ev,
-        "formation": {
-            name: {"value": value, "meaning": meanings.get(name, "")} for name, value in row.formation.items()
-        },
-        "rounds": [asdict(found) for found in rounds if found.frame_id == frame.frame_id],
-        "distilled": own("consolidate/repairs.parquet", REPAIRS) if "consolidate" in done else None,
+        "formation": {name: {"value": value, "meaning": MEANINGS.get(name, "")} for name, value in formation},
+        "rounds": [asdict(found) for found in row.rounds],
+        "distilled": next((line for line in repairs if line["frame_id"] == frame.frame_id), None),
     }
 
 
@@ -193,80 +182,62 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
     They are the frame as filmed, those of the latest round's EXR, and the last scene at the frame.
     """
-    import numpy as np
-
-    from cleargs.formation.exposure import read_exposure
-    from cleargs.media.contact_sheet import Tile, contact_sheet
-    from cleargs.media.image import write_rgb
-    from cleargs.report.frame_pictures import LAYERS, layers_of
-    from cleargs.report.frame_strip import last_scene
-    from cleargs.report.web_scene import Renderer, camera_of
-    from cleargs.splat.ply import read_ply
-
     images = layers_of(row, run)
     scene = last_scene(stages)
     if scene is not None and row.frame.registered:
         affine = read_exposure(run / scene / "exposure.parquet").of(row.frame.frame_id)
         images["final"] = Renderer(read_ply(run / scene / "scene.ply"))(camera_of(row.frame), affine)
-    selection = row.selection
-    kept = selection is not None and (selection.accepted or selection.chosen == "observed")
-    chosen = selection.chosen if selection is not None and kept else None
     shown = [name for name in LAYERS if name in images]
-    tiles = [
-        Tile(
-            images[name].astype(np.float32) / np.float32(255),
-            f"{LAYERS[name]}{' (chosen)' if name == chosen else ''}",
-            marked=name == chosen,
-        )
-        for name in shown
-    ]
-    rows = [tiles[start : start + _ACROSS] for start in range(0, len(tiles), _ACROSS)]
+    tiles = []
+    for name in shown:
+        chosen = name == row.chosen
+        label = f"{LAYERS[name]} (chosen)" if chosen else LAYERS[name]
+        tiles.append(Tile(images[name] / np.float32(255), label, marked=chosen))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_rgb(path, contact_sheet(rows, tile_width=min(_WIDEST, max(240, row.frame.width))))
+    lines = [tiles[start : start + _ACROSS] for start in range(0, len(tiles), _ACROSS)]
+    write_rgb(path, contact_sheet(lines, tile_width=min(_WIDEST, max(240, row.frame.width))))
     return shown
 
 
-def _lines(facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
+def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
     """Label and text of every line for a reader."""
-    from cleargs.report.frame_strip import CHOICES
-
-    yield "file", facts["name"]
-    yield "image", f"{run / 'ingest' / facts['image']}, {facts['width']}x{facts['height']} px"
-    if facts["time_s"] is not None:
-        yield "time", f"{facts['time_s']:.2f} s"
-    if facts["split"] == "test":
+    frame, judged = row.frame, facts["rva"]
+    yield "file", frame.name
+    yield "image", f"{run / 'ingest' / frame.image}, {frame.width}x{frame.height} px"
+    if frame.time_s is not None:
+        yield "time", f"{frame.time_s:.2f} s"
+    if frame.split == "test":
         yield "held out", "for testing: it enters no training"
-    if facts["centre"] is None:
-        yield "pose", f"none found: {facts['placed']}" if facts["placed"] else "none found"
+    if not frame.registered:
+        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
     else:
         centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
         quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
         yield "pose", f"at ({centre}) of the run's world, world to camera ({quaternion}), w first"
-        if facts["placed"]:
-            yield "placed by", facts["placed"]
-        yield "points", f"{facts['n_points']} sparse points seen"
-    if row := facts["rva"]:
-        yield "role", f"{row['role']}, weight {row['weight']:.2f}: {row['reason']}"
-        known = [f"{name} {row[name]:.2f} {text}" for name, text in SCORES.items() if row[name] is not None]
-        yield "scores", ", ".join(known)
+        if frame.placed:
+            yield "placed by", frame.placed
+        yield "points", f"{frame.n_points} sparse points seen"
+    if judged:
+        yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
+        known = {name: value for name, value in judged.items() if value is not None}
+        scores = (f"{name} {known[name]:.2f} {text}" for name, text in SCORES.items() if name in known)
+        yield "scores", ", ".join(scores)
         for label, prefix in (("good, of 1", "r_"), ("bad, of 1", "b_")):
-            cues = {key[2:].replace("_", " "): row[key] for key in row if key.startswith(prefix)}
-            yield label, ", ".join(f"{name} {value:.2f}" for name, value in cues.items() if value is not None)
-        yield "worst cue", row["worst_cue"] or "none"
-    if facts["exposure_stops"] is not None:
-        yield "exposure", f"{facts['exposure_stops']:+.2f} stops compared with the scene's"
-    if facts["formation"]:
-        yield from _formation({name: found["value"] for name, found in facts["formation"].items()})
-    for found in facts["rounds"]:
-        refused = ", refused" if not found["accepted"] and found["chosen"] != "observed" else ""
-        yield f"round {found['round']}", f"{CHOICES[found['chosen']]}{refused} ({found['reason']})"
-        for use in ("primary", "tiebreak"):
-            scores = {name: found[f"{use}_{name}"] for name in CHOICES}
-            known = [f"{name} {score:.1f}" for name, score in scores.items() if score is not None]
-            yield "", f"{found[f'{use}_metric']}: {', '.join(known)}"
-        moved = found["blur_px"] is not None
-        motion = f": blur {found['blur_px']:.1f} px, skew {found['skew_px']:.1f} px" if moved else ""
-        yield "", f"restored from {SOURCES[found['restored_from']]}{motion}"
+            cues = (name for name in known if name.startswith(prefix))
+            yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)
+        yield "worst cue", judged["worst_cue"] or "none"
+    if row.gain_ev is not None:
+        yield "exposure", f"{row.gain_ev:+.2f} stops compared with the scene's"
+    if row.formation:
+        yield from _formation(row.formation)
+    for found in row.rounds:
+        refused = ", refused" if not found.accepted and found.chosen != "observed" else ""
+        yield f"round {found.round}", f"{CHOICES[found.chosen]}{refused} ({found.reason})"
+        for metric, scores in scores_of(found):
+            yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
+        moved = found.blur_px is not None
+        motion = f": blur {found.blur_px:.1f} px, skew {found.skew_px:.1f} px" if moved else ""
+        yield "", f"restored from {SOURCES[found.restored_from]}{motion}"
     if repair := facts["distilled"]:
         yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
 

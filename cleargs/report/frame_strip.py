@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import Exposure, read_exposure
+from cleargs.formation.table import FORMATION
 from cleargs.parquet import damage_told, read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
@@ -27,70 +27,88 @@ CHOICES = {
     "observed": "none: the raw frame is kept",
 }
 
+MEANINGS = {column.name: column.metadata[b"meaning"].decode() for column in FORMATION}
+"""Column of ``formation.parquet`` -> what it means."""
+
 
 @dataclass(frozen=True)
 class FrameRow:
-    """One frame; None where a stage has nothing to say about it."""
+    """One frame, and what the stages say of it."""
 
     frame: Frame
     role: str
-    weight: float | None
-    """Of its raw supervision, 0 to 1."""
-    R: float | None
-    B: float | None
-    G: float | None
-    cues: Mapping[str, float] = field(default_factory=dict)
-    """Name -> how bad it is, 0 to 1, qualities turned round."""
-    geometry: Mapping[str, float] = field(default_factory=dict)
-    selection: Selection | None = None
-    """Of the latest round."""
+    judged: Mapping[str, Any] = field(default_factory=dict)
+    """Its row of ``rva/frames.parquet``; empty without one."""
+    rounds: tuple[Selection, ...] = ()
+    """Its rows of ``rivr/selection.parquet``, in the order of the rounds."""
     gain_ev: float | None = None
-    """Exposure beside the scene's at middle grey, stops; None without compensation."""
+    """Exposure next to the scene's at middle grey, stops; None without compensation."""
     formation: Mapping[str, Any] = field(default_factory=dict)
-    """Column of ``formation.parquet`` -> value."""
+    """Column of the last scene's ``formation.parquet`` -> value; empty without one."""
 
     @property
-    def worst(self) -> tuple[str, float] | None:
-        """The worst cue and how bad it is."""
-        return max(self.cues.items(), key=lambda item: item[1], default=None)
+    def weight(self) -> float | None:
+        """Weight of its raw supervision, 0 to 1."""
+        return self.judged.get("weight")
+
+    @property
+    def cues(self) -> dict[str, float]:
+        """Cue -> how bad it is, 0 to 1, qualities turned round; the worst first."""
+        lacking = {f"low {name}": self.judged.get(f"r_{name}") for name in R_CUES}
+        found = {name: 1.0 - value for name, value in lacking.items() if value is not None}
+        harms = {name.replace("_", " "): self.judged.get(f"b_{name}") for name in B_CUES}
+        found |= {name: value for name, value in harms.items() if value is not None}
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def selection(self) -> Selection | None:
+        """Its row of the latest round."""
+        return self.rounds[-1] if self.rounds else None
+
+    @property
+    def chosen(self) -> str | None:
+        """The layer of the latest round that supervises the frame."""
+        if self.selection is None:
+            return None
+        kept = self.selection.accepted or self.selection.chosen == "observed"
+        return self.selection.chosen if kept else None
 
     @property
     def blur_px(self) -> float | None:
         """How far the pixels moved while exposed."""
-        return self._motion("blur_px")
+        return self.formation.get("blur_px", getattr(self.selection, "blur_px", None))
 
     @property
     def skew_px(self) -> float | None:
         """How far the last line of pixels moved against the first."""
-        return self._motion("skew_px")
-
-    def _motion(self, name: str) -> float | None:
-        found: float | None = self.formation.get(name)
-        return found if found is not None or self.selection is None else getattr(self.selection, name)
+        return self.formation.get("skew_px", getattr(self.selection, "skew_px", None))
 
     @property
     def repair(self) -> str:
         """The repair chosen, in words."""
         if self.selection is None:
             return "none tried"
-        chosen = CHOICES[self.selection.chosen]
-        kept = self.selection.accepted or self.selection.chosen == "observed"
-        return chosen if kept else f"none: {chosen} was refused"
+        words = CHOICES[self.selection.chosen]
+        return words if self.chosen else f"none: {words} was refused"
 
     @property
     def why(self) -> str:
         """Why it was chosen."""
         if self.selection is None:
             return ""
-        scores = scores_of(self.selection, "primary")
+        metric, scores = scores_of(self.selection)[0]
         found = ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
-        return f"{self.selection.reason}; {self.selection.primary_metric}: {found}"
+        return f"{self.selection.reason}; {metric}: {found}"
 
 
-def scores_of(selection: Selection, role: str) -> dict[str, float]:
-    """Candidate -> score by the ``primary`` or ``tiebreak`` scorer."""
-    scores = {name: getattr(selection, f"{role}_{name}") for name in CHOICES}
-    return {name: score for name, score in scores.items() if score is not None}
+def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
+    """Name of the scorer, and candidate -> score: of the one that decides, then of that for ties."""
+    found = []
+    for use in ("primary", "tiebreak"):
+        scores = {name: getattr(selection, f"{use}_{name}") for name in CHOICES}
+        known = {name: score for name, score in scores.items() if score is not None}
+        found.append((getattr(selection, f"{use}_metric"), known))
+    return found
 
 
 SCENES = ("g0", "rivr", "consolidate")
@@ -104,68 +122,42 @@ def last_scene(stages: Collection[str]) -> str | None:
 
 def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     """The frames of ``run`` in their order, as far as ``stages`` say something of them. Raises StoreError."""
-    judged = _judged(run) if "rva" in stages else {}
-    selections = _selections(run) if "rivr" in stages else {}
+    judged = {}
+    if "rva" in stages:
+        rows = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
+        judged = {row["frame_id"]: row for row in rows}
+    rounds: dict[int, list[Selection]] = {}
+    if "rivr" in stages:
+        for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
+            rounds.setdefault(found.frame_id, []).append(found)
     final = last_scene(stages)
     exposure = read_exposure(run / final / "exposure.parquet") if final else None
-    formation = _formation(run, final)
-    rows = []
-    for frame in load_frames(run / "ingest"):
-        seen = judged.get(frame.frame_id, {})
-        role = seen.get("role", "") if frame.split == "train" else HELD_OUT
-        rows.append(
-            FrameRow(
-                frame=frame,
-                role=role if frame.registered else UNPLACED,
-                weight=seen.get("weight"),
-                R=seen.get("R"),
-                B=seen.get("B"),
-                G=seen.get("G"),
-                cues=_cues(seen),
-                geometry={name: seen[name] for name in "CDOZ" if seen.get(name) is not None},
-                selection=selections.get(frame.frame_id),
-                gain_ev=_gain(exposure, frame.frame_id),
-                formation=formation.get(frame.frame_id, {}),
-            )
+    formation = _formation(run / final / "formation.parquet") if final else {}
+    return [
+        FrameRow(
+            frame,
+            _role(frame, judged.get(frame.frame_id, {})),
+            judged.get(frame.frame_id, {}),
+            tuple(rounds.get(frame.frame_id, ())),
+            _gain(exposure, frame.frame_id),
+            formation.get(frame.frame_id, {}),
         )
-    return rows
+        for frame in load_frames(run / "ingest")
+    ]
 
 
-def _judged(run: Path) -> dict[int, dict[str, Any]]:
-    path = run / "rva" / "frames.parquet"
-    return {row["frame_id"]: row for row in read_table(path, FRAMES).to_pylist()} if path.is_file() else {}
+def _role(frame: Frame, judged: Mapping[str, Any]) -> str:
+    if not frame.registered:
+        return UNPLACED
+    return HELD_OUT if frame.split != "train" else str(judged.get("role", ""))
 
 
-def _selections(run: Path) -> dict[int, Selection]:
-    """The row of the latest round of every target frame."""
-    path = run / "rivr" / "selection.parquet"
-    rows = read_selection(path) if path.is_file() else []
-    return {row.frame_id: row for row in sorted(rows, key=lambda row: row.round)}
-
-
-def _formation(run: Path, final: str | None) -> dict[int, dict[str, Any]]:
-    """What the camera did to each frame, as the latest stage found it."""
-    path = run / (final or "") / "formation.parquet"
+def _formation(path: Path) -> dict[int, dict[str, Any]]:
+    """What the camera did to each frame; empty for a scene that was trained without asking."""
     if not path.is_file():
         return {}
     with damage_told(path):
-        rows = pq.read_table(path).to_pylist()
-    return {row.pop("frame_id"): row for row in rows if "frame_id" in row}
-
-
-def formation_meanings(run: Path, final: str | None) -> dict[str, str]:
-    """Column of ``formation.parquet`` -> what it means."""
-    path = run / (final or "") / "formation.parquet"
-    with damage_told(path):
-        schema = pq.read_schema(path) if path.is_file() else pa.schema([])
-    return {field.name: (field.metadata or {}).get(b"meaning", b"").decode() for field in schema}
-
-
-def _cues(row: Mapping[str, Any]) -> dict[str, float]:
-    qualities = {f"low {name}": row.get(f"r_{name}") for name in R_CUES}
-    lacking = {name: 1.0 - value for name, value in qualities.items() if value is not None}
-    harms = {name.replace("_", " "): row.get(f"b_{name}") for name in B_CUES}
-    return {**lacking, **{name: value for name, value in harms.items() if value is not None}}
+        return {row.pop("frame_id"): row for row in pq.read_table(path).to_pylist()}
 
 
 def _gain(exposure: Exposure | None, frame_id: int) -> float | None:

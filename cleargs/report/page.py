@@ -12,7 +12,7 @@ from cleargs.manifest import Manifest
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.report import charts, facts, words
 from cleargs.report.frame_pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
-from cleargs.report.frame_strip import SCENES, FrameRow, formation_meanings, load_rows, scores_of
+from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
 from cleargs.report.html import new_report, write_page
 from cleargs.report.report_json import LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.verdict import judge
@@ -101,7 +101,6 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     rendered = frozenset(row.frame.frame_id for row in shown)
     pictures = write_pictures(rows, run, folder, render, rendered, planner.threads)
     times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
-    meanings = formation_meanings(run, final)
     write_page(
         folder,
         "report.html.jinja",
@@ -129,8 +128,7 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
             "layers": LAYERS,
             "opening": {"left": "observed", "right": "final"},
             "frames": [
-                _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id), meanings)
-                for row in rows
+                _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id)) for row in rows
             ],
             "viewer": _viewer_data(placed, scenes) if scenes else None,
         },
@@ -185,30 +183,22 @@ def _plans(planner: Planner) -> dict[str, StagePlan]:
 # -- what the scripts of the page know ----------------------------------------------------------------------
 
 
-def _frame_data(
-    row: FrameRow, pictures: FramePictures, time: float | None, meanings: Mapping[str, str]
-) -> dict[str, Any]:
-    figures = {"R": row.R, "B": row.B, "G": row.G, **row.geometry}
-    selection = row.selection
-    scores = {}
-    if selection is not None:
-        scores[selection.primary_metric] = scores_of(selection, "primary")
-        scores[selection.tiebreak_metric] = scores_of(selection, "tiebreak")
+def _frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> dict[str, Any]:
     found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,
         "name": row.frame.name,
         "role": row.role,
         "weight": row.weight,
-        "figures": {name: value for name, value in figures.items() if value is not None},
-        "cues": dict(sorted(row.cues.items(), key=lambda item: -item[1])),
+        "figures": {name: row.judged[name] for name in "RBGCDOZ" if row.judged.get(name) is not None},
+        "cues": row.cues,
         "repair": row.repair,
         "why": row.why,
-        "chosen": selection.chosen if selection and selection.accepted else None,
-        "scores": scores,
+        "chosen": row.selection.chosen if row.selection and row.selection.accepted else None,
+        "scores": dict(scores_of(row.selection)) if row.selection else {},
         "found": {name: value for name, value in found.items() if value is not None},
         "formation": [
-            {"name": name.replace("_", " "), "value": value, "meaning": meanings.get(name, "")}
+            {"name": name.replace("_", " "), "value": value, "meaning": MEANINGS.get(name, "")}
             for name, value in row.formation.items()
         ],
         "layers": {name: picture.path for name, picture in pictures.layers.items()},
