@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,17 +15,15 @@ from numpy.typing import NDArray
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
+from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import read_rgb
 from cleargs.parquet import read_table
+from cleargs.report.web_scene import camera_of
 from cleargs.rva.allocation import Role, effective_sample_size
-from cleargs.rva.assessment import poses_from
-from cleargs.rva.geometry import camera_centres, view_directions
 from cleargs.rva.tables import BINS, FRAMES
 
 Row = Mapping[str, Any]
 """Of rva/frames.parquet."""
-
-Floats = NDArray[np.float64]
 
 SHOWN = 6
 """Most frames in a row of pictures."""
@@ -40,8 +36,7 @@ _ROLES = {
     Role.REACTIVATED: ("#CC79A7", "D"),
     Role.SUPPRESSED: ("#555555", "x"),
 }
-_UNCOVERED = "#F3CFE2"
-_THUMBNAIL = 420  # px, long side
+_TILE = 380  # px, width of a picture
 _ARROWS = 100  # more of them would hide the trajectory
 
 
@@ -59,22 +54,20 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
             hint="`cleargs show RUN ingest` and `cleargs show RUN rva` say what is missing",
         )
     frames = {frame.frame_id: frame for frame in load_frames(ingest)}
-    shown = extremes(rows)
-    heights = [6.0, 2.6 * len(shown)]
-    figure = Figure(figsize=(16.0, sum(heights)), dpi=100, layout="constrained")
+    pictured = extremes(rows)
+    layout = [["plan", "scores"], ["plan", "weights"], *([name, name] for name in pictured)]
+    heights = [3.0, 3.0, *(2.4 for _ in pictured)]
+    figure = Figure(figsize=(16.0, sum(heights)), dpi=150, layout="constrained")
     figure.suptitle(_headline(rows, covered, title), fontsize=12, parse_math=False)  # names may hold dollars
-    top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-    grid = top.add_gridspec(2, 2, width_ratios=(1.0, 1.6))
-    _draw_plan(top.add_subplot(grid[:, 0]), rows, [frames[row["frame_id"]] for row in rows])
-    _draw_along(top.add_subplot(grid[0, 1]), top.add_subplot(grid[1, 1]), rows, frames, covered)
-    top.legend(loc="outside lower center", ncols=8, frameon=False, fontsize=9)
-    panels = bottom.subplots(len(shown), SHOWN, squeeze=False)
-    for line, (name, chosen) in zip(panels, shown.items(), strict=True):
-        for panel in line[len(chosen) :]:
-            panel.axis("off")
-        for panel, row in zip(line, chosen, strict=False):
-            _draw_frame(panel, ingest / frames[row["frame_id"]].image, row)
-        line[0].set_ylabel(name, fontsize=11)
+    panels = figure.subplot_mosaic(layout, width_ratios=(1.0, 1.6), height_ratios=heights)
+    _draw_plan(panels["plan"], [row for row in rows if frames[row["frame_id"]].registered], frames)
+    _draw_along(panels["scores"], panels["weights"], rows, frames, covered)
+    for name, shown in pictured.items():
+        tiles = [_tile(ingest / frames[row["frame_id"]].image, row) for row in shown]
+        tiles += [Tile(None, "")] * (SHOWN - len(tiles))
+        panels[name].imshow(contact_sheet([tiles], tile_width=_TILE))
+        panels[name].set(title=name)
+        panels[name].axis("off")
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
@@ -91,14 +84,14 @@ def extremes(rows: Sequence[Row], most: int = SHOWN) -> dict[str, list[Row]]:
     half = (len(ranked) + 1) // 2
     revived = [k for k, row in enumerate(rows) if row["role"] == Role.REACTIVATED]
     places = np.linspace(0, len(revived) - 1, min(most, len(revived))).round().astype(int)
-    found = {"best\nby R - B": ranked[:half], "worst\nby R - B": ranked[half:][::-1]}
+    found = {"best by R - B": ranked[:half], "worst by R - B": ranked[half:][::-1]}
     for title, candidates in found.items():
         chosen: list[int] = []
         for k in candidates:
             if len(chosen) < most and all(abs(k - other) >= len(rows) // 20 for other in chosen):
                 chosen.append(k)
         found[title] = chosen
-    found[f"reactivated\n{len(places)} of {len(revived)}"] = [revived[place] for place in places]
+    found[f"reactivated: {len(places)} of {len(revived)}"] = [revived[place] for place in places]
     return {title: [rows[k] for k in chosen] for title, chosen in found.items() if chosen}
 
 
@@ -115,19 +108,17 @@ def _headline(rows: Sequence[Row], covered: Sequence[bool], title: str) -> str:
     return fill(f"{title}: " + "; ".join(facts), 140)
 
 
-def _draw_plan(panel: Axes, rows: Sequence[Row], frames: Sequence[Frame]) -> None:
+def _draw_plan(panel: Axes, rows: Sequence[Row], frames: Mapping[int, Frame]) -> None:
     """The cameras from above: x to the right, z up the page, as a camera that looks along +z sees them."""
-    posed = [k for k, frame in enumerate(frames) if frame.registered]
-    rows, poses = [rows[k] for k in posed], poses_from([frames[k] for k in posed])
-    x, _, z = camera_centres(poses.rotations, poses.translations).T
-    panel.plot(x, z, color="0.75", linewidth=1.0, zorder=1)
-    every = -(-len(posed) // _ARROWS)
-    look = view_directions(poses.rotations)[::every]
+    cameras = [camera_of(frames[row["frame_id"]]) for row in rows]
+    x, _, z = np.array([camera.centre for camera in cameras]).T
+    panel.plot(x, z, color="0.75", zorder=1)
+    every = -(-len(rows) // _ARROWS)
+    look = np.array([camera.world_to_camera[2, :3] for camera in cameras])[::every]
     panel.quiver(x[::every], z[::every], look[:, 0], look[:, 2], width=0.0025, color="0.6")
-    _mark_frames(panel, x, z, rows, named=False)
+    _mark_frames(panel, x, z, rows)
     for k, name in ((0, "start"), (-1, "end")):
-        text = f"{rows[k]['frame_id']} ({name})"
-        panel.annotate(text, (x[k], z[k]), (7, -4), textcoords="offset points", zorder=6)
+        panel.annotate(f"{rows[k]['frame_id']} ({name})", (x[k], z[k]), (7, -4), textcoords="offset points")
     panel.set_aspect("equal", adjustable="datalim")
     panel.margins(0.12)
     panel.set(title="from above; arrow: view, size: weight", xlabel="x; z upwards (normalised world)")
@@ -140,38 +131,31 @@ def _draw_along(
     times = [frames[row["frame_id"]].time_s for row in rows]
     x = np.array([row["frame_id"] for row in rows] if None in times else times, np.float64)
     for name, style in (("R, reliability", "k.-"), ("B, degradation risk", "r.--"), ("G, geometry", "b.:")):
-        values = [np.nan if row[name[0]] is None else row[name[0]] for row in rows]
-        scores.plot(x, values, style, linewidth=1.0, label=name)
-    _mark_frames(weights, x, np.array([row["weight"] for row in rows]), rows, named=True)
-    # A bin ends halfway between its last frame and the next.
-    placed = [k for k, row in enumerate(rows) if row["bin"] is not None]
-    borders = [x[placed[0]], *((x[a] + x[b]) / 2 for a, b in pairwise(placed)), x[placed[-1]]]
-    for (left, right), k in zip(pairwise(borders), placed, strict=True):
-        if not covered[rows[k]["bin"]]:
-            for panel in (scores, weights):
-                panel.axvspan(left, right, color=_UNCOVERED, linewidth=0.0, zorder=0)
+        scores.plot(x, np.array([row[name[0]] for row in rows], np.float64), style, linewidth=1.0, label=name)
+    _mark_frames(weights, x, np.array([row["weight"] for row in rows]), rows)
+    half = 0.5 * (x[-1] - x[0]) / max(len(x) - 1, 1)
     for panel in (scores, weights):
+        for number in np.flatnonzero(np.logical_not(covered)):
+            inside = x[[row["bin"] == number for row in rows]]
+            if len(inside):
+                panel.axvspan(inside[0] - half, inside[-1] + half, color="#F3CFE2", linewidth=0.0, zorder=0)
         panel.grid(axis="y", alpha=0.25)
+        panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
     scores.set(ylim=(-0.03, 1.03), title="shaded: bins without an active frame before reactivation")
     weights.set(ylim=(-0.08, 1.08), ylabel="weight", xlabel="frame" if None in times else "time (s)")
 
 
-def _mark_frames(panel: Axes, x: Floats, y: Floats, rows: Sequence[Row], *, named: bool) -> None:
+def _mark_frames(panel: Axes, x: NDArray[Any], y: NDArray[Any], rows: Sequence[Row]) -> None:
     """Draw a mark per frame in the colour and shape of its role, of a size that grows with its weight."""
     for role, (colour, shape) in _ROLES.items():
         among = [k for k, row in enumerate(rows) if row["role"] == role]
         sizes = [14.0 + 50.0 * rows[k]["weight"] for k in among]
         if among:
-            label = f"{role} ({len(among)})" if named else None
+            label = f"{role} ({len(among)})"
             panel.scatter(x[among], y[among], s=sizes, c=colour, marker=shape, label=label, zorder=4)
 
 
-def _draw_frame(panel: Axes, path: Path, row: Row) -> None:
-    image = read_rgb(path)
-    shrink = min(1.0, _THUMBNAIL / max(image.shape[:2]))
-    panel.imshow(cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA))
-    panel.set(xticks=[], yticks=[])
-    panel.spines[:].set(color=_ROLES[Role(row["role"])][0], linewidth=4.0)
-    geometry = "no pose" if row["G"] is None else f"G {row['G']:.2f}  weight {row['weight']:.2f}"
-    title = f"frame {row['frame_id']}: {row['role']}\nR {row['R']:.2f}  B {row['B']:.2f}  {geometry}"
-    panel.set_title(title, fontsize=9)
+def _tile(path: Path, row: Row) -> Tile:
+    place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
+    label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
+    return Tile(read_rgb(path) / np.float32(255), label, marked=bool(row["weight"]))
