@@ -28,6 +28,7 @@ from cleargs.pipeline.run_file import Run
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 
 _PAGES: Mapping[str, str] = {"/": "live.html", "/live.css": "live.css", "/live.js": "live.js"}
+_POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'"
 
 
 class Server(ThreadingHTTPServer):
@@ -69,7 +70,7 @@ class _Handler(SimpleHTTPRequestHandler):
     timeout = 30
 
     def __init__(self, dag: Dag, run: Run, host: str, *arguments: Any) -> None:
-        self._dag, self._run, self._host = dag, run, host
+        self._dag, self._run, self._host, self.path = dag, run, host, ""
         super().__init__(*arguments, directory=str(run.folder))
 
     def send_head(self) -> BytesIO | BinaryIO | None:
@@ -117,6 +118,8 @@ class _Handler(SimpleHTTPRequestHandler):
         self.send_error(HTTPStatus.NOT_FOUND)
 
     def end_headers(self) -> None:
+        if urlsplit(self.path).path in _PAGES:  # the report has a policy of its own, in its page
+            self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.send_header("Cache-Control", "no-store")
