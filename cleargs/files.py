@@ -40,6 +40,27 @@ def atomic_path(path: Path) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Yield a new folder that becomes ``path`` when the block ends without an error.
+
+    With ``replace`` it takes the place of an older one. Raises StoreError when it cannot be written.
+    """
+    folder = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
+    old = folder.with_name(f"{folder.name}.old")
+    try:
+        folder.mkdir()
+        yield folder
+        if replace and path.exists():
+            path.rename(old)
+        folder.rename(path)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise disk_error(error, path) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def is_partial(path: Path) -> bool:
     """Whether ``path`` is a leftover of a writer that died."""
     return path.name.startswith(".") and PARTIAL_SUFFIX in path.name

@@ -62,6 +62,12 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
         return table.select(schema.names).cast(schema)
 
 
+def read_any_table(path: Path) -> pa.Table:
+    """Read a table with whatever columns it has. Raises StoreError when it is missing or damaged."""
+    with damage_told(path):
+        return pq.read_table(path)
+
+
 @contextmanager
 def damage_told(path: Path) -> Iterator[None]:
     """While a table is read: what cannot be read becomes a StoreError that names it."""

@@ -91,9 +91,7 @@ class StageResults:
     def table(self, name: str) -> pa.Table:
         """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none,
         StoreError where it is damaged."""
-        import pyarrow.parquet as pq
-
-        from cleargs.parquet import damage_told
+        from cleargs.parquet import read_any_table
 
         path = self.folder.resolve() / f"{name}.parquet"
         if not path.is_file():
@@ -101,8 +99,7 @@ class StageResults:
             raise InputError(
                 f"{self.manifest.stage} has no table {name!r}", hint=f"its tables are {', '.join(known)}"
             )
-        with damage_told(path):
-            return pq.read_table(path)
+        return read_any_table(path)
 
     def weights(self) -> dict[int, float]:
         """Frame -> weight of its supervision in [0, 1]: of ``rva``."""

@@ -34,10 +34,11 @@ from benchmarks.comparison.variants import WHOLE
 from cleargs.capture.tables import load_frames
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
+from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import new_report, page_environment, write_page
+from cleargs.report.html import page_environment, write_page
 from cleargs.report.report_json import page_of
 
 POSES = 3
@@ -91,7 +92,7 @@ def write_comparison(
     layers = {name: f"v{place}" for place, name in enumerate(cells.variants())}
     subject = WHOLE if WHOLE in labels else cells.variants()[-1]
     samples = {(cell.column, cell.sample) for cell in cells.cells}
-    with new_report(out) as folder:
+    with whole_folder(page_of(out).parent, replace=True) as folder:
         captures = _captures(out, folder, compared, layers)
         write_page(
             folder,

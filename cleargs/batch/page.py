@@ -12,10 +12,11 @@ from cleargs.batch.loop import Batch, Result, State
 from cleargs.batch.sheet import Scene
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
+from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import new_report, write_page
+from cleargs.report.html import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.words import count, duration, size
 
@@ -35,7 +36,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
     order = get_args(State)
     pairs = sorted(zip(batch.scenes, results, strict=True), key=lambda pair: order.index(pair[1].state))
     side = min(MAX_SIDE, side_of(len(results), ASPECT, BYTES, MIN_SIDE))
-    with new_report(batch.folder) as report:
+    with whole_folder(batch.folder / FOLDER, replace=True) as report:
         (report / "scenes").mkdir()
         write_page(
             report,

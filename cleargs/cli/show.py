@@ -12,17 +12,17 @@ import click
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from rich.console import Console
 from rich.table import Table
 
 from cleargs.cli.common import json_option, print_json, run_argument
 from cleargs.errors import InputError
-from cleargs.manifest import Manifest, linked_manifest
-from cleargs.parquet import damage_told
+from cleargs.manifest import Manifest
+from cleargs.parquet import read_any_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import at_work, preview_of
 from cleargs.pipeline.run_file import Run, read_run_file
+from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16
 """Most items of a list that are spelt out."""
@@ -135,8 +135,7 @@ def show(
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
     settings = read_run_file(run, dag)
-    manifests = {name: linked_manifest(run, name) for name in dag.names}
-    done = {name: manifest for name, manifest in manifests.items() if manifest is not None}
+    done = linked_manifests(run, dag.names)
     if frame is not None:
         from cleargs.cli.show_frame import show_frame
 
@@ -147,9 +146,9 @@ def show(
         _tell(facts, picture, as_json)
     elif stage is None:
         if as_json:
-            print_json({name: manifest and _facts(manifest) for name, manifest in manifests.items()})
+            print_json({name: _facts(done[name]) if name in done else None for name in dag.names})
         else:
-            _print_run(settings, manifests)
+            _print_run(settings, {name: done.get(name) for name in dag.names})
     elif dag.check(stage) not in done:
         raise InputError(f"{stage} is not done in {run}", hint=f"see cleargs status {run}")
     elif plot:
@@ -210,12 +209,12 @@ def _show_stage(
     """Print the figures of a stage, and its tables as far as they are asked for."""
     manifest = done[stage]
     names = [name for name in sorted(manifest.files) if name.endswith(".parquet") and "/" not in name]
-    tables = {name: _read(run / stage / name) for name in names}
+    tables = {name: read_any_table(run / stage / name) for name in names}
     frames = None
     if stage == "rva":
         from cleargs.cli.show_frame import frame_rows, short_name
 
-        repairs = _read(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
+        repairs = read_any_table(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
     if as_json:
         described = {
@@ -250,12 +249,6 @@ def _show_stage(
             _print(_row_table("" if columns else title, data, wanted))
     if not columns:
         click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
-
-
-def _read(path: Path) -> pa.Table:
-    """Return a table of any columns. Raises StoreError when it cannot be read."""
-    with damage_told(path):
-        return pq.read_table(path)
 
 
 def describe_table(table: pa.Table) -> dict[str, dict[str, Any]]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import secrets
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.files import PARTIAL_SUFFIX, disk_error, sync_tree, write_json
+from cleargs.files import disk_error, sync_tree, whole_folder, write_json
 from cleargs.media.encode import Codec, require_even, write_video
 from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
@@ -49,9 +47,16 @@ class Photographer:
         self._scene = scene.to(device)
         self._engine = rasteriser_for(device)
 
+    def view(self, camera: Camera, affine: NDArray[np.float64] | None = None) -> Picture:
+        """What ``camera`` sees, its colours through ``affine`` [3, 4] if there is one."""
+        image = self._render(camera, self._scene.background).image.cpu().numpy()
+        if affine is not None:
+            image = image @ affine[:, :3].T.astype(np.float32) + affine[:, 3].astype(np.float32)
+        return to_uint8(image)
+
     def picture(self, shot: Shot) -> Picture:
         """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
-        rendered = to_uint8(self._render(shot.camera, self._scene.background).image.cpu().numpy())
+        rendered = self.view(shot.camera)
         if shot.filmed is None:
             return rendered
         return np.concatenate([_fitted(read_rgb(shot.filmed), *rendered.shape[:2]), rendered], axis=1)
@@ -143,23 +148,14 @@ def write_shots(
 
 def _write_folder(output: Path, photographer: Photographer, shots: Sequence[Shot], task: Task) -> None:
     """Write stills into a folder next to its place, and rename it when all are there."""
-    folder = output.parent
-    temporary = folder.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{folder.name}")
     (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
     named = [(f"{before}{digits % number}{after}", shot) for number, shot in enumerate(shots)]
-    try:
-        temporary.mkdir()
+    with whole_folder(output.parent) as folder:
         for name, shot in named:
-            photographer.write(temporary / name, shot)
+            photographer.write(folder / name, shot)
             task.advance()
-        cameras = cameras_json([(name, shot.camera) for name, shot in named])
-        write_json(temporary / "cameras.json", cameras)
-        sync_tree(temporary)
-        temporary.rename(folder)
-    except OSError as error:
-        raise disk_error(error, folder) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        write_json(folder / "cameras.json", cameras_json([(name, shot.camera) for name, shot in named]))
+        sync_tree(folder)
 
 
 def _fitted(image: Picture, height: int, width: int) -> Picture:

@@ -6,7 +6,7 @@ Pure functions from the poses of a capture to new ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,21 +35,17 @@ _PULL = 0.003
 """Weight of the cameras' mean up, against their horizontal axes, in what is up."""
 
 
-@dataclass(frozen=True)
-class CameraPath:
-    """A camera on its way."""
-
-    poses: Array  # [K, 4, 4] world to camera
-    nearest: NDArray[np.int64]  # [K] the frame of the capture that is nearest along the way, by position
-
-
-def smooth_path(cameras: Sequence[Camera], count: int) -> CameraPath:
+def smooth_path(
+    cameras: Sequence[Camera], count: int
+) -> tuple[Array, NDArray[np.int64]]:  # [K, 4, 4] world to camera, [K]
     """The way of ``cameras`` (in the order of their frames) from the first pose to the last, made smooth and
     cut into ``count`` poses of equal steps.
 
     A step's length is the distance over the extent of the path plus the angle over pi, so that a camera
     which only turns takes its time as well. Positions and quaternions go through one Gaussian filter along
     the path, mirrored through its ends, which therefore stay where they are.
+
+    Returns the poses, and the number of the camera that is nearest to each along the way.
 
     Raises InputError when no camera moves.
     """
@@ -75,7 +71,7 @@ def smooth_path(cameras: Sequence[Camera], count: int) -> CameraPath:
     motion = _motion(centres, turns)
     even = np.linspace(0, motion[-1], count)
     nearest = np.rint(np.interp(even, motion, passed)).astype(np.int64)
-    return CameraPath(_poses(_at(even, motion, centres), Slerp(motion, turns)(even)), nearest)
+    return _poses(_at(even, motion, centres), Slerp(motion, turns)(even)), nearest
 
 
 def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
@@ -196,5 +192,5 @@ def _poses(centres: Array, turns: Rotation) -> Array:  # [K, 4, 4] world to came
 
 
 def _unit(vector: Array) -> Array:
-    unit: Array = vector / np.linalg.norm(vector)
+    unit: Array = vector / max(float(np.linalg.norm(vector)), 1e-12)
     return unit

@@ -66,9 +66,9 @@ class CaptureShots:
 
     def path(self, count: int) -> list[Shot]:
         """``count`` pictures along the smoothed path of the capture, at equal steps."""
-        path = smooth_path(self._cameras, count)
-        cameras = [replace(self._lens, world_to_camera=pose) for pose in path.poses]
-        return self._shots(cameras, [self._frames[index] for index in path.nearest])
+        poses, nearest = smooth_path(self._cameras, count)
+        cameras = [replace(self._lens, world_to_camera=pose) for pose in poses]
+        return self._shots(cameras, [self._frames[index] for index in nearest])
 
     def turntable(self, count: int) -> list[Shot]:
         """``count`` pictures of a full turn around what the cameras look at."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from matplotlib.ticker import MaxNLocator
 
 from cleargs.parquet import read_table
 from cleargs.report.frame_strip import FrameRow
@@ -21,30 +22,11 @@ _POINTS = 120  # of a curve
 _LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
 
 
-class Tick(NamedTuple):
-    """A label on an axis, and its position."""
+def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
+    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError.
 
-    at: float
-    label: str
-
-
-class Curve(NamedTuple):
-    """One figure over all steps of all trainings."""
-
-    title: str
-    unit: str
-    path: str
-    """Of an SVG path, in `WIDTH` x `HEIGHT`."""
-    ticks: list[Tick]
-    parts: list[Tick]
-    """Where each training starts."""
-    steps: int
-    first: str
-    last: str
-
-
-def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
-    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError."""
+    Places (of ticks, and of the parts where each training starts) are in `WIDTH` x `HEIGHT`.
+    """
     paths = {stage: run / stage / "train.parquet" for stage in stages}
     tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
     tables = {stage: table for stage, table in tables.items() if table.num_rows}
@@ -53,25 +35,31 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
     steps = pa.concat_tables(tables.values())
     real = np.array(steps["kind"].to_pylist()) == "real"
     starts = np.cumsum([0, *(table.num_rows for table in tables.values())])
-    parts = [Tick(start / len(real) * WIDTH, stage) for start, stage in zip(starts, tables, strict=False)]
+    parts = [(start / len(real) * WIDTH, stage) for start, stage in zip(starts, tables, strict=False)]
 
-    def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> Curve:
+    def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> dict[str, Any]:
         values = steps[name].to_numpy().astype(np.float64)
         known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(len(values))
         # Medians of equal stretches: a step shows one view, and views differ more than steps do.
         stretches = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
         x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
         y = np.array([np.median(values[part]) for part in stretches])
-        ticks = _nice(float(y.min()), float(y.max()))
-        low, high = min(ticks[0], float(y.min())), max(ticks[-1], float(y.max()))
+        ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
+        low, high = ticks[[0, -1]]
 
         def height(value: float) -> float:
-            return HEIGHT * (1.0 - (value - low) / ((high - low) or 1.0))
+            return float(HEIGHT * (1.0 - (value - low) / (high - low)))
 
-        path = "M" + " L".join(f"{a:.1f},{height(float(b)):.1f}" for a, b in zip(x, y, strict=True))
-        labels = [Tick(height(tick), f"{tick:,g}") for tick in ticks]
-        first, last = (f"{float(value):,.{digits}f}" for value in (y[0], y[-1]))
-        return Curve(title, unit, path, labels, parts, len(values), first, last)
+        return {
+            "title": title,
+            "unit": unit,
+            "path": "M" + " L".join(f"{a:.1f},{height(b):.1f}" for a, b in zip(x, y, strict=True)),
+            "ticks": [(height(tick), f"{tick:,g}") for tick in ticks],
+            "parts": parts,
+            "steps": len(values),
+            "first": f"{y[0]:,.{digits}f}",
+            "last": f"{y[-1]:,.{digits}f}",
+        }
 
     return [
         curve("PSNR of the frames trained on", "dB", "psnr", 1, only_real=True),
@@ -80,46 +68,15 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[Curve]:
     ]
 
 
-def _nice(low: float, high: float) -> list[float]:
-    """Three to six round numbers that cover low to high."""
-    span = max(high - low, 1e-9 * max(abs(high), 1.0), 1e-9)
-    raw = span / 4
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = power * next(factor for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
-    first, last = np.floor(low / step), np.ceil(high / step)
-    return [round(float(index * step), 10) for index in np.arange(first, last + 1)]
-
-
-class Mark(NamedTuple):
-    """A camera from above."""
-
-    frame_id: int
-    x: float
-    y: float
-    radius: float
-    colour: str
-    tip: tuple[float, float]
-    """End of the line that shows where it looks."""
-    active: bool
-
-
-class Plan(NamedTuple):
-    """The trajectory from above, in units of its SVG."""
-
-    width: float
-    height: float
-    path: str
-    marks: list[Mark]
-
-
 def weight_colour(weight: float) -> str:
     """Amber (barely used) to teal (fully), which people with any colour vision can tell apart."""
     red, green, blue = np.rint(_LOW + (_HIGH - _LOW) * min(max(weight, 0.0), 1.0)).astype(int)
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
-def plan_of(rows: Sequence[FrameRow]) -> Plan | None:
-    """The cameras of the placed frames from above (x to the right, z up); None without any."""
+def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
+    """The cameras of the placed frames from above (x to the right, z up), in units of the SVG; None without
+    any. The tip of a mark ends the line that shows where it looks."""
     placed = [row for row in rows if row.frame.registered]
     if not placed:
         return None
@@ -134,35 +91,23 @@ def plan_of(rows: Sequence[FrameRow]) -> Plan | None:
     at = (centres - (low + high) / 2.0) * min(scale, height / max(float(high[1] - low[1]), 1e-6))
     at += np.array([size[0], height]) / 2.0 + 60.0
     marks = [
-        Mark(
-            row.frame.frame_id,
-            round(float(x), 1),
-            round(float(y), 1),
-            5.0 + 3.0 * (row.weight or 0.0),
-            weight_colour(row.weight or 0.0),
-            (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
-            bool(row.weight),
-        )
+        {
+            "frame_id": row.frame.frame_id,
+            "x": round(float(x), 1),
+            "y": round(float(y), 1),
+            "radius": 5.0 + 3.0 * (row.weight or 0.0),
+            "colour": weight_colour(row.weight or 0.0),
+            "tip": (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
+            "active": bool(row.weight),
+        }
         for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
     ]
-    path = "M" + " L".join(f"{mark.x},{mark.y}" for mark in marks)
-    return Plan(float(size[0]) + 120.0, height + 120.0, path, marks)
+    path = "M" + " L".join(f"{mark['x']},{mark['y']}" for mark in marks)
+    return {"width": float(size[0]) + 120.0, "height": height + 120.0, "path": path, "marks": marks}
 
 
-class Bars(NamedTuple):
-    """One figure a frame."""
-
-    title: str
-    unit: str
-    values: list[tuple[int, float]]
-    """Frame id and value."""
-    low: float
-    high: float
-    summary: str
-
-
-def fitted_bars(rows: Sequence[FrameRow]) -> list[Bars]:
-    """The figures of each frame's exposure, as far as they are known."""
+def fitted_bars(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
+    """The figures of each frame's exposure, as far as they are known: frame id and value of each bar."""
     figures: dict[tuple[str, str], list[float | None]] = {
         ("Motion blur", "px"): [row.blur_px for row in rows],
         ("Rolling shutter", "px"): [row.skew_px for row in rows],
@@ -180,5 +125,7 @@ def fitted_bars(rows: Sequence[FrameRow]) -> list[Bars]:
         if unit == "stops":
             summary = f"from {values.min():+.2f} to {values.max():+.2f} {unit}"
         low, high = min(0.0, float(values.min())), max(float(values.max()), 0.0) or 1.0
-        bars.append(Bars(title, unit, known, low, high, summary))
+        bars.append(
+            {"title": title, "unit": unit, "known": known, "low": low, "high": high, "summary": summary}
+        )
     return bars

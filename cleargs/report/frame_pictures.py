@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -48,19 +48,15 @@ class Picture(NamedTuple):
     height: int
 
 
-class FramePictures(NamedTuple):
-    """The pictures of one frame."""
-
-    thumbnail: Picture
-    layers: Mapping[str, Picture]
-    """Name in `LAYERS` -> picture, in that order."""
+FramePictures = tuple[Picture, dict[str, Picture]]
+"""Thumbnail of a frame, and its layers by their names in `LAYERS`."""
 
 
 def write_pictures(
     rows: Sequence[FrameRow],
     run: Path,
     report: Path,
-    render: RenderFrame | None,
+    render: RenderFrame,
     rendered: frozenset[int],
     threads: int,
 ) -> dict[int, FramePictures]:
@@ -73,7 +69,7 @@ def write_pictures(
         futures = {}
         for row in rows:
             frame_id = row.frame.frame_id
-            final = render(row, side) if render and frame_id in rendered else None
+            final = render(row, side) if frame_id in rendered else None
             futures[frame_id] = pool.submit(_write_frame, row, run, report, final, side)
         return {frame_id: future.result() for frame_id, future in futures.items()}
 
@@ -101,14 +97,9 @@ def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, si
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"
-    return FramePictures(
-        write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL),
-        {
-            layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side)
-            for layer in LAYERS
-            if layer in images
-        },
-    )
+    names = [layer for layer in LAYERS if layer in images]
+    layers = {layer: write_jpeg(report, f"{name}-{layer}.jpg", images[layer], side) for layer in names}
+    return write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers
 
 
 def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:

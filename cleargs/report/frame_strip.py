@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import Exposure, read_exposure
 from cleargs.formation.table import FORMATION
-from cleargs.parquet import damage_told, read_table
+from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
 
@@ -156,8 +154,7 @@ def _formation(path: Path) -> dict[int, dict[str, Any]]:
     """What the camera did to each frame; empty for a scene that was trained without asking."""
     if not path.is_file():
         return {}
-    with damage_told(path):
-        return {row.pop("frame_id"): row for row in pq.read_table(path).to_pylist()}
+    return {row.pop("frame_id"): row for row in read_any_table(path).to_pylist()}
 
 
 def _gain(exposure: Exposure | None, frame_id: int) -> float | None:

@@ -1,12 +1,8 @@
-"""What the pages have in common: templates, JSON for their scripts, and folders that appear whole."""
+"""What the pages have in common: templates, and JSON for their scripts."""
 
 from __future__ import annotations
 
 import json
-import secrets
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -15,37 +11,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 import cleargs
-from cleargs.files import PARTIAL_SUFFIX, disk_error
 from cleargs.manifest import plain_json
 from cleargs.report.charts import weight_colour
-from cleargs.report.report_json import FOLDER, PAGE
+from cleargs.report.report_json import PAGE
 
 
 def write_page(folder: Path, template: str | Template, **values: Any) -> None:
     """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
     html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
     (folder / PAGE).write_bytes(html.encode())
-
-
-@contextmanager
-def new_report(parent: Path) -> Iterator[Path]:
-    """A folder to fill, which then becomes ``parent/report`` as a whole, in place of an older one.
-
-    Raises StoreError when it cannot be written.
-    """
-    folder = parent / f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{FOLDER}"
-    try:
-        folder.mkdir()
-        yield folder
-        old = folder.with_name(f"{folder.name}.old")
-        if (parent / FOLDER).exists():
-            (parent / FOLDER).rename(old)
-        folder.rename(parent / FOLDER)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise disk_error(error, parent / FOLDER) from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def json_in_html(value: Any) -> Markup:

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+import tomli_w
 
 from cleargs.errors import InputError
+from cleargs.files import whole_folder
 from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import Manifest
+from cleargs.pipeline.config import Config, load_config, recipe_names
+from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.keys import settings
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.report import charts, facts, words
-from cleargs.report.frame_pictures import LAYERS, FramePictures, Picture, write_jpeg, write_pictures
+from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.settings import settings_of
+from cleargs.render.output import Photographer
+from cleargs.report import charts
+from cleargs.report.frame_pictures import LAYERS, Image, Picture, write_jpeg, write_pictures
 from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
-from cleargs.report.html import new_report, write_page
+from cleargs.report.html import write_page
 from cleargs.report.report_json import LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.verdict import judge
 from cleargs.report.web_scene import (
-    Renderer,
     camera_of,
     level_camera,
     opening,
@@ -26,6 +36,7 @@ from cleargs.report.web_scene import (
     write_scene,
     write_viewer,
 )
+from cleargs.report.words import duration, size
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 
@@ -44,20 +55,9 @@ TITLES = {
 UNCHANGED = "the same scene: no repair changed it"
 """What the second is where it has the bytes of the first."""
 
-
-class SceneView(NamedTuple):
-    """One of the two scenes."""
-
-    key: str
-    title: str
-    what: str
-    stage: str
-    gaussians: int
-    still: Picture
-    sh_degree: int
-    shown_degree: int
-    antialias: bool
-    background: tuple[float, float, float]
+STATES = {"done": "up to date", "partial": "done in part", "missing": "to be made"}
+HOW = {"made": "made anew", "found": "found in the store"}
+"""What the last ``cleargs run`` did."""
 
 
 def write_report(planner: Planner, last: LastRun | None = None) -> Path:
@@ -74,7 +74,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
     last = last or noted(run)
-    with new_report(run) as folder:
+    with whole_folder(page_of(run).parent, replace=True) as folder:
         _fill(folder, planner, manifests, last)
         write_record(folder, manifests, last)
     return page_of(run)
@@ -85,19 +85,18 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     run = planner.run.folder
     set_threads(planner.threads)
     trained = [stage for stage in SCENES if stage in manifests]
-    final = trained[-1] if trained else None
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
-    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
-    exposure = read_exposure(run / final / "exposure.parquet") if final else None
+    scenes, photographer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
+    exposure = read_exposure(run / trained[-1] / "exposure.parquet") if trained else None
 
-    def render(row: FrameRow, side: int) -> Any:
+    def render(row: FrameRow, side: int) -> Image:
         camera = camera_of(row.frame)
-        assert renderer is not None and exposure is not None  # asked for only where there is a scene
+        assert photographer is not None and exposure is not None  # asked for only where there is a scene
         smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-        return renderer(smaller, exposure.of(row.frame.frame_id))
+        return photographer.view(smaller, exposure.of(row.frame.frame_id))
 
-    shown = placed[:: -(-len(placed) // RENDERED) or 1] if renderer else []
+    shown = placed[:: -(-len(placed) // RENDERED) or 1] if photographer else []
     rendered = frozenset(row.frame.frame_id for row in shown)
     pictures = write_pictures(rows, run, folder, render, rendered, planner.threads)
     times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
@@ -114,22 +113,19 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
         plan=charts.plan_of(rows),
         curves=charts.training_curves(run, trained),
         bars=charts.fitted_bars(rows),
-        stages=facts.stage_rows(planner.dag.names, manifests, _plans(planner), last.stages if last else {}),
-        total=words.duration(sum(manifest.seconds for manifest in manifests.values())),
+        stages=_stage_rows(planner.dag.names, manifests, _plans(planner), last.stages if last else {}),
+        total=duration(sum(manifest.seconds for manifest in manifests.values())),
         memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
         device=list(manifests.values())[-1].device,
         started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
-        settings=facts.changed_settings(planner.run.config),
-        versions=facts.versions(manifests),
-        command=facts.command(planner.run, planner.dag),
-        layers=LAYERS,
+        settings=changed_settings(planner.run.config),
+        versions=_versions(manifests),
+        command=command(planner.run, planner.dag),
         aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
         data={
             "layers": LAYERS,
             "opening": {"left": "observed", "right": "final"},
-            "frames": [
-                _frame_data(row, pictures[row.frame.frame_id], times.get(row.frame.frame_id)) for row in rows
-            ],
+            "frames": [_frame_data(row, pictures[row.frame.frame_id][1], times) for row in rows],
             "viewer": _viewer_data(placed, scenes) if scenes else None,
         },
     )
@@ -137,38 +133,38 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
 
 def _scenes(
     folder: Path, run: Path, trained: Mapping[str, Manifest], placed: Sequence[FrameRow]
-) -> tuple[list[SceneView], Renderer | None]:
-    """Write the first and the last scene, each with a still; and what renders the last."""
+) -> tuple[list[dict[str, Any]], Photographer | None]:
+    """Write the first and the last scene, each with a still; returns what the page says of them, and what
+    renders the last."""
     if not trained or not placed:
         return [], None
     first, *_, last = [*trained] * 2
-    unchanged = trained[first].files["scene.ply"] == trained[last].files["scene.ply"]
-    views: list[SceneView] = []
-    renderer = None
+    views: list[dict[str, Any]] = []
     start = placed[opening([row.weight or 0.0 for row in placed])]
-    for key, stage in (("before", first), ("after", last)):
+    for (key, (title, what)), stage in zip(TITLES.items(), (first, last), strict=True):
+        if views and trained[first].files["scene.ply"] == trained[last].files["scene.ply"]:
+            what = UNCHANGED
         scene = read_ply(run / stage / "scene.ply")
-        renderer = Renderer(scene)
+        photographer = Photographer(scene)
         camera = camera_of(start.frame)
         longer = max(camera.width, camera.height)
         size = [max(1, round(_STILL / longer * side)) for side in (camera.width, camera.height)]
-        still = write_jpeg(folder, f"{key}.jpg", renderer(level_camera(camera, *size)), _STILL)
-        degree = write_scene(folder / f"scene-{key}.js", key, scene)
+        still = photographer.view(level_camera(camera, *size))
         views.append(
-            SceneView(
-                key,
-                TITLES[key][0],
-                UNCHANGED if unchanged and key == "after" else TITLES[key][1],
-                stage,
-                scene.gaussians.num,
-                still,
-                scene.gaussians.sh_degree,
-                degree,
-                scene.antialias,
-                scene.background,
-            )
+            {
+                "key": key,
+                "title": title,
+                "what": what,
+                "stage": stage,
+                "gaussians": scene.gaussians.num,
+                "still": write_jpeg(folder, f"{key}.jpg", still, _STILL),
+                "sh_degree": scene.gaussians.sh_degree,
+                "shown_degree": write_scene(folder / f"scene-{key}.js", key, scene),
+                "antialias": scene.antialias,
+                "background": scene.background,
+            }
         )
-    return views, renderer
+    return views, photographer
 
 
 def _plans(planner: Planner) -> dict[str, StagePlan]:
@@ -180,10 +176,87 @@ def _plans(planner: Planner) -> dict[str, StagePlan]:
         return {}
 
 
+# -- how the run came about ----------------------------------------------------------------------------------
+
+
+def _stage_rows(
+    names: Sequence[str],
+    manifests: Mapping[str, Manifest],
+    plans: Mapping[str, StagePlan],
+    last: Mapping[str, str],
+) -> list[dict[str, Any]]:
+    """What each stage cost, and whether its results are those of today's settings and input.
+
+    last: stage -> ``made`` or ``found``, as the last run had it.
+    """
+    total = sum(manifest.seconds for manifest in manifests.values()) or 1.0
+    rows = []
+    for name in names:
+        manifest, plan = manifests.get(name), plans.get(name)
+        rows.append(
+            {
+                "name": name,
+                "state": STATES[plan.state] if plan else "unknown",
+                "reasons": plan.reasons if plan else (),
+                "how": HOW.get(last.get(name, ""), ""),
+                "time": duration(manifest.seconds) if manifest else "",
+                "share": manifest.seconds / total if manifest else 0.0,
+                "size": size(manifest.bytes) if manifest else "",
+                "key": manifest.key[:12] if manifest else "",
+            }
+        )
+    return rows
+
+
+def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
+    """Name, value, default and meaning of each setting of the stages that differs from its default."""
+    found = []
+    for section, model in config.sections.items():
+        values = dict(settings({section: model.model_dump(mode="json")}))
+        for setting in settings_of(section, type(model)):
+            value = values[setting.name]
+            if value != setting.default:
+                found.append((setting.name, _toml(value), _toml(setting.default), setting.meaning))
+    return found
+
+
+def command(run: Run, dag: Dag) -> str:
+    """The ``cleargs run`` that makes this run, called next to its folder: a recipe, then settings."""
+    wanted = dict(settings(run.config.document()))
+    candidates = []
+    for recipe in ("default", *(name for name in recipe_names() if name != "default")):
+        have = dict(settings(load_config(dag, recipe).document()))
+        changed = {name: value for name, value in wanted.items() if have.get(name) != value}
+        candidates.append((len(changed), recipe, changed))
+    _, recipe, changed = min(candidates, key=lambda item: item[0])
+    source = os.path.relpath(run.source, run.folder.parent)
+    words = ["cleargs", "run", source, "-o", run.folder.name]
+    words += ["--workflow", recipe] if recipe != "default" else []
+    words += ["--seed", str(changed.pop("seed"))] if "seed" in changed else []
+    for name, value in changed.items():
+        words += ["--set", f"{name}={value if isinstance(value, str) else _toml(value)}"]
+    return shlex.join(words)
+
+
+def _toml(value: Any) -> str:
+    """``value`` as TOML writes it; "unset" for None."""
+    if value is None:
+        return "unset"
+    return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
+
+
+def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
+    """Program or library -> version, of all stages together."""
+    found: dict[str, str] = {}
+    for manifest in manifests.values():
+        found |= {**manifest.versions, **{name: str(v) for name, v in manifest.parts.libraries.items()}}
+    return found
+
+
 # -- what the scripts of the page know ----------------------------------------------------------------------
 
 
-def _frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> dict[str, Any]:
+def _frame_data(row: FrameRow, layers: Mapping[str, Picture], times: Mapping[int, float]) -> dict[str, Any]:
     found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,
@@ -201,12 +274,12 @@ def _frame_data(row: FrameRow, pictures: FramePictures, time: float | None) -> d
             {"name": name.replace("_", " "), "value": value, "meaning": MEANINGS.get(name, "")}
             for name, value in row.formation.items()
         ],
-        "layers": {name: picture.path for name, picture in pictures.layers.items()},
-        "time": time,
+        "layers": {name: picture.path for name, picture in layers.items()},
+        "time": times.get(row.frame.frame_id),
     }
 
 
-def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dict[str, Any]:
+def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The settings of the two viewers (SuperSplat Viewer's schema, version 2), and their scenes.
 
     The trajectory is an animation track: its keys are the frames' poses, to which the page goes by time.
@@ -230,14 +303,11 @@ def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[SceneView]) -> dic
         },
     }
     return {
-        "scenes": [
-            {"key": scene.key, "antialias": scene.antialias, "background": scene.background}
-            for scene in scenes
-        ],
+        "scenes": [{name: scene[name] for name in ("key", "antialias", "background")} for scene in scenes],
         "start": start * _SECONDS_A_FRAME,
         "settings": {
             **viewer_settings(),
-            "background": {"color": list(scenes[-1].background)},
+            "background": {"color": list(scenes[-1]["background"])},
             "animTracks": [track],
             "cameras": [{"initial": poses[start]}],
             "annotations": [],

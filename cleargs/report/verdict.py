@@ -37,12 +37,8 @@ class Caution(NamedTuple):
     """As ``--set`` takes them; empty where no setting helps."""
 
 
-class Figure(NamedTuple):
-    """A number that stands for a part of the run."""
-
-    value: str
-    label: str
-    note: str
+Figure = tuple[str, str, str]
+"""A number that stands for a part of the run, its label, and a note."""
 
 
 class Verdict(NamedTuple):
@@ -64,22 +60,6 @@ def judge(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: C
     return Verdict(*run.headline(), run.text(), tuple(run.figures()), warnings)
 
 
-def figure(manifests: Mapping[str, Manifest], stage: str, *path: str) -> Any:
-    """A figure that a stage reported; None without the stage or the figure."""
-    value: Any = manifests[stage].summary if stage in manifests else None
-    for name in path:
-        value = value.get(name) if isinstance(value, Mapping) else None
-    return value
-
-
-def training_psnr(manifests: Mapping[str, Manifest]) -> tuple[float | None, str]:
-    """PSNR of the first scene on the best frames that it was trained on, dB, and what these are called."""
-    strong = figure(manifests, "g0", "psnr_strong")
-    if strong is not None:
-        return strong, "the trusted training frames"
-    return figure(manifests, "g0", "psnr_active"), "its training frames"
-
-
 class _Run:
     """A run under judgement."""
 
@@ -89,7 +69,18 @@ class _Run:
         self._unused = sum(row.weight == 0.0 for row in self._placed)
 
     def _figure(self, stage: str, *path: str) -> Any:
-        return figure(self._manifests, stage, *path)
+        """A figure that a stage reported; None without the stage or the figure."""
+        value: Any = self._manifests[stage].summary if stage in self._manifests else None
+        for name in path:
+            value = value.get(name) if isinstance(value, Mapping) else None
+        return value
+
+    def _training_psnr(self) -> tuple[float | None, str]:
+        """PSNR of the first scene on the best frames of its training, dB, and what these are called."""
+        strong = self._figure("g0", "psnr_strong")
+        if strong is not None:
+            return strong, "the trusted training frames"
+        return self._figure("g0", "psnr_active"), "its training frames"
 
     def _setting(self, section: str, name: str) -> Any:
         return getattr(self._config.sections[section], name)
@@ -98,17 +89,15 @@ class _Run:
         """The tone and the first line."""
         if "g0" not in self._manifests:
             return "fair", "The capture is prepared; no scene is trained yet."
-        psnr, frames = training_psnr(self._manifests)
+        psnr, frames = self._training_psnr()
         if psnr is None:
             return "fair", "The scene is trained."
         follows = f"The first scene follows {frames}"
         if psnr >= CLOSE_DB:
             return "good", f"{follows} closely."
-        return (
-            ("fair", f"{follows} fairly closely.")
-            if psnr >= LOOSE_DB
-            else ("poor", f"{follows} only loosely.")
-        )
+        if psnr >= LOOSE_DB:
+            return "fair", f"{follows} fairly closely."
+        return "poor", f"{follows} only loosely."
 
     def text(self) -> str:
         """The lines under the headline."""
@@ -141,23 +130,23 @@ class _Run:
     def figures(self) -> Iterator[Figure]:
         """The numbers of the first screen."""
         placed = f"{len(self._placed)} of {len(self._rows)}"
-        yield Figure(placed, "frames placed", "with a pose that fits the others")
+        yield placed, "frames placed", "with a pose that fits the others"
         if "rva" in self._manifests:
             active = sum(bool(row.weight) for row in self._rows)
             whole = f"as much as {self._figure('rva', 'effective_frames'):.1f} whole ones together"
-            yield Figure(f"{active}", "frames train the scene", whole)
-        psnr, frames = training_psnr(self._manifests)
+            yield f"{active}", "frames train the scene", whole
+        psnr, frames = self._training_psnr()
         if psnr is not None:
             rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
-            yield Figure(decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}")
+            yield decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}"
         unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
         if unseen is not None:
             note = "PSNR of the last scene on a hundredth of every frame; views off the path are worse"
-            yield Figure(decibel(unseen), "on pixels that no training saw", note)
+            yield decibel(unseen), "on pixels that no training saw", note
         repairs = self._figure("consolidate", "repairs")
         if repairs is not None:
             views = "repaired views" if repairs != 1 else "repaired view"
-            yield Figure(str(repairs), views, "carried into the final scene")
+            yield str(repairs), views, "carried into the final scene"
 
     def parts_missing(self) -> Iterator[Caution]:
         """Stages that are done only in part."""

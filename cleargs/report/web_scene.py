@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame
-from cleargs.splat.backend import rasteriser_for
+from cleargs.render.paths import look_at
 from cleargs.splat.camera import Camera
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
@@ -68,8 +67,7 @@ def write_viewer(folder: Path) -> str:
 
 def viewer_settings() -> dict[str, Any]:
     """The viewer's settings that are the same in all reports."""
-    settings: dict[str, Any] = json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8"))
-    return settings
+    return dict(json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8")))
 
 
 def _script(name: str, packed: bytes) -> bytes:
@@ -94,12 +92,8 @@ def viewer_pose(camera: Camera) -> dict[str, Any]:
 
 def level_camera(camera: Camera, width: int, height: int) -> Camera:
     """What the viewer shows at `viewer_pose` in a canvas of this size: no roll, the axis in the middle."""
-    forward = camera.world_to_camera[2, :3]
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= max(float(np.linalg.norm(right)), 1e-9)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(forward, right), forward]
-    pose[:3, 3] = -pose[:3, :3] @ camera.centre
+    target = camera.centre + camera.world_to_camera[2, :3]
+    pose = look_at(camera.centre, target, np.array([0.0, -1.0, 0.0]))
     side, focal = (camera.width, camera.fx) if camera.width > camera.height else (camera.height, camera.fy)
     focal *= max(width, height) / side
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
@@ -109,23 +103,3 @@ def opening(weights: Sequence[float]) -> int:
     """The registered frame that the viewers open at: of the heaviest, the one halfway along."""
     heaviest = [index for index, weight in enumerate(weights) if weight >= 0.95 * max(weights)]
     return heaviest[len(heaviest) // 2]
-
-
-class Renderer:
-    """Pictures of one scene, uint8 sRGB."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._engine = rasteriser_for()
-
-    def __call__(
-        self, camera: Camera, affine: NDArray[np.float64] | None = None
-    ) -> NDArray[np.uint8]:  # [H, W, 3]
-        """The view of ``camera``, its colours through ``affine`` [3, 4] if there is one."""
-        scene = self._scene
-        image = self._engine.forward(
-            scene.gaussians, camera, background=scene.background, antialias=scene.antialias
-        ).image.numpy()
-        if affine is not None:
-            image = image @ affine[:, :3].T.astype(np.float32) + affine[:, 3].astype(np.float32)
-        return np.asarray(np.rint(image.clip(0.0, 1.0) * 255.0), np.uint8)

@@ -15,7 +15,7 @@ def decibel(value: float) -> str:
 
 def duration(seconds: float) -> str:
     """``4.0 s``, ``3.4 min``, ``2.1 h``."""
-    if seconds < 100:
+    if seconds < 120:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 

@@ -67,13 +67,13 @@ def as_poses(cameras: Sequence[Camera]) -> Array:
 @given(seed=st.integers(0, 10**6), frames=st.integers(2, 60), count=st.integers(2, 200))
 def test_the_path_begins_and_ends_where_the_capture_does(seed: int, frames: int, count: int) -> None:
     cameras = handheld(seed, frames)
-    path = smooth_path(cameras, count)
-    assert path.poses.shape == (count, 4, 4)
-    np.testing.assert_allclose(path.poses[0], cameras[0].world_to_camera, atol=1e-9)
-    np.testing.assert_allclose(path.poses[-1], cameras[-1].world_to_camera, atol=1e-9)
-    assert path.nearest[0] == 0 and path.nearest[-1] == frames - 1
-    assert (np.diff(path.nearest) >= 0).all()
-    turns = path.poses[:, :3, :3]
+    poses, nearest = smooth_path(cameras, count)
+    assert poses.shape == (count, 4, 4)
+    np.testing.assert_allclose(poses[0], cameras[0].world_to_camera, atol=1e-9)
+    np.testing.assert_allclose(poses[-1], cameras[-1].world_to_camera, atol=1e-9)
+    assert nearest[0] == 0 and nearest[-1] == frames - 1
+    assert (np.diff(nearest) >= 0).all()
+    turns = poses[:, :3, :3]
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (count, 1, 1)), atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(turns), 1.0)
 
@@ -82,7 +82,7 @@ def test_the_path_begins_and_ends_where_the_capture_does(seed: int, frames: int,
 def test_the_camera_keeps_its_pace(seed: int) -> None:
     """Whatever the frames' own pace was: here it is three times as fast in the second half."""
     cameras = handheld(seed, 60)
-    made = steps(smooth_path(cameras[:30] + cameras[30::3], 50).poses)
+    made = steps(smooth_path(cameras[:30] + cameras[30::3], 50)[0])
     # Steps are chords of a smooth curve: they fall short of its length by some thousandths.
     np.testing.assert_allclose(made, made.mean(), rtol=0.02)
 
@@ -91,7 +91,7 @@ def test_the_camera_keeps_its_pace(seed: int) -> None:
 def test_tremor_is_gone_and_the_way_is_kept(seed: int) -> None:
     cameras = handheld(seed, 60)
     raw = np.stack([each.centre for each in cameras])
-    made = centres(smooth_path(cameras, 60).poses)
+    made = centres(smooth_path(cameras, 60)[0])
     assert bends(made) < 0.2 * bends(raw)
     # The tremor is 0.01 a axis; what the filter cuts from the bends of the way is of the same size.
     nearest = np.linalg.norm(made[:, None] - raw, axis=2).min(axis=1)
@@ -106,7 +106,7 @@ def test_a_camera_that_stops_and_turns_takes_its_time() -> None:
     poses[20:, :3, :3] = turning[-1].as_matrix()
     walked = np.stack([np.linspace(0.1, 2, 20), np.zeros(20), np.zeros(20)], 1)
     poses[20:, :3, 3] = -np.einsum("kij,kj->ki", poses[20:, :3, :3], walked)
-    made = smooth_path([camera(pose) for pose in poses], 100).poses
+    made = smooth_path([camera(pose) for pose in poses], 100)[0]
     turns = Rotation.from_matrix(made[:, :3, :3])
     assert np.degrees((turns[1:] * turns[:-1].inv()).magnitude()).max() < 5
     np.testing.assert_allclose(steps(made), steps(made).mean(), rtol=0.02)
@@ -115,7 +115,7 @@ def test_a_camera_that_stops_and_turns_takes_its_time() -> None:
 def test_frames_at_one_place_and_repeated_frames() -> None:
     cameras = handheld(0, 5)
     twice = [cameras[0], cameras[0], *cameras[1:], cameras[-1]]
-    np.testing.assert_allclose(smooth_path(twice, 20).poses[-1], cameras[-1].world_to_camera, atol=1e-9)
+    np.testing.assert_allclose(smooth_path(twice, 20)[0][-1], cameras[-1].world_to_camera, atol=1e-9)
     with pytest.raises(InputError, match="do not move"):
         smooth_path([cameras[0]] * 4, 20)
 
@@ -129,7 +129,7 @@ def test_opposite_signs_of_a_quaternion_are_one_turn() -> None:
         pose[:3, :3] = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         pose[:3, 3] = -pose[:3, :3] @ [0.01 * index, 0, 0]
         cameras.append(camera(pose))
-    made = Rotation.from_matrix(smooth_path(cameras, 200).poses[:, :3, :3])
+    made = Rotation.from_matrix(smooth_path(cameras, 200)[0][:, :3, :3])
     turned = (made[1:] * made[:-1].inv()).as_rotvec(degrees=True)
     np.testing.assert_allclose(turned[:, 1], 900 / 199, rtol=0.05)
 

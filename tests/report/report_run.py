@@ -31,7 +31,7 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
-from cleargs.report.web_scene import Renderer
+from cleargs.render.output import Photographer
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
@@ -146,7 +146,7 @@ class FinishedRun:
     def _ingest(self) -> None:
         folder = self.folder / "ingest"
         (folder / "images").mkdir(parents=True)
-        render = Renderer(self.scenes["g0"])
+        render = Photographer(self.scenes["g0"]).view
         rows = []
         for index in range(COUNT):
             pose = camera(index)
@@ -229,7 +229,7 @@ class FinishedRun:
     def _rivr(self) -> None:
         folder = self.folder / "rivr"
         (folder / "round_01").mkdir(parents=True)
-        render = Renderer(self.scenes["consolidate"])
+        render = Photographer(self.scenes["consolidate"]).view
         rows = []
         for index in range(5):
             image = render(camera(index)).astype(np.float32) / 255

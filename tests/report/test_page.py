@@ -25,11 +25,10 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
-from cleargs.report import facts
 from cleargs.report.charts import weight_colour
 from cleargs.report.frame_strip import UNPLACED
 from cleargs.report.html import json_in_html
-from cleargs.report.page import write_report
+from cleargs.report.page import changed_settings, command, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import judge
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
@@ -108,11 +107,9 @@ def test_the_verdict_names_settings_that_exist(parsed: Page, run: FinishedRun) -
 
 
 def test_settings_and_the_command_make_the_run_again(run: FinishedRun) -> None:
-    changed = {
-        setting.name: (setting.value, setting.default) for setting in facts.changed_settings(run.run.config)
-    }
+    changed = {name: (value, default) for name, value, default, _ in changed_settings(run.run.config)}
     assert changed["rva.tau_R"] == ("0.61", "0.7") and changed["rivr.distil.steps"] == ("100", "unset")
-    assert facts.command(run.run, run.dag) == (
+    assert command(run.run, run.dag) == (
         "cleargs run 'gone & <away>.mp4' -o run --workflow smoke --set rva.tau_R=0.61"
     )
 

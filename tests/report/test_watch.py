@@ -20,8 +20,8 @@ from watched import reported, serving, working
 
 from cleargs.errors import InputError
 from cleargs.progress import PREVIEW
+from cleargs.render.output import Photographer
 from cleargs.report.serve import Server
-from cleargs.report.web_scene import Renderer
 from cleargs.splat.train_log import write_preview
 
 
@@ -93,7 +93,7 @@ def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun
         }
         versions = []
         for seed in (1, 2):
-            image = Renderer(wall(seed))
+            image = Photographer(wall(seed)).view
             write_preview(checkpoints / "round_01" / PREVIEW, torch.from_numpy(image(camera(1)) / 255))
             versions.append(json.loads(ask(port, "/state.json").body)["preview"])
             shown = ask(port, "/preview.png?1")
@@ -202,6 +202,7 @@ def test_browsers_are_told_to_be_careful(port: int, path: str) -> None:
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert "access-control-allow-origin" not in headers and "python" not in headers["server"].lower()
+    assert ("content-security-policy" in headers) == (path in ("/", "/live.js"))
 
 
 def test_it_listens_at_this_machine_alone_and_says_what_it_cannot(finished: FinishedRun) -> None:
