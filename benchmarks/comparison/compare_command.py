@@ -11,6 +11,7 @@ from click.core import ParameterSource
 
 from benchmarks.comparison.variants import BASELINES, VARIANTS, find_variants
 from cleargs.cli.common import (
+    DONE_IN_PART,
     json_option,
     output_option,
     print_json,
@@ -20,7 +21,6 @@ from cleargs.cli.common import (
     threads_or_all,
     work_options,
 )
-from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError, InputError
 from cleargs.evaluate.config import LPIPS_NETS, SCORERS, EvalOptions, LpipsNet

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.cli.common import output_option, quiet_option, threads_or_all, work_options
-from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, threads_or_all, work_options
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
 from cleargs.pipeline.dag import Dag

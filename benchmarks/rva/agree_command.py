@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cleargs.cli.common import (
+    DONE_IN_PART,
     json_option,
     print_json,
     quiet_option,
@@ -17,7 +18,6 @@ from cleargs.cli.common import (
     threads_or_all,
     work_options,
 )
-from cleargs.cli.outcome import DONE_IN_PART
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError

@@ -15,6 +15,9 @@ from cleargs.splat.budget import Quality
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+DONE_IN_PART = 3
+"""Exit code of work that is not whole."""
+
 FOLDER = click.Path(file_okay=False, path_type=Path)
 
 store_option = click.option(

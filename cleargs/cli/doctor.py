@@ -57,8 +57,20 @@ def doctor(folder: Path, as_json: bool) -> int:
         Finding("cleargs", "ok", f"{cleargs.__version__}, Python {platform.python_version()}"),
         *(_library(name) for name in LIBRARIES),
         Finding("cores", "ok", str(usable_cores())),
-        _memory(),
-        _disk(folder),
+        _room(
+            "memory",
+            available_memory() / 1e9,
+            MIN_MEMORY_GB,
+            "",
+            f"a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size",
+        ),
+        _room(
+            "disk",
+            shutil.disk_usage(folder).free / 1e9,
+            MIN_DISK_GB,
+            f" at {folder.absolute()}",
+            "cleargs gc frees what no run needs",
+        ),
         Finding("device", "note" if obstacle is None else "ok", device),
         Finding("pace", "ok", speed),
         _writable("runs", folder),
@@ -82,18 +94,10 @@ def _library(name: str) -> Finding:
         return Finding(name, "bad", "not installed: install cleargs again")
 
 
-def _memory() -> Finding:
-    available = available_memory() / 1e9
-    enough = available >= MIN_MEMORY_GB
-    advice = "" if enough else f"; a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size"
-    return Finding("memory", "ok" if enough else "note", f"{available:.1f} GB free{advice}")
-
-
-def _disk(folder: Path) -> Finding:
-    free = shutil.disk_usage(folder).free / 1e9
-    enough = free >= MIN_DISK_GB
-    advice = "" if enough else "; cleargs gc frees what no run needs"
-    return Finding("disk", "ok" if enough else "note", f"{free:.1f} GB free at {folder.absolute()}{advice}")
+def _room(what: str, free: float, least: float, text: str, advice: str) -> Finding:
+    """What is ``free``, GB, with ``advice`` where it is less than the ``least``."""
+    words = f"{free:.1f} GB free{text}"
+    return Finding(what, "ok", words) if free >= least else Finding(what, "note", f"{words}; {advice}")
 
 
 def _writable(what: str, folder: Path) -> Finding:

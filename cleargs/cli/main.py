@@ -20,23 +20,20 @@ INTERRUPTED = 130
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("cleargs.cli.run", "Turn a capture into a clean scene: all stages, or those that are missing."),
-    "status": ("cleargs.cli.status", "Say for each stage whether it is done, and what changed if not."),
+    "status": ("cleargs.cli.run", "Say for each stage whether it is done, and what changed if not."),
     "show": ("cleargs.cli.show", "Show the tables and figures of a run or of one stage."),
-    "watch": ("cleargs.cli.watch", "Show a run in the browser while it is at work, then its report."),
-    "report": (
-        "cleargs.cli.report",
-        "Write a page that shows a run: the scene in 3D, and every frame.",
-    ),
+    "watch": ("cleargs.cli.report", "Show a run in the browser while it is at work, then its report."),
+    "report": ("cleargs.cli.report", "Write a page that shows a run: the scene in 3D, and every frame."),
     "render": ("cleargs.cli.render", "Render the scene: stills, and films along a path."),
     "export": ("cleargs.cli.export", "Write the scene for a viewer or another program."),
     "eval": ("cleargs.cli.eval", "Measure a scene against sharp images."),
     "batch": ("cleargs.cli.batch", "Bring all scenes of a sheet through the stages."),
-    "stage": ("cleargs.cli.stage", "Run one stage of a prepared run."),
+    "stage": ("cleargs.cli.run", "Run one stage of a prepared run."),
     "settings": ("cleargs.cli.settings", "List every setting: default, range, meaning."),
     "models": ("cleargs.cli.models", "List, install and verify model weights."),
     "synth": ("cleargs.cli.synth", "Make a synthetic capture with known truth."),
-    "verify": ("cleargs.cli.verify", "Read every file of a run again, and name what is damaged."),
-    "gc": ("cleargs.cli.gc", "Remove results that no run links to."),
+    "verify": ("cleargs.cli.store", "Read every file of a run again, and name what is damaged."),
+    "gc": ("cleargs.cli.store", "Remove results that no run links to."),
     "doctor": ("cleargs.cli.doctor", "Check this machine: versions, memory, disk, device."),
 }
 """Command -> (module that holds the click command of that name, _ for -; its line in ``cleargs --help``)."""

@@ -1,9 +1,11 @@
-"""``cleargs report``: a run as a page to look at and to hand on."""
+"""``cleargs report`` and ``watch``: a run as a page, finished or at work."""
 
 from __future__ import annotations
 
 import resource
 from collections.abc import Sequence
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 from shlex import quote
 
@@ -24,6 +26,8 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.session import opened_store
+
+HERE = "127.0.0.1"
 
 
 @click.command(
@@ -91,3 +95,49 @@ def older_report(run: Path, dag: Dag) -> str:
     if not page.is_file() or is_current(run, linked_manifests(run, dag.names)):
         return ""
     return f"note: {page} shows earlier results; `cleargs report {quote(str(run))}` makes it anew"
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cleargs watch room                     the address to open stands on the first line
+  cleargs watch room --port 8000
+  ssh -L 8000:localhost:8000 HOST cleargs watch room --port 8000      a run on another machine
+
+\b
+While a run is at work the page shows the stage, its figures, the time left, and the scene at the last
+checkpoint; it renews itself. Afterwards it shows the report.
+"""
+)
+@run_argument
+@click.option(
+    "--host",
+    default=HERE,
+    show_default=True,
+    help="Address to listen at. Any other than this one lets other machines read the report.",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65_535),
+    default=0,
+    help="Port to listen at.  [default: one that is free]",
+)
+@store_option
+@click.pass_obj
+def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None:
+    """Serve the report of RUN, and how far it is while it is at work, until Ctrl-C."""
+    from cleargs.report.serve import Server
+
+    with Server(dag, read_run_file(run, dag, store=store), host, port) as server:
+        if not _is_loopback(host):
+            click.echo(f"warning: whoever reaches {host} can read the report of this run", err=True)
+        click.echo(f"{server.address}  (Ctrl-C ends it)")
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

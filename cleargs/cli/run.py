@@ -1,12 +1,16 @@
-"""``cleargs run``: a capture through all stages."""
+"""``cleargs run``, ``stage`` and ``status``: the stages of a run, made or only looked at."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
+from typing import Any
 
 import click
 
 from cleargs.cli.common import (
+    DONE_IN_PART,
     json_option,
     output_option,
     partial_option,
@@ -14,17 +18,26 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
+    run_argument,
     store_option,
     threads_or_all,
     work_options,
 )
-from cleargs.cli.outcome import exit_code, outcome_json, print_outcomes, print_plans
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.report import older_report, report_on
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.runner import Runner, check_same_input
-from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store
+from cleargs.pipeline.plan import Planner, StagePlan, cost_line
+from cleargs.pipeline.run_file import read_run_file
+from cleargs.pipeline.runner import Outcome, Runner, check_same_input
+from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, resolve_device
+from cleargs.report.words import duration
+from cleargs.untrusted import printable
+
+Summaries = Mapping[str, Mapping[str, Any]]
+"""Stage -> the figures of its manifest."""
+
+PICTURES = ("before_after.png", "candidates.png")
+"""What to look at, the first that a stage has."""
 
 
 @click.command(
@@ -126,3 +139,198 @@ def run(
     else:
         print_outcomes(outcomes, settings.folder, page)
     return exit_code(outcomes)
+
+
+@click.command(
+    epilog="""\b
+Example:
+  cleargs run photos/ -o room --until ingest
+  cleargs stage rva room
+"""
+)
+@click.argument("name")
+@run_argument
+@click.option("--force", is_flag=True, help="Make the stage again, even if its results are there.")
+@click.option("--report", "wants_report", is_flag=True, help="Write RUN/report/index.html at the end.")
+@partial_option
+@work_options
+@store_option
+@json_option
+@quiet_option
+@click.pass_obj
+def stage(
+    dag: Dag,
+    name: str,
+    run: Path,
+    force: bool,
+    wants_report: bool,
+    allow_partial: bool,
+    device: DeviceChoice,
+    threads: int | None,
+    store: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Run the one stage NAME of RUN with the settings in RUN/run.toml.
+
+    The stages before it must be done.
+    """
+    dag.check(name)
+    resolved = None if device == "auto" else resolve_device(device, click.echo)
+    settings = read_run_file(run, dag, store=store, device=resolved)
+    with opened_store(settings.store) as opened:
+        runner = Runner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet))
+        outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
+        if wants_report:
+            report_on(runner.planner, [outcome])
+    if as_json:
+        print_json(outcome_json(outcome))
+    else:
+        print_outcomes([outcome], settings.folder)
+    return exit_code([outcome])
+
+
+@click.command(
+    epilog="""\b
+States:
+  done     the results are there and whole
+  partial  the results are there, something is missing; the next run tries again
+  missing  to be made: the line says which setting, input file or version changed
+"""
+)
+@run_argument
+@store_option
+@json_option
+@click.pass_obj
+def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
+    """Say for each stage of RUN whether it is done, partial or missing, and what changed."""
+    settings = read_run_file(run, dag, store=store)
+    with opened_store(settings.store) as opened:
+        planner = Planner(dag, settings, opened, threads_or_all(None), make_reporter())
+        print_plans(planner.plan(), as_json)
+
+
+# -- what became of stages, or would become of them ----------------------------------------------------------
+
+
+def exit_code(outcomes: Sequence[Outcome]) -> int:
+    """0, or 3 where something is missing."""
+    return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
+
+
+def print_outcomes(outcomes: Sequence[Outcome], run: Path, report: Path | None = None) -> None:
+    """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
+    what to look at (the ``report``, a picture), the next command."""
+    last = outcomes[-1].manifest
+    for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
+        click.echo(f"missing: {printable(missing)}", err=True)
+    if last.status == "partial":
+        click.echo("hint: the same command tries again; --allow-partial continues without it", err=True)
+    summaries = {outcome.stage: outcome.manifest.summary for outcome in outcomes}
+    scene = "scene.ply" in last.files
+    partial = ", in part" if last.status == "partial" else ""
+    place = run / last.stage / ("scene.ply" if scene else "")
+    click.echo(f"{'scene' if scene else 'results'}: {place}{partial}{_extent(summaries)}")
+    if quality := _quality(summaries):
+        click.echo(f"quality: {quality}")
+    click.echo(f"time: {_times(outcomes)}")
+    pictures = [
+        run / outcome.stage / name
+        for outcome in reversed(outcomes)
+        for name in PICTURES
+        if name in outcome.manifest.files
+    ]
+    if shown := [*([report] if report else []), *pictures[:1]]:
+        click.echo(f"look at: {', '.join(map(str, shown))}")
+    click.echo(f"next: {_next(summaries, run, scene)}")
+
+
+def _extent(summaries: Summaries) -> str:
+    """How large the result is: frames with a pose, and how many of them were repaired."""
+    ingest, consolidate = summaries.get("ingest", {}), summaries.get("consolidate", {})
+    words = []
+    if "registered" in ingest and "frames" in ingest:
+        words.append(f"{ingest['registered']} of {ingest['frames']} frames placed")
+    if "roles" in summaries.get("rva", {}):
+        words.append(f"{summaries['rva']['roles']['strong']} strong")
+    if "repairs" in consolidate:
+        words.append(f"{consolidate['repairs']} repaired")
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _quality(summaries: Summaries) -> str:
+    """What is known of how good the last scene is; "" for nothing."""
+    scenes = {
+        stage: figures for stage, figures in summaries.items() if figures.get("psnr_unseen") is not None
+    }
+    if not scenes:
+        return ""
+    last, figures = list(scenes.items())[-1]
+    first = summaries.get("g0", {}).get("psnr_unseen")  # `cleargs stage` tells of one stage alone
+    beside = f" (first scene {first:.1f})" if last != "g0" and first is not None else ""
+    text = (
+        f"PSNR {figures['psnr_unseen']:.1f} dB{beside} on pixels that no training saw; "
+        "views off the path are worse"
+    )
+    harm = figures.get("held_back", {}).get("harm")
+    return f"{text}. Rejected: {harm}" if harm else text
+
+
+def _times(outcomes: Sequence[Outcome]) -> str:
+    """How long this call worked, stage by stage, and what it found."""
+    made = [outcome for outcome in outcomes if outcome.how == "made"]
+    found = [outcome.stage for outcome in outcomes if outcome.how == "found"]
+    words = []
+    if made:
+        stages = ", ".join(f"{outcome.stage} {duration(outcome.manifest.seconds)}" for outcome in made)
+        words.append(f"{duration(sum(outcome.manifest.seconds for outcome in made))} ({stages})")
+    if found:
+        words.append(f"already there: {', '.join(found)}")
+    return "; ".join(words)
+
+
+def _next(summaries: Summaries, run: Path, scene: bool) -> str:
+    """The command to give next."""
+    if not scene:
+        stage = " rva" if list(summaries)[-1] == "rva" else ""
+        return f"cleargs show {quote(str(run))}{stage}"
+    if summaries.get("ingest", {}).get("test"):
+        return f"cleargs eval {quote(str(run))}"
+    return f"cleargs export {quote(str(run))} -o {quote(f'{run.name}.ply')}"
+
+
+def outcome_json(outcome: Outcome) -> dict[str, Any]:
+    """One outcome as JSON values."""
+    manifest = outcome.manifest
+    return {
+        "stage": outcome.stage,
+        "how": outcome.how,
+        "status": manifest.status,
+        "missing": [*manifest.inherited, *manifest.missing],
+        "key": manifest.key,
+        "digest": manifest.digest,
+        "seconds": manifest.seconds,
+        "folder": str(outcome.folder),
+        "summary": manifest.summary,
+    }
+
+
+def print_plans(plans: list[StagePlan], as_json: bool) -> None:
+    """The state of each stage and its reasons; then the expected cost."""
+    if as_json:
+        print_json([_plan_json(plan) for plan in plans])
+        return
+    for plan in plans:
+        first, *others = plan.reasons or ("",)
+        click.echo(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
+        for reason in others:
+            click.echo(f"{'':<21} {reason}")
+    if line := cost_line(plans):
+        click.echo(line)
+
+
+def _plan_json(plan: StagePlan) -> dict[str, Any]:
+    figures = ("minutes", "memory_gb", "disk_gb")
+    estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
+    facts = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}
+    return {**facts, "estimate": estimate}

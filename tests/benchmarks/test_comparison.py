@@ -18,7 +18,7 @@ from benchmarks.comparison.choices import judge_choices
 from benchmarks.comparison.equal_work import Work, decide_work
 from benchmarks.comparison.scenes import Made, Recipe, evaluated, existing, view_sets
 from cleargs.capture.tables import load_frames
-from cleargs.cli.outcome import DONE_IN_PART
+from cleargs.cli.common import DONE_IN_PART
 from cleargs.errors import InputError
 from cleargs.evaluate import evaluate, metrics
 from cleargs.evaluate.config import EvalOptions

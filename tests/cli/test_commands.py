@@ -17,8 +17,8 @@ from toy import Bench
 
 from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
-from cleargs.cli.outcome import print_outcomes
 from cleargs.cli.progress_bars import LineReporter
+from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
