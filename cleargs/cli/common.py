@@ -19,6 +19,7 @@ DONE_IN_PART = 3
 """Exit code of work that is not whole."""
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
 
 store_option = click.option(
     "--store",
@@ -33,6 +34,9 @@ partial_option = click.option(
     "--allow-partial", is_flag=True, help="Continue after a stage that is done only in part."
 )
 run_argument = click.argument("run", type=FOLDER)
+scene_option = click.option(
+    "--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]"
+)
 
 
 def output_option(
@@ -40,6 +44,12 @@ def output_option(
 ) -> Callable[[F], F]:
     """``-o`` of a command that fills a folder."""
     return click.option("-o", "--output", name, metavar=metavar, required=required, type=FOLDER, help=help)
+
+
+def file_option(help: str) -> Callable[[F], F]:
+    """``-o`` of a command that writes a file of a kind that its ending says."""
+    help = f"The new file; its ending says what to write: {help}"
+    return click.option("-o", "--output", required=True, type=FILE, help=help)
 
 
 def report_option(help: str) -> Callable[[F], F]:
@@ -99,3 +109,12 @@ def threads_or_all(threads: int | None) -> int:
 def print_json(value: Any) -> None:
     """Print ``value`` as indented JSON on stdout."""
     click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def answer(as_json: bool, facts: Any, *lines: str) -> None:
+    """Print ``facts`` as JSON for a program, or ``lines`` for a reader."""
+    if as_json:
+        print_json(facts)
+    else:
+        for line in lines:
+            click.echo(line)

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import click
 
 import cleargs
-from cleargs.cli.common import json_option, print_json
+from cleargs.cli.common import answer, json_option
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 from cleargs.splat.kernels.memory import available_memory
@@ -59,14 +59,14 @@ def doctor(folder: Path, as_json: bool) -> int:
         Finding("cores", "ok", str(usable_cores())),
         _room(
             "memory",
-            available_memory() / 1e9,
+            available_memory(),
             MIN_MEMORY_GB,
             "",
             f"a run may want {MIN_MEMORY_GB:.0f} GB: lower ingest.max_size",
         ),
         _room(
             "disk",
-            shutil.disk_usage(folder).free / 1e9,
+            shutil.disk_usage(folder).free,
             MIN_DISK_GB,
             f" at {folder.absolute()}",
             "cleargs gc frees what no run needs",
@@ -77,11 +77,8 @@ def doctor(folder: Path, as_json: bool) -> int:
         _writable("caches", Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")),
         _writable("temporary files", Path(tempfile.gettempdir())),
     ]
-    if as_json:
-        print_json([finding._asdict() for finding in findings])
-    else:
-        for finding in findings:
-            click.echo(f"{finding.state:<5} {finding.what:<32} {finding.text}")
+    lines = (f"{state:<5} {what:<32} {text}" for what, state, text in findings)
+    answer(as_json, [finding._asdict() for finding in findings], *lines)
     return 1 if any(finding.state == "bad" for finding in findings) else 0
 
 
@@ -94,10 +91,11 @@ def _library(name: str) -> Finding:
         return Finding(name, "bad", "not installed: install cleargs again")
 
 
-def _room(what: str, free: float, least: float, text: str, advice: str) -> Finding:
-    """What is ``free``, GB, with ``advice`` where it is less than the ``least``."""
-    words = f"{free:.1f} GB free{text}"
-    return Finding(what, "ok", words) if free >= least else Finding(what, "note", f"{words}; {advice}")
+def _room(what: str, free: float, least_gb: float, place: str, advice: str) -> Finding:
+    """How many bytes are ``free``, with ``advice`` where they are few."""
+    words = f"{free / 1e9:.1f} GB free{place}"
+    enough = free / 1e9 >= least_gb
+    return Finding(what, "ok" if enough else "note", words if enough else f"{words}; {advice}")
 
 
 def _writable(what: str, folder: Path) -> Finding:

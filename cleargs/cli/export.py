@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cleargs.cli.common import run_argument
+from cleargs.cli.common import file_option, run_argument, scene_option
 from cleargs.errors import InputError
 from cleargs.files import disk_error
 from cleargs.manifest import linked_manifest
@@ -68,14 +68,8 @@ Examples:
     type=click.Choice(["3", "4"]),
     help="Of a .spz: 4 is the newer, 3 what more programs read.  [default: 3]",
 )
-@click.option("--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="The new file; its ending says what to write: .ply .compressed.ply .sog .spz .glb .usdc",
-)
+@scene_option
+@file_option(".ply .compressed.ply .sog .spz .glb .usdc")
 @click.option("--force", is_flag=True, help="Replace the files where they exist.")
 @click.pass_obj
 def export(

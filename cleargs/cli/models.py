@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from cleargs.cli.common import json_option, print_json
+from cleargs.cli.common import FOLDER, answer, json_option, print_json
 from cleargs.errors import InputError
 from cleargs.models.registry import Source, find_model, load_registry, model_dir, state
 from cleargs.models.registry import verify as verify_model
@@ -16,7 +16,7 @@ _dir_option = click.option(
     "directory",
     envvar="CLEARGS_MODELS",
     show_envvar=True,
-    type=click.Path(file_okay=False, path_type=Path),
+    type=FOLDER,
     help="The folder of installed models.  [default: in the user's cache folder]",
 )
 
@@ -90,11 +90,8 @@ def verify(names: tuple[str, ...], directory: Path | None, as_json: bool) -> Non
             faults[entry.name] = None
         except InputError as error:
             faults[entry.name] = error
-    if as_json:
-        print_json({name: str(fault or "sound") for name, fault in faults.items()})
-    else:
-        for name, fault in faults.items():
-            click.echo(f"{name}: {fault or 'sound'}")
+    found = {name: str(fault or "sound") for name, fault in faults.items()}
+    answer(as_json, found, *(f"{name}: {words}" for name, words in found.items()))
     for fault in faults.values():
         if fault is not None:
             raise fault

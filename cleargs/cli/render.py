@@ -8,11 +8,13 @@ from typing import Literal
 import click
 
 from cleargs.cli.common import (
+    answer,
+    file_option,
     json_option,
     parse_size,
-    print_json,
     quiet_option,
     run_argument,
+    scene_option,
     threads_or_all,
     work_options,
 )
@@ -20,6 +22,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
+from cleargs.report.words import count as count_of
 from cleargs.run_results import scene_stage
 
 SECONDS = 10.0
@@ -62,7 +65,7 @@ for each pose.
     help="Whose world the poses of --poses are in: the run's, or that of the capture's own poses.  [default: "
     "normalised for cameras.json, input for transforms.json]",
 )
-@click.option("--stage", "chosen", help="The stage whose scene to take.  [default: the last that is done]")
+@scene_option
 @click.option(
     "--size", callback=parse_size, metavar="WxH", help="Size of a picture.  [default: that of the frames]"
 )
@@ -90,13 +93,7 @@ for each pose.
     show_default=True,
     help="Of a film: h264 plays everywhere, av1 takes less space.",
 )
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="The new file; its ending says what to write: .mp4 .png .exr",
-)
+@file_option(".mp4 .png .exr")
 @click.option("--force", is_flag=True, help="Replace the file where it exists.")
 @work_options
 @json_option
@@ -185,9 +182,9 @@ def render(
         write_shots(output, scene, shots, task, fps=fps, codec=codec, device=on)
     camera = shots[0].camera
     width = camera.width * (2 if side_by_side else 1)
-    if as_json:
-        facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
-        print_json({**facts, "width": width, "height": camera.height})
-    else:
-        pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
-        click.echo(f"{output}: {pictures} of {width}x{camera.height} of the scene of {stage}")
+    facts = {"file": str(output), "stage": stage, "pictures": len(shots)}
+    answer(
+        as_json,
+        {**facts, "width": width, "height": camera.height},
+        f"{output}: {count_of(len(shots), 'picture')} of {width}x{camera.height} of the scene of {stage}",
+    )

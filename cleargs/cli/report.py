@@ -12,8 +12,8 @@ from shlex import quote
 import click
 
 from cleargs.cli.common import (
+    answer,
     json_option,
-    print_json,
     quiet_option,
     run_argument,
     store_option,
@@ -42,14 +42,7 @@ Examples:
 @json_option
 @quiet_option
 @click.pass_obj
-def report(
-    dag: Dag,
-    run: Path,
-    threads: int | None,
-    store: Path | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def report(dag: Dag, run: Path, threads: int | None, store: Path | None, as_json: bool, quiet: bool) -> None:
     """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
     from cleargs.report.page import write_report
 
@@ -57,10 +50,7 @@ def report(
     reporter = make_reporter(quiet)
     with opened_store(settings.store) as opened:
         page = write_report(Planner(dag, settings, opened, threads_or_all(threads), reporter))
-    if as_json:
-        print_json({"report": str(page)})
-    else:
-        click.echo(f"report: {page}")
+    answer(as_json, {"report": str(page)}, f"report: {page}")
 
 
 def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:

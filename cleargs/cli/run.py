@@ -11,6 +11,7 @@ import click
 
 from cleargs.cli.common import (
     DONE_IN_PART,
+    answer,
     json_option,
     output_option,
     partial_option,
@@ -317,16 +318,12 @@ def outcome_json(outcome: Outcome) -> dict[str, Any]:
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:
     """The state of each stage and its reasons; then the expected cost."""
-    if as_json:
-        print_json([_plan_json(plan) for plan in plans])
-        return
+    lines = []
     for plan in plans:
         first, *others = plan.reasons or ("",)
-        click.echo(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
-        for reason in others:
-            click.echo(f"{'':<21} {reason}")
-    if line := cost_line(plans):
-        click.echo(line)
+        lines.append(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
+        lines += [f"{'':<21} {reason}" for reason in others]
+    answer(as_json, [_plan_json(plan) for plan in plans], *lines, *filter(None, [cost_line(plans)]))
 
 
 def _plan_json(plan: StagePlan) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 
-from cleargs.cli.common import json_option, print_json, run_argument
+from cleargs.cli.common import FILE, answer, json_option, print_json, run_argument
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table
@@ -100,7 +100,7 @@ Examples:
 @click.option(
     "-o",
     "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=FILE,
     help=f"Picture of --plot or --frame (.png).  [default: RUN/{PLOT}, RUN/frame-N.png]",
 )
 @json_option
@@ -142,8 +142,8 @@ def show(
         picture = output or run / f"frame-{frame:06d}.png"
         facts, lines = show_frame(run, done, frame, picture)
         if not as_json:
-            _print(_line_table(f"frame {frame}", lines))
-        _tell(facts, picture, as_json)
+            _print_table(lines, title=f"frame {frame}")
+        answer(as_json, facts, f"written: {picture}")
     elif stage is None:
         if as_json:
             print_json({name: _facts(done[name]) if name in done else None for name in dag.names})
@@ -156,17 +156,9 @@ def show(
 
         picture = output or run / PLOT
         plot_allocation(picture, run / "rva", run / "ingest", run.resolve().name)
-        _tell({"stage": stage, "plot": str(picture)}, picture, as_json)
+        answer(as_json, {"stage": stage, "plot": str(picture)}, f"written: {picture}")
     else:
         _show_stage(run, done, stage, rows, columns, as_json)
-
-
-def _tell(facts: Mapping[str, Any], picture: Path, as_json: bool) -> None:
-    """Print ``facts``, or where the picture lies."""
-    if as_json:
-        print_json(facts)
-    else:
-        click.echo(f"written: {picture}")
 
 
 def _facts(manifest: Manifest) -> dict[str, Any]:
@@ -183,17 +175,17 @@ def _facts(manifest: Manifest) -> dict[str, Any]:
 
 def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
     """Print a line per stage, and the present work with its preview."""
-    table = _new_table("stage", "state", "seconds", "MB", "files", "figures")
+    rows = []
     for name, manifest in manifests.items():
         if manifest is None:
-            table.add_row(name, "not done")
+            rows.append([name, "not done"])
             continue
         cells = (f"{manifest.seconds:.1f}", f"{manifest.bytes / 1e6:.1f}", str(len(manifest.files)))
         found = manifest.summary
         chosen = {key: found[key] for key in HEADLINES if key in found} or found
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
-        table.add_row(name, manifest.status, *cells, text)
-    _print(table)
+        rows.append([name, manifest.status, *cells, text])
+    _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
     if None in manifests.values():
         click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
     if work := at_work(run.folder, run.store):
@@ -226,27 +218,24 @@ def _show_stage(
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)
     lines.append(("made in", f"{manifest.seconds:.1f} s on {manifest.device}, {manifest.started}"))
-    _print(_line_table(f"{stage}: {manifest.status}", lines))
+    _print_table(lines, title=f"{stage}: {manifest.status}")
     if frames is not None and not columns and rows is None:
         click.echo()
-        table = _new_table(*frames[0] if frames else ())
-        table.padding = (0, 1, 0, 0)  # all fits on 80 columns
-        for column in table.columns:
-            column.no_wrap = column.header != "reason"
-        for row in frames:
-            values = (row | {"name": short_name(row["name"])}).values()
-            table.add_row(
-                *(f"{value:.2f}" if isinstance(value, float) else text_of(value) for value in values)
-            )
-        _print(table)
+        named = ((row | {"name": short_name(row["name"])}).values() for row in frames)
+        cells = ([f"{x:.2f}" if isinstance(x, float) else text_of(x) for x in row] for row in named)
+        _print_table(cells, *frames[0] if frames else (), wraps="reason")  # all fits on 80 columns
         return
     for name, data in tables.items():
         wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
         title = f"{name}: {data.num_rows} rows"
         if columns:
-            _print(_column_table(title, data))
-        if wanted and data.num_rows:
-            _print(_row_table("" if columns else title, data, wanted))
+            described = (_column_row(*item) for item in describe_table(data).items())
+            heads = ("column", "min .. median .. max, or counts", "meaning")
+            _print_table(described, *heads, title=f"\n{title}")
+        if wanted and data.num_rows:  # one row per column of the terminal
+            cells = ([text_of(value) for value in row.values()] for row in sampled_rows(data, wanted))
+            lines = zip(data.column_names, *cells, strict=True)
+            _print_table(lines, title="" if columns else f"\n{title}")
     if not columns:
         click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 
@@ -334,46 +323,31 @@ def text_of(value: Any) -> str:
 # -- on the terminal -----------------------------------------------------------------------------------------
 
 
-def _column_table(title: str, data: pa.Table) -> Table:
-    table = _new_table("column", "min .. median .. max, or counts", "meaning", title=f"\n{title}")
-    for column, facts in describe_table(data).items():
-        if "counts" in facts:
-            words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
-        elif "median" in facts:
-            words = " .. ".join(text_of(facts[name]) for name in ("min", "median", "max"))
-        else:
-            words = f"{facts['distinct']} different"
-        empty = f", {facts['nulls']} empty" if facts["nulls"] else ""
-        table.add_row(column, words + empty, facts.get("meaning", ""))
-    return table
+def _column_row(column: str, facts: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Name, figures in words and meaning of a column of `describe_table`."""
+    if "counts" in facts:
+        words = ", ".join(f"{value} {count}" for value, count in facts["counts"].items())
+    elif "median" in facts:
+        words = " .. ".join(text_of(facts[name]) for name in ("min", "median", "max"))
+    else:
+        words = f"{facts['distinct']} different"
+    empty = f", {facts['nulls']} empty" if facts["nulls"] else ""
+    return column, words + empty, facts.get("meaning", "")
 
 
-def _row_table(title: str, data: pa.Table, wanted: int) -> Table:
-    """Some rows of a table, one per column of the terminal."""
-    rows = [[text_of(value) for value in row.values()] for row in sampled_rows(data, wanted)]
-    table = _new_table(title=title and f"\n{title}")
-    for line in zip(data.column_names, *rows, strict=True):
-        table.add_row(*line)
-    return table
+def _print_table(rows: Iterable[Sequence[str]], *columns: str, title: str = "", wraps: str = "") -> None:
+    """Print a table without lines; one without ``columns`` has labels in its first.
 
-
-def _new_table(*columns: str, title: str = "") -> Table:
-    """An empty table without lines; one without ``columns`` has labels in its first column."""
-    table = Table(*columns, box=None, header_style="bold", padding=(0, 2, 0, 0), pad_edge=False)
+    wraps: the only column whose cells may take several lines; the columns then stand closer. Brackets in
+    names are no markup.
+    """
+    gap = (0, 1 if wraps else 2, 0, 0)
+    table = Table(*columns, box=None, header_style="bold", padding=gap, pad_edge=False)
     table.title, table.title_justify, table.show_header = title or None, "left", bool(columns)
     if not columns:
         table.add_column(no_wrap=True)
-    return table
-
-
-def _line_table(title: str, lines: Iterable[tuple[str, str]]) -> Table:
-    """A table with a label and a text per line."""
-    table = _new_table(title=title)
-    for line in lines:
-        table.add_row(*line)
-    return table
-
-
-def _print(table: Table) -> None:
-    """Print a table; brackets in names are no markup."""
+    for column in table.columns:
+        column.no_wrap |= bool(wraps) and column.header != wraps
+    for row in rows:
+        table.add_row(*row)
     Console(highlight=False, markup=False, emoji=False).print(table)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import click
 
-from cleargs.cli.common import FOLDER, json_option, print_json, run_argument, store_option
+from cleargs.cli.common import FOLDER, answer, json_option, run_argument, store_option
 from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, damages, read_manifest
@@ -16,6 +16,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import Run, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import ROOTS, Store
+from cleargs.report.words import count
 
 
 class Fault(NamedTuple):
@@ -66,13 +67,13 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:
         raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
-    if as_json:
-        print_json({"stages": stages, "files": files, "faults": [fault._asdict() for fault in faults]})
-    else:
-        for kind, stage, text in faults:
-            click.echo(f"{kind:<8} {stage:<12} {text}")
-        found = {0: "all as they were made", 1: "1 fault"}.get(len(faults), f"{len(faults)} faults")
-        click.echo(f"{files} files of {len(stages)} stages read: {found}")
+    found = count(len(faults), "fault") if faults else "all as they were made"
+    answer(
+        as_json,
+        {"stages": stages, "files": files, "faults": [fault._asdict() for fault in faults]},
+        *(f"{kind:<8} {stage:<12} {text}" for kind, stage, text in faults),
+        f"{files} files of {len(stages)} stages read: {found}",
+    )
     if any(fault.kind == "damaged" for fault in faults):
         click.echo(f"hint: `cleargs run {settings.source} -o {run}` makes damaged results again", err=True)
     return 1 if faults else 0
@@ -141,10 +142,10 @@ def gc(
         if run is not None and not dry_run:
             opened.add_root(run.absolute())
         garbage = opened.collect(dag.names, checkpoints=checkpoints, dry_run=dry_run)
-    if as_json:
-        print_json([{"folder": str(item.folder), "kind": item.kind, "bytes": item.bytes} for item in garbage])
-        return
-    for item in garbage:
-        click.echo(f"{item.bytes / 1e6:>9.1f} MB  {item.kind:<10}  {item.folder.relative_to(opened.root)}")
-    word = "would be freed" if dry_run else "freed"
-    click.echo(f"{sum(item.bytes for item in garbage) / 1e6:>9.1f} MB  {word}")
+    sized = [(item.bytes, f"{item.kind:<10}  {item.folder.relative_to(opened.root)}") for item in garbage]
+    sized.append((sum(item.bytes for item in garbage), "would be freed" if dry_run else "freed"))
+    answer(
+        as_json,
+        [{"folder": str(item.folder), "kind": item.kind, "bytes": item.bytes} for item in garbage],
+        *(f"{size / 1e6:>9.1f} MB  {text}" for size, text in sized),
+    )
