@@ -229,13 +229,13 @@ def _show_stage(
         wanted = rows if rows is not None else 8 if "step" in data.column_names and not columns else 0
         title = f"{name}: {data.num_rows} rows"
         if columns:
-            described = (_column_row(*item) for item in describe_table(data).items())
+            column_rows = (_column_row(*item) for item in describe_table(data).items())
             heads = ("column", "min .. median .. max, or counts", "meaning")
-            _print_table(described, *heads, title=f"\n{title}")
+            _print_table(column_rows, *heads, title=f"\n{title}")
         if wanted and data.num_rows:  # one row per column of the terminal
             cells = ([text_of(value) for value in row.values()] for row in sampled_rows(data, wanted))
-            lines = zip(data.column_names, *cells, strict=True)
-            _print_table(lines, title="" if columns else f"\n{title}")
+            turned = zip(data.column_names, *cells, strict=True)
+            _print_table(turned, title="" if columns else f"\n{title}")
     if not columns:
         click.echo(f"\nevery column: cleargs show {quote(str(run))} {stage} --columns")
 

@@ -193,7 +193,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     for name in shown:
         chosen = name == row.chosen
         label = f"{LAYERS[name]} (chosen)" if chosen else LAYERS[name]
-        tiles.append(Tile(images[name] / np.float32(255), label, marked=chosen))
+        tiles.append(Tile(images[name].astype(np.float32) / np.float32(255), label, marked=chosen))
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [tiles[start : start + _ACROSS] for start in range(0, len(tiles), _ACROSS)]
     write_rgb(path, contact_sheet(lines, tile_width=min(_WIDEST, max(240, row.frame.width))))
@@ -221,8 +221,8 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
     if judged:
         yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
         known = {name: value for name, value in judged.items() if value is not None}
-        scores = (f"{name} {known[name]:.2f} {text}" for name, text in SCORES.items() if name in known)
-        yield "scores", ", ".join(scores)
+        named = (f"{name} {known[name]:.2f} {text}" for name, text in SCORES.items() if name in known)
+        yield "scores", ", ".join(named)
         for label, prefix in (("good, of 1", "r_"), ("bad, of 1", "b_")):
             cues = (name for name in known if name.startswith(prefix))
             yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)

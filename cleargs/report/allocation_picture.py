@@ -55,7 +55,7 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
         )
     frames = {frame.frame_id: frame for frame in load_frames(ingest)}
     pictured = extremes(rows)
-    layout = [["plan", "scores"], ["plan", "weights"], *([name, name] for name in pictured)]
+    layout: list[Any] = [["plan", "scores"], ["plan", "weights"], *([name, name] for name in pictured)]
     heights = [3.0, 3.0, *(2.4 for _ in pictured)]
     figure = Figure(figsize=(16.0, sum(heights)), dpi=150, layout="constrained")
     figure.suptitle(_headline(rows, covered, title), fontsize=12, parse_math=False)  # names may hold dollars
@@ -158,4 +158,4 @@ def _mark_frames(panel: Axes, x: NDArray[Any], y: NDArray[Any], rows: Sequence[R
 def _tile(path: Path, row: Row) -> Tile:
     place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
     label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
-    return Tile(read_rgb(path) / np.float32(255), label, marked=bool(row["weight"]))
+    return Tile(read_rgb(path).astype(np.float32) / np.float32(255), label, marked=bool(row["weight"]))

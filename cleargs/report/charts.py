@@ -45,7 +45,7 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
         x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
         y = np.array([np.median(values[part]) for part in stretches])
         ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
-        low, high = ticks[[0, -1]]
+        low, high = ticks[0], ticks[-1]
 
         def height(value: float) -> float:
             return float(HEIGHT * (1.0 - (value - low) / (high - low)))

@@ -74,12 +74,16 @@ class FrameRow:
     @property
     def blur_px(self) -> float | None:
         """How far the pixels moved while exposed."""
-        return self.formation.get("blur_px", getattr(self.selection, "blur_px", None))
+        return self._motion("blur_px")
 
     @property
     def skew_px(self) -> float | None:
         """How far the last line of pixels moved against the first."""
-        return self.formation.get("skew_px", getattr(self.selection, "skew_px", None))
+        return self._motion("skew_px")
+
+    def _motion(self, name: str) -> float | None:
+        found: float | None = self.formation.get(name, getattr(self.selection, name, None))
+        return found
 
     @property
     def repair(self) -> str:
