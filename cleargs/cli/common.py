@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args
 
 import click
 
+from cleargs.manifest import Manifest
 from cleargs.pipeline.session import usable_cores
 from cleargs.splat.budget import Quality
 
@@ -104,6 +105,18 @@ def work_options(command: F) -> F:
 def threads_or_all(threads: int | None) -> int:
     """The given number of threads, or that of the cores which this process may use."""
     return threads or usable_cores()
+
+
+def manifest_json(manifest: Manifest) -> dict[str, Any]:
+    """Return the state of a stage as JSON values."""
+    names = ("status", "key", "digest", "started", "seconds", "device", "summary")
+    return {
+        **{name: getattr(manifest, name) for name in names},
+        "missing": [*manifest.inherited, *manifest.missing],
+        "files": len(manifest.files),
+        "bytes": manifest.bytes,
+        "versions": {**manifest.versions, **manifest.parts.libraries},
+    }
 
 
 def print_json(value: Any) -> None:

@@ -27,8 +27,6 @@ from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.session import opened_store
 
-HERE = "127.0.0.1"
-
 
 @click.command(
     epilog="""\b
@@ -102,7 +100,7 @@ checkpoint; it renews itself. Afterwards it shows the report.
 @run_argument
 @click.option(
     "--host",
-    default=HERE,
+    default="127.0.0.1",
     show_default=True,
     help="Address to listen at. Any other than this one lets other machines read the report.",
 )

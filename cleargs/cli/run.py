@@ -13,6 +13,7 @@ from cleargs.cli.common import (
     DONE_IN_PART,
     answer,
     json_option,
+    manifest_json,
     output_option,
     partial_option,
     print_json,
@@ -302,18 +303,8 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
 
 def outcome_json(outcome: Outcome) -> dict[str, Any]:
     """One outcome as JSON values."""
-    manifest = outcome.manifest
-    return {
-        "stage": outcome.stage,
-        "how": outcome.how,
-        "status": manifest.status,
-        "missing": [*manifest.inherited, *manifest.missing],
-        "key": manifest.key,
-        "digest": manifest.digest,
-        "seconds": manifest.seconds,
-        "folder": str(outcome.folder),
-        "summary": manifest.summary,
-    }
+    facts = {"stage": outcome.stage, "how": outcome.how, "folder": str(outcome.folder)}
+    return {**facts, **manifest_json(outcome.manifest)}
 
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 
-from cleargs.cli.common import FILE, answer, json_option, print_json, run_argument
+from cleargs.cli.common import FILE, answer, json_option, manifest_json, print_json, run_argument
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table
@@ -146,7 +146,7 @@ def show(
         answer(as_json, facts, f"written: {picture}")
     elif stage is None:
         if as_json:
-            print_json({name: _facts(done[name]) if name in done else None for name in dag.names})
+            print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
         else:
             _print_run(settings, {name: done.get(name) for name in dag.names})
     elif dag.check(stage) not in done:
@@ -159,18 +159,6 @@ def show(
         answer(as_json, {"stage": stage, "plot": str(picture)}, f"written: {picture}")
     else:
         _show_stage(run, done, stage, rows, columns, as_json)
-
-
-def _facts(manifest: Manifest) -> dict[str, Any]:
-    """The state of a stage as JSON values."""
-    names = ("status", "key", "digest", "started", "seconds", "device", "summary")
-    return {
-        **{name: getattr(manifest, name) for name in names},
-        "missing": [*manifest.inherited, *manifest.missing],
-        "files": len(manifest.files),
-        "bytes": manifest.bytes,
-        "versions": {**manifest.versions, **manifest.parts.libraries},
-    }
 
 
 def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
@@ -213,7 +201,7 @@ def _show_stage(
             name: {"rows": data.num_rows, "columns": describe_table(data)} for name, data in tables.items()
         }
         shown = {} if frames is None else {"frames": frames}
-        print_json({"stage": stage, **_facts(manifest), "tables": described, **shown})
+        print_json({"stage": stage, **manifest_json(manifest), "tables": described, **shown})
         return
     lines = [("missing", missing) for missing in (*manifest.inherited, *manifest.missing)]
     lines += labelled(manifest.summary)

@@ -15,13 +15,13 @@ from cleargs.manifest import Manifest
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
 from cleargs.parquet import read_table
-from cleargs.render.output import Photographer
 from cleargs.report.frame_pictures import LAYERS, layers_of
 from cleargs.report.frame_strip import CHOICES, MEANINGS, FrameRow, last_scene, load_rows, scores_of
 from cleargs.report.web_scene import camera_of
 from cleargs.rivr.gates import REFUSED
 from cleargs.rivr.tables import REPAIRS
 from cleargs.splat.ply import read_ply
+from cleargs.splat.viewer import Viewer
 
 MAX_NAME_LENGTH = 14
 """Characters of a frame's name in a table."""
@@ -187,7 +187,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     scene = last_scene(stages)
     if scene is not None and row.frame.registered:
         affine = read_exposure(run / scene / "exposure.parquet").of(row.frame.frame_id)
-        images["final"] = Photographer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), affine)
+        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), affine)
     shown = [name for name in LAYERS if name in images]
     tiles = []
     for name in shown:

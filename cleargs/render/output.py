@@ -16,12 +16,11 @@ from cleargs.errors import InputError
 from cleargs.files import disk_error, sync_tree, whole_folder, write_json
 from cleargs.media.encode import Codec, require_even, write_video
 from cleargs.media.exr import write_view
-from cleargs.media.image import read_rgb, to_uint8, write_rgb
+from cleargs.media.image import read_rgb, write_rgb
 from cleargs.progress import Task
-from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.scene import Scene
-from cleargs.splat.types import Render
+from cleargs.splat.viewer import Viewer
 
 Kind = Literal["film", "still", "folder"]
 Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
@@ -40,19 +39,8 @@ class Shot:
     """The frame of the capture to lay on its left."""
 
 
-class Photographer:
-    """Renders one scene."""
-
-    def __init__(self, scene: Scene, device: str = "cpu") -> None:
-        self._scene = scene.to(device)
-        self._engine = rasteriser_for(device)
-
-    def view(self, camera: Camera, affine: NDArray[np.float64] | None = None) -> Picture:
-        """What ``camera`` sees, its colours through ``affine`` [3, 4] if there is one."""
-        image = self._render(camera, self._scene.background).image.cpu().numpy()
-        if affine is not None:
-            image = image @ affine[:, :3].T.astype(np.float32) + affine[:, 3].astype(np.float32)
-        return to_uint8(image)
+class Photographer(Viewer):
+    """Renders shots of one scene."""
 
     def picture(self, shot: Shot) -> Picture:
         """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
@@ -69,17 +57,11 @@ class Photographer:
         if path.suffix.lower() != ".exr":
             write_rgb(path, self.picture(shot))
             return
-        render = self._render(shot.camera, (0.0, 0.0, 0.0), depth=True)
+        render = self.render(shot.camera, (0.0, 0.0, 0.0), depth=True)
         assert render.depth is not None
         image, alpha, depth = (layer.cpu().numpy() for layer in (render.image, render.alpha, render.depth))
         depth = np.where(alpha >= _OPAQUE, depth / np.maximum(alpha, _OPAQUE), 0.0).astype(np.float32)
         write_view(path, image, alpha, depth)
-
-    def _render(self, camera: Camera, background: tuple[float, float, float], depth: bool = False) -> Render:
-        scene = self._scene
-        return self._engine.forward(
-            scene.gaussians, camera, background=background, antialias=scene.antialias, depth=depth
-        )
 
 
 def kind_of(output: Path) -> Kind:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from cleargs.errors import InputError
-from cleargs.splat.camera import Camera
+from cleargs.splat.camera import Camera, look_at
 
 Array = NDArray[np.float64]
 
@@ -136,16 +136,6 @@ def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
     level = rights.T @ rights / len(rights) - _PULL * np.outer(mean, mean)
     up: Array = np.linalg.eigh(level)[1][:, 0]
     return up if up @ mean > 0 else -up
-
-
-def look_at(place: Array, target: Array, up: Array) -> Array:  # [4, 4] world to camera
-    """A camera at ``place`` whose axis goes through ``target``, without roll. OpenCV axes."""
-    forward = _unit(target - place)
-    right = _unit(np.cross(forward, up))
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(forward, right), forward]
-    pose[:3, 3] = -pose[:3, :3] @ place
-    return pose
 
 
 def framed(camera: Camera, width: int, height: int) -> Camera:

@@ -20,7 +20,6 @@ from cleargs.pipeline.keys import settings
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.settings import settings_of
-from cleargs.render.output import Photographer
 from cleargs.report import charts
 from cleargs.report.frame_pictures import LAYERS, Image, Picture, write_jpeg, write_pictures
 from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
@@ -39,6 +38,7 @@ from cleargs.report.web_scene import (
 from cleargs.report.words import duration, size
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
+from cleargs.splat.viewer import Viewer
 
 RENDERED = 40
 """Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
@@ -87,16 +87,16 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
     trained = [stage for stage in SCENES if stage in manifests]
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
-    scenes, photographer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
+    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
     exposure = read_exposure(run / trained[-1] / "exposure.parquet") if trained else None
 
     def render(row: FrameRow, side: int) -> Image:
         camera = camera_of(row.frame)
-        assert photographer is not None and exposure is not None  # asked for only where there is a scene
+        assert renderer is not None and exposure is not None  # asked for only where there is a scene
         smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-        return photographer.view(smaller, exposure.of(row.frame.frame_id))
+        return renderer.view(smaller, exposure.of(row.frame.frame_id))
 
-    shown = placed[:: -(-len(placed) // RENDERED) or 1] if photographer else []
+    shown = placed[:: -(-len(placed) // RENDERED) or 1] if renderer else []
     rendered = frozenset(row.frame.frame_id for row in shown)
     pictures = write_pictures(rows, run, folder, render, rendered, planner.threads)
     times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
@@ -133,7 +133,7 @@ def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], las
 
 def _scenes(
     folder: Path, run: Path, trained: Mapping[str, Manifest], placed: Sequence[FrameRow]
-) -> tuple[list[dict[str, Any]], Photographer | None]:
+) -> tuple[list[dict[str, Any]], Viewer | None]:
     """Write the first and the last scene, each with a still; returns what the page says of them, and what
     renders the last."""
     if not trained or not placed:
@@ -145,11 +145,11 @@ def _scenes(
         if views and trained[first].files["scene.ply"] == trained[last].files["scene.ply"]:
             what = UNCHANGED
         scene = read_ply(run / stage / "scene.ply")
-        photographer = Photographer(scene)
+        renderer = Viewer(scene)
         camera = camera_of(start.frame)
         longer = max(camera.width, camera.height)
         size = [max(1, round(_STILL / longer * side)) for side in (camera.width, camera.height)]
-        still = photographer.view(level_camera(camera, *size))
+        still = renderer.view(level_camera(camera, *size))
         views.append(
             {
                 "key": key,
@@ -164,7 +164,7 @@ def _scenes(
                 "background": scene.background,
             }
         )
-    return views, photographer
+    return views, renderer
 
 
 def _plans(planner: Planner) -> dict[str, StagePlan]:

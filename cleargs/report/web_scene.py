@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from cleargs.capture.tables import Frame
-from cleargs.render.paths import look_at
-from cleargs.splat.camera import Camera
+from cleargs.splat.camera import Camera, look_at
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians

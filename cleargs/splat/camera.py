@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from cleargs.errors import InputError
 
+Array = npt.NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -95,6 +97,17 @@ class Camera:
     def scaled(self, factor: float) -> Camera:
         """The camera of the view resampled by ``factor``, its size rounded to whole pixels (at least 1)."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+
+def look_at(place: Array, target: Array, up: Array) -> Array:  # [4, 4] world to camera
+    """A camera at ``place`` whose axis goes through ``target``, without roll. OpenCV axes."""
+    forward = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(forward, up)
+    right /= max(float(np.linalg.norm(right)), 1e-12)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(forward, right), forward]
+    pose[:3, 3] = -pose[:3, :3] @ place
+    return pose
 
 
 def cameras_json(

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
-from cleargs.render.paths import Array, framed, look_at, seen_point, smooth_path, turntable, upright
-from cleargs.splat.camera import Camera
+from cleargs.render.paths import Array, framed, seen_point, smooth_path, turntable, upright
+from cleargs.splat.camera import Camera, look_at
 
 UP = np.array([0.0, -1.0, 0.0])
 

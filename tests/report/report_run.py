@@ -31,7 +31,6 @@ from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import Run, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
-from cleargs.render.output import Photographer
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.rva.tables import R_CUES
@@ -40,6 +39,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.tables import TRAIN
+from cleargs.splat.viewer import Viewer
 
 WIDTH, HEIGHT, FOCAL = 96, 54, 90.0
 COUNT = 7
@@ -146,7 +146,7 @@ class FinishedRun:
     def _ingest(self) -> None:
         folder = self.folder / "ingest"
         (folder / "images").mkdir(parents=True)
-        render = Photographer(self.scenes["g0"]).view
+        render = Viewer(self.scenes["g0"]).view
         rows = []
         for index in range(COUNT):
             pose = camera(index)
@@ -229,7 +229,7 @@ class FinishedRun:
     def _rivr(self) -> None:
         folder = self.folder / "rivr"
         (folder / "round_01").mkdir(parents=True)
-        render = Photographer(self.scenes["consolidate"]).view
+        render = Viewer(self.scenes["consolidate"]).view
         rows = []
         for index in range(5):
             image = render(camera(index)).astype(np.float32) / 255

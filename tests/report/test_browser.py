@@ -14,9 +14,9 @@ from report_run import HOSTILE, FinishedRun
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
-from cleargs.render.output import Photographer
 from cleargs.report.page import write_report
 from cleargs.report.web_scene import camera_of, level_camera
+from cleargs.splat.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -105,7 +105,7 @@ def phone(browser: Any, run: FinishedRun) -> Iterator[Report]:
 def ours(run: FinishedRun, stage: str, frame: int, shape: tuple[int, ...]) -> np.ndarray:
     """The scene of a stage at a frame, as `cleargs` renders it, without the camera's roll."""
     camera = camera_of(load_frames(run.folder / "ingest")[frame])
-    return Photographer(run.scenes[stage]).view(level_camera(camera, shape[1], shape[0])).astype(np.float64)
+    return Viewer(run.scenes[stage]).view(level_camera(camera, shape[1], shape[0])).astype(np.float64)
 
 
 def difference(first: np.ndarray, second: np.ndarray) -> float:

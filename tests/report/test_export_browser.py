@@ -15,9 +15,9 @@ from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.render.output import Photographer
 from cleargs.report.web_scene import camera_of, level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
+from cleargs.splat.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -96,6 +96,6 @@ def test_the_viewer_shows_what_was_exported(
     png = page.screenshot()
     page.close()
     shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB).astype(np.float64)
-    ours = Photographer(run.scenes["consolidate"]).view(level_camera(camera, *SIZE)).astype(np.float64)
+    ours = Viewer(run.scenes["consolidate"]).view(level_camera(camera, *SIZE)).astype(np.float64)
     assert complaints == [] and shown.shape == ours.shape and shown.std() > 20
     assert np.abs(shown - ours).mean() < DIFFERENCE

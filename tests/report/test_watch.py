@@ -20,9 +20,9 @@ from watched import reported, serving, working
 
 from cleargs.errors import InputError
 from cleargs.progress import PREVIEW
-from cleargs.render.output import Photographer
 from cleargs.report.serve import Server
 from cleargs.splat.train_log import write_preview
+from cleargs.splat.viewer import Viewer
 
 
 @dataclass
@@ -93,7 +93,7 @@ def test_a_run_at_work_shows_how_far_it_is_and_its_preview(finished: FinishedRun
         }
         versions = []
         for seed in (1, 2):
-            image = Photographer(wall(seed)).view
+            image = Viewer(wall(seed)).view
             write_preview(checkpoints / "round_01" / PREVIEW, torch.from_numpy(image(camera(1)) / 255))
             versions.append(json.loads(ask(port, "/state.json").body)["preview"])
             shown = ask(port, "/preview.png?1")

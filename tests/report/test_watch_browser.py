@@ -13,8 +13,8 @@ from watched import reported, serving, working
 
 from cleargs.pipeline import live
 from cleargs.progress import PREVIEW
-from cleargs.render.output import Photographer
 from cleargs.splat.train_log import write_preview
+from cleargs.splat.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
@@ -31,7 +31,7 @@ def until(page: Any, condition: str) -> None:
 def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "EVERY", 0.0)
     made = reported(tmp_path)
-    picture = torch.from_numpy(Photographer(wall(1)).view(camera(1)) / 255)
+    picture = torch.from_numpy(Viewer(wall(1)).view(camera(1)) / 255)
     complaints: list[str] = []
     with serving(made) as port:
         page = browser.new_page()
