@@ -7,6 +7,7 @@ part in a fit: they judge which model explains the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_ba
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
-from cleargs.splat.kernels.cpu import backend as kernels
+from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
@@ -100,10 +101,43 @@ def scales(sight: Sight) -> list[float]:
     return [size / longest for size in sizes]
 
 
+class SearchKernels(Protocol):
+    """Kernels that a search for a frame's motion runs; the CPU's back end has them, others may be passed."""
+
+    def misfit(
+        self,
+        image: Floats,
+        observed: Floats,
+        weight: Floats,
+        fields: tuple[Floats, Floats, Floats],
+        samples: Floats,
+        limit: float,
+    ) -> float:
+        """Return the sum of weight * min(|observed - exposed image|, limit)."""
+        ...
+
+    def normal_equations(
+        self,
+        stack: Floats,
+        observed: Floats,
+        weight: Floats,
+        basis: Floats,
+        down: Floats,
+        offset: Floats,
+        sweep: Floats,
+        times: Floats,
+        outlier: float,
+        active: NDArray[np.int64],
+    ) -> tuple[Vector, Vector]:
+        """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
+        ...
+
+
 class Level:
     """The problem at one size."""
 
-    def __init__(self, sight: Sight, scale: float) -> None:
+    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels = cpu) -> None:
+        self._kernels = kernels
         margin = sight.margin
         height, width = sight.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
@@ -148,7 +182,7 @@ class Level:
 
     def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
         fields = self.fields(motion)
-        return kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
+        return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
     def fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
         """Offset, sweep and radius: see `DisplacementFields`."""
@@ -166,7 +200,7 @@ class Level:
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[Vector, Vector]:
         """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         offset, sweep, _ = self.fields(motion)
-        return kernels.normal_equations(
+        return self._kernels.normal_equations(
             self._stack,
             self._observed,
             self._fitting,

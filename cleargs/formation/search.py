@@ -12,8 +12,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.comparison import COARSE, DISC, LEVELS, Explanation, Level, Sight, scales
+from cleargs.formation.comparison import (
+    COARSE,
+    DISC,
+    LEVELS,
+    Explanation,
+    Level,
+    SearchKernels,
+    Sight,
+    scales,
+)
 from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
+from cleargs.splat.kernels.cpu import backend as cpu
 
 WARM_STEPS = 2
 """Gauss-Newton steps of a fit that starts from the last one."""
@@ -44,13 +54,16 @@ _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "bo
 _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus": 1}
 
 
-def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Explanation]:
+def search(
+    sight: Sight, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
+) -> list[Explanation]:
     """Every model at its best, from scratch. The first is ``none``.
 
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
+    kernels: the back end that computes misfits and normal equations.
     """
-    levels = [Level(sight, scale) for scale in scales(sight)]
+    levels = [Level(sight, scale, kernels) for scale in scales(sight)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -68,9 +81,16 @@ def search(sight: Sight, *, skew: bool = True, pose: bool = False) -> list[Expla
     return [levels[-1].judged("none", still), *(levels[-1].judged(name, found[name]) for name in found)]
 
 
-def refine(sight: Sight, model: Model, motion: FrameMotion, *, pose: bool = False) -> list[Explanation]:
+def refine(
+    sight: Sight,
+    model: Model,
+    motion: FrameMotion,
+    *,
+    pose: bool = False,
+    kernels: SearchKernels = cpu,
+) -> list[Explanation]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = Level(sight, scales(sight)[-1])
+    level = Level(sight, scales(sight)[-1], kernels)
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":

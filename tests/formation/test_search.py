@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from helpers.photographs import (
 from cleargs.formation.motion import TWIST, FrameMotion, Model, flow_basis
 from cleargs.formation.search import preferred, refine, search
 from cleargs.splat.backend import set_threads
+from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.cpu import frame_warp as kernels
 
 BLUR = FrameMotion(blur=twist(0, 0, 0, 3, 6, 0), median_depth=MEDIAN)
@@ -179,3 +181,22 @@ def test_misfits_count_what_has_a_weight_and_nothing_else() -> None:
         expected[y] += weight[y, x] * min(abs(observed[y, x] - np.mean(seen)), limit)
     # float32 within: 1e-7 of a light of 1, a dozen pixels a row.
     np.testing.assert_allclose(rows, expected, atol=5e-6)
+
+
+def test_search_runs_the_kernels_that_it_is_given(truth: Image) -> None:
+    """A back end passed to the search is the one that computes, down to the same bits."""
+
+    class Counting:
+        calls = 0
+
+        def __getattr__(self, name: str) -> Any:
+            Counting.calls += 1
+            return getattr(cpu, name)
+
+    seen = sight(photograph(truth, BLUR), truth)
+    given: Any = Counting()
+    first = refine(seen, "blur", BLUR, kernels=given)
+    assert Counting.calls > 2
+    for one, other in zip(first, refine(seen, "blur", BLUR), strict=True):
+        assert one.misfit == other.misfit
+        np.testing.assert_array_equal(one.motion.vector, other.motion.vector)
