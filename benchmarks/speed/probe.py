@@ -25,7 +25,7 @@ KERNELS = (
     "loss.differentiate",
     "rasterise.backward",
     "gradients.backpropagate",
-    "adam.adam",
+    "elementwise.adam",
 )
 """Entry points of a training iteration (module.function below PACKAGE), in the order of their work."""
 

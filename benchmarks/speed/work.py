@@ -136,6 +136,6 @@ def work_of(size: Size) -> dict[str, Work]:
         "gradients.backpropagate": Work(
             780 * n + 9 * pairs, n * (2 * PARAMETERS + SPLAT + 8) + pairs * PAIR_SUMS
         ),
-        "adam.adam": Work(13 * VALUES * n, 28 * VALUES * n),
+        "elementwise.adam": Work(13 * VALUES * n, 28 * VALUES * n),
     }
     return {name: work[name] for name in KERNELS}

@@ -175,6 +175,9 @@ class QwenServer(QwenEvaluator):
                     self._gone = reason if fault.nobody else self._gone
                     raise UnscoredError(reason) from None
                 pause *= 2
+            except StageError as fault:  # another thread may take the next frame before the stage ends
+                self._gone = str(fault)
+                raise
 
     def _once(self, body: Mapping[str, Any]) -> str:
         answer, raw = self._send("POST", "chat/completions", self._config.timeout_s, body)
