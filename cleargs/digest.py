@@ -8,9 +8,9 @@ import os
 import sqlite3
 import time
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from cleargs.errors import InputError
 from cleargs.files import External
@@ -18,6 +18,14 @@ from cleargs.untrusted import open_regular, require_utf8
 
 RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
+
+COLUMNS = "size, mtime_ns, ctime_ns, inode, digest"
+"""Of the memo, after the path."""
+
+_Row: TypeAlias = tuple[int, int, int, int, str]
+
+NOTHING: _Row = (-1, -1, -1, -1, "")
+"""The row of a file of which nothing is known: no file has such a state."""
 
 
 def json_digest(value: Any) -> str:
@@ -55,56 +63,54 @@ class DigestMemo:
     Any program may set mtime; ctime only the kernel sets, at every write and also where mtime is put back.
 
     The memo only saves time: where its file is damaged, locked or not writable, digests are computed
-    afresh and nobody is troubled. The file appears with the first flush, if its folder is there by then.
+    afresh and nobody is troubled. The file is read at once and written at the end, if its folder is there by
+    then.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._pending: dict[str, tuple[int, int, int, int, str]] = {}
-        self._database = _open(path) if path.exists() else None
+        self._known: dict[str, _Row] = {}
+        self._learnt: dict[str, _Row] = {}
+        if path.exists():
+            with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=5)) as database:
+                rows = database.execute(f"SELECT path, {COLUMNS} FROM contents")
+                self._known = {row[0]: row[1:] for row in rows}
 
     def __enter__(self) -> DigestMemo:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self.flush()
-        if self._database is not None:
-            self._database.close()
-
-    def flush(self) -> None:
-        """Write what was learnt since the last flush."""
-        if self._database is None and self._pending and self._path.parent.is_dir():
-            self._database = _open(self._path)
-        if self._database is None:
+        """Write what was learnt."""
+        if not self._learnt or not self._path.parent.is_dir():
             return
-        rows = [(path, *row) for path, row in self._pending.items()]
-        with suppress(sqlite3.Error), self._database:  # locked or damaged: the next run hashes again
-            self._database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
-            self._pending.clear()
+        try:
+            self._write()
+        except sqlite3.OperationalError:
+            pass  # locked, or not writable: the next run hashes again
+        except sqlite3.DatabaseError:  # damaged: an empty one takes its place
+            with suppress(OSError, sqlite3.Error):
+                self._path.unlink(missing_ok=True)
+                self._write()
 
     def digest(self, path: Path) -> str:
         """The digest of the file at ``path``: remembered where size, times and inode are unchanged."""
         name, state = _state(path)
-        known = self._pending.get(name) or self._lookup(name)
+        known = self._learnt.get(name) or self._known.get(name)
         if known is not None and known[:4] == state:
             return known[4]
         digest = file_digest(path)
         if time.time_ns() - max(state[1:3]) > RACY_NS:
-            self._pending[name] = (*state, digest)
+            self._learnt[name] = (*state, digest)
         return digest
 
     def remember(self, path: Path, digest: str) -> None:
         """Note the digest of a file that nobody will write again."""
         name, state = _state(path)
-        self._pending[name] = (*state, digest)
+        self._learnt[name] = (*state, digest)
 
     def forget(self, path: Path) -> None:
         """Drop what is known of ``path``, so that the next `digest` reads the file."""
-        name = str(path.absolute())
-        self._pending.pop(name, None)
-        if self._database is not None:
-            with suppress(sqlite3.Error), self._database:
-                self._database.execute("DELETE FROM contents WHERE path = ?", (name,))
+        self._learnt[str(path.absolute())] = NOTHING
 
     def digests_of(self, place: External, *, afresh: bool = False) -> dict[str, str]:
         """Relative path -> digest for a folder, {"": digest} for a file, name -> digest for files by name.
@@ -125,14 +131,11 @@ class DigestMemo:
                 hint="check the path and its permissions, or remove it from the input",
             ) from error
 
-    def _lookup(self, name: str) -> tuple[int, int, int, int, str] | None:
-        row: tuple[int, int, int, int, str] | None = None
-        with suppress(sqlite3.Error):
-            if self._database is not None:
-                row = self._database.execute(
-                    "SELECT size, mtime_ns, ctime_ns, inode, digest FROM contents WHERE path = ?", (name,)
-                ).fetchone()
-        return row
+    def _write(self) -> None:
+        rows = [(name, *row) for name, row in self._learnt.items()]
+        with closing(sqlite3.connect(self._path, timeout=5)) as database, database:
+            database.execute(f"CREATE TABLE IF NOT EXISTS contents (path TEXT PRIMARY KEY, {COLUMNS})")
+            database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
 def named_files(place: External) -> dict[str, Path]:
@@ -145,33 +148,3 @@ def named_files(place: External) -> dict[str, Path]:
 def _state(path: Path) -> tuple[str, tuple[int, int, int, int]]:
     status = path.stat()
     return str(path.absolute()), (status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
-
-
-def _open(path: Path) -> sqlite3.Connection | None:
-    """Open the memo; a damaged file is replaced by an empty one. None where that cannot be done."""
-    try:
-        return _connect(path)
-    except sqlite3.OperationalError:
-        return None  # locked, or not writable
-    except sqlite3.DatabaseError:
-        with suppress(OSError, sqlite3.Error):
-            path.unlink(missing_ok=True)
-            return _connect(path)
-    return None
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path, timeout=5)
-    try:
-        database.execute(
-            "CREATE TABLE IF NOT EXISTS contents"
-            " (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, ctime_ns INTEGER, inode INTEGER,"
-            " digest TEXT)"
-        )
-        database.execute(
-            "SELECT path, size, mtime_ns, ctime_ns, inode, digest FROM contents LIMIT 1"
-        ).fetchone()
-    except sqlite3.Error:
-        database.close()
-        raise
-    return database

@@ -42,28 +42,6 @@ class Reporter(Protocol):
         """Something the user should look at, although the work continues."""
 
 
-class Pace:
-    """The time that a task of ``total`` steps will still take, by its pace since the first step was done.
-
-    What comes before that step (compiling kernels, reading a checkpoint) says nothing of those to come.
-    """
-
-    def __init__(self, total: int | None) -> None:
-        self._total = total
-        self._first: tuple[float, float] | None = None
-
-    def seconds_left(self, done: int, share: float | None = None) -> float | None:
-        """To be asked whenever ``done`` grows; None while there is nothing to go by. ``share``: of the work,
-        where it is not that of the steps."""
-        now = time.monotonic()
-        if not self._total or not done:
-            return None
-        if share is None:
-            share = done / self._total
-        begin, first = self._first = self._first or (now, share)
-        return (now - begin) * max(0.0, 1.0 - share) / (share - first) if share > first else None
-
-
 class Rate:
     """Steps a second, of the last seconds: where steps grow longer, the mean of all would flatter."""
 
@@ -92,7 +70,10 @@ class CountedTask:
 
     def __init__(self, total: int | None, show: Show) -> None:
         self.done, self.note = 0, ""
-        self._show, self._pace = show, Pace(total)
+        self._total, self._show = total, show
+        self._first: tuple[float, float] | None = None
+        """When the first step was done, and the share of the work that it was. What comes before that step
+        (compiling kernels, reading a checkpoint) says nothing of those to come."""
 
     def advance(self, steps: int = 1) -> None:
         self.update(done=self.done + steps)
@@ -100,7 +81,16 @@ class CountedTask:
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         self.done = self.done if done is None else done
         self.note = self.note if note is None else printable(note)
-        self._show(self.done, self.note, self._pace.seconds_left(self.done, share))
+        self._show(self.done, self.note, self._seconds_left(share))
+
+    def _seconds_left(self, share: float | None) -> float | None:
+        """The time that the task will still take by its pace so far; None while that is not known."""
+        if not self._total or not self.done:
+            return None
+        now = time.monotonic()
+        share = self.done / self._total if share is None else share
+        begin, first = self._first = self._first or (now, share)
+        return (now - begin) * max(0.0, 1.0 - share) / (share - first) if share > first else None
 
 
 class SilentTask:

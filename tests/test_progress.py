@@ -10,7 +10,7 @@ import pytest
 
 from cleargs import api, progress
 from cleargs.errors import InputError
-from cleargs.progress import Pace, Rate, log_reporter
+from cleargs.progress import CountedTask, Rate, log_reporter
 
 
 def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,10 +44,12 @@ def test_no_less_than_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares of work are sums, which end at 1 but for rounding: the bar said "-0 s left"."""
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    pace = Pace(10)
-    pace.seconds_left(1, 0.1)
+    shown: list[float | None] = []
+    task = CountedTask(10, lambda done, note, left: shown.append(left))
+    task.update(done=1, share=0.1)
     now = 3600.0
-    assert pace.seconds_left(10, 1.0 + 1e-15) == 0.0
+    task.update(done=10, share=1.0 + 1e-15)
+    assert shown == [None, 0.0]
 
 
 def test_remarks_of_the_library_are_logged(

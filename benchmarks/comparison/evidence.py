@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 from benchmarks.comparison.equal_work import steps_of, variant_config
 from benchmarks.comparison.findings import Compared, compare_scenes
 from benchmarks.comparison.scenes import Recipe, Sample, make_scenes
+from benchmarks.comparison.splat_world import scene_setting
 from benchmarks.comparison.variants import find_variants
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.pipeline.config import load_config
@@ -295,7 +296,7 @@ def _synthetic(
             height=height,
             seed=seed,
             reporter=shop.reporter,
-            scene=scene,
+            setting=None if scene is None else scene_setting(scene, None, section.frames, width, height),
         )
         beside.rename(place)
     return place

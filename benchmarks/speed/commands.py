@@ -238,10 +238,10 @@ def quality(
     from benchmarks.speed.quality_report import plot_quality, quality_markdown
     from cleargs.files import write_bytes, write_json
     from cleargs.pipeline.config import parse_override
-    from cleargs.pipeline.keys import settings
+    from cleargs.pipeline.settings import flattened
     from cleargs.splat.kernels.cpu.backend import warm_up
 
-    changed = dict(item for text in overrides for item in settings(parse_override(text)))
+    changed = dict(item for text in overrides for item in flattened(parse_override(text)))
     plan = QualityPlan(captures, qualities, changed, until, threads_or_all(threads))
     warm_up()
     benchmark = run(plan, out, make_reporter(quiet))

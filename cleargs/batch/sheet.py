@@ -13,7 +13,7 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.pipeline.config import merge, parse_toml
-from cleargs.pipeline.keys import settings
+from cleargs.pipeline.settings import flattened
 from cleargs.record import Record
 from cleargs.untrusted import FAULTS, cause, read_text
 
@@ -116,7 +116,7 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, Any]]]:
         values = merge(document, scene)
         if isinstance(given := values.get("set"), dict):  # JSON's spelling of a value is TOML's too
             values["set"] = {
-                name: json.dumps(value, ensure_ascii=False, default=str) for name, value in settings(given)
+                name: json.dumps(value, ensure_ascii=False, default=str) for name, value in flattened(given)
             }
         yield f"{path.name}, scene {scene.get('name', number)}", values
 

@@ -22,7 +22,6 @@ Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
   cleargs run room -o run                        uses the given poses
   cleargs run room -o run --set ingest.poses=sfm  starts from the images alone
-  cleargs synth blurred --protocol gs2e-medium --scene run/g0/scene.ply
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
@@ -32,19 +31,6 @@ Example:
 )
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another room and walk.")
-@click.option(
-    "--scene",
-    type=click.Path(path_type=Path),
-    metavar="FILE.ply",
-    help="A trained Gaussian scene as the world, instead of the room.",
-)
-@click.option(
-    "--cameras",
-    type=click.Path(path_type=Path),
-    metavar="DIR|FILE",
-    help="Whose cameras the walk through the scene follows: a transforms.json, its folder, or a run. "
-    "Without it, those of the run that the scene lies in.",
-)
 @click.option("--video", is_flag=True, help="Also write OUT/capture.mp4.")
 @json_option
 def synth(
@@ -53,18 +39,14 @@ def synth(
     frames: int,
     size: tuple[int, int],
     seed: int,
-    scene: Path | None,
-    cameras: Path | None,
     video: bool,
     as_json: bool,
 ) -> None:
-    """Make a synthetic handheld capture of a procedural room, or of a trained scene, in the new folder OUT.
+    """Make a synthetic handheld capture of a procedural room in the new folder OUT.
 
     OUT/images and OUT/transforms.json are a capture like any other; OUT/truth holds the sharp views with
     exact poses and depth, views off the path, and what is wrong with each frame.
     """
-    if cameras is not None and scene is None:
-        raise click.UsageError("--cameras belongs to --scene")
     from cleargs.synth.synthetic_capture import make_capture
 
     summary = make_capture(
@@ -75,17 +57,23 @@ def synth(
         height=size[1],
         seed=seed,
         reporter=make_reporter(),
-        scene=scene,
-        cameras=cameras,
         video=video,
     )
     if as_json:
         print_json(summary)
-        return
-    click.echo(f"{frames} frames of {protocol!r} in {out}; the truth in {out / 'truth'}")
-    click.echo(_line("true blur", summary["blur_px"], size[0]))
+    else:
+        print_capture(out, summary)
+
+
+def print_capture(out: Path, summary: dict[str, Any]) -> None:
+    """Say what `cleargs.synth.synthetic_capture.make_capture` made in ``out``."""
+    width = summary["width"]
+    click.echo(
+        f"{summary['frames']} frames of {summary['protocol']!r} in {out}; the truth in {out / 'truth'}"
+    )
+    click.echo(_line("true blur", summary["blur_px"], width))
     if summary["rolling_shutter_px"]["max"] > 0:
-        click.echo(_line("true rolling-shutter skew", summary["rolling_shutter_px"], size[0]))
+        click.echo(_line("true rolling-shutter skew", summary["rolling_shutter_px"], width))
     if (noise := summary["pose_noise"]) is not None:
         click.echo(
             f"noise on the given poses: {noise['rotation_deg']:.2f} degrees about and "

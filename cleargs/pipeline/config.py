@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import settings_of, suggestion
+from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
 from cleargs.untrusted import FAULTS, cause, read_text
 
 RECIPES = "cleargs.workflows"
@@ -42,6 +42,12 @@ class Config:
             name: model.model_dump(mode="json", exclude_none=True) for name, model in self.sections.items()
         }
         return {"seed": self.seed, **tables}
+
+    def settings(self) -> Iterator[tuple[Setting, Any]]:
+        """Each setting of the stages, and its value as JSON holds it."""
+        for section, model in self.sections.items():
+            values = dict(flattened({section: model.model_dump(mode="json")}))
+            yield from ((setting, values[setting.name]) for setting in settings_of(section, type(model)))
 
 
 def load_config(

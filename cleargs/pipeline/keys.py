@@ -12,6 +12,7 @@ from typing import Any, cast
 from pydantic import BaseModel
 
 from cleargs.manifest import KeyParts
+from cleargs.pipeline.settings import fields_of, flattened
 from cleargs.pipeline.stage import Device, Stage
 from cleargs.plugins import Socket, installed_version, package_of, plugins
 
@@ -49,21 +50,19 @@ def library_versions(stage: Stage, device: Device) -> dict[str, str]:
     return versions if other is None else versions | other(device)
 
 
-def plugin_versions(config: BaseModel, prefix: str = "") -> dict[str, str]:
+def plugin_versions(config: BaseModel) -> dict[str, str]:
     """What other packages bring to the settings: "DISTRIBUTION for SETTING=NAME" -> installed version.
 
     A field that may name such a part is declared with ``json_schema_extra={"plugin": SOCKET}``.
     """
     versions: dict[str, str] = {}
-    for name, field in type(config).model_fields.items():
-        value, extra = getattr(config, name), field.json_schema_extra
-        if isinstance(value, BaseModel):
-            versions |= plugin_versions(value, f"{prefix}{name}.")
-        elif isinstance(extra, dict) and "plugin" in extra and value != field.default:
+    for name, field, value in fields_of(config):
+        extra = field.json_schema_extra
+        if isinstance(extra, dict) and "plugin" in extra and value != field.default:
             found = plugins(cast(Socket, extra["plugin"])).get(value)
             if found is not None:
                 distribution, version = package_of(found)
-                versions[f"{distribution} for {prefix}{name}={value}"] = version
+                versions[f"{distribution} for {name}={value}"] = version
     return versions
 
 
@@ -81,7 +80,7 @@ def differences(
     lines = []
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
-    for name, before, after in _changes(dict(settings(old.config)), dict(settings(new.config))):
+    for name, before, after in _changes(dict(flattened(old.config)), dict(flattened(new.config))):
         own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
         lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
     inputs = [("input", name) for name, _, _ in _changes(_input_digests(old), _input_digests(new))]
@@ -111,15 +110,6 @@ def _input_digests(parts: KeyParts) -> dict[str, str]:
         for path, digest in paths.items()
         if digest is not None
     }
-
-
-def settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of each setting in nested tables."""
-    for name, value in config.items():
-        if isinstance(value, dict):
-            yield from settings(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
 
 
 def _show(value: Any) -> str:

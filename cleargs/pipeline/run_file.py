@@ -13,8 +13,7 @@ from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import settings
-from cleargs.pipeline.settings import Setting, settings_of
+from cleargs.pipeline.settings import Setting
 from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
 
@@ -65,13 +64,10 @@ def _text(run: Run) -> str:
 def _commented(config: Config) -> str:
     """All settings as TOML, each below its meaning, range and default; unset ones as a comment."""
     tables: dict[str, list[str]] = {}
-    for section, model in config.sections.items():
-        values = dict(settings(model.model_dump(mode="json")))
-        for setting in settings_of(section, type(model)):
-            value = values[setting.name.removeprefix(f"{section}.")]
-            lines = tables.setdefault(setting.table, [])
-            lines += wrap(_comment(setting), WIDTH, initial_indent="# ", subsequent_indent="# ")
-            lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
+    for setting, value in config.settings():
+        lines = tables.setdefault(setting.table, [])
+        lines += wrap(_comment(setting), WIDTH, initial_indent="# ", subsequent_indent="# ")
+        lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
 
 

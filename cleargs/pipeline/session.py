@@ -14,7 +14,6 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
 from cleargs.pipeline.config import Config, check_document, load_config
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import settings as settings_in
 from cleargs.pipeline.run_file import RUN_FILE, Device, Noted, Run, noted_run, noted_source
 from cleargs.pipeline.store import STORE_FOLDER, Store
 
@@ -106,13 +105,13 @@ def asked_run(
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or noted.store or folder / STORE_FOLDER).absolute()
     chosen = resolve_device(noted.device or device if device == "auto" else device, say)
-    if kept is not None and (line := _own_settings(dag, kept)):
+    if kept is not None and (line := _own_settings(kept)):
         say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
     return Run(folder, source.absolute(), config, root, chosen)
 
 
-def _own_settings(dag: Dag, config: Config, most: int = 3) -> str:
+def _own_settings(config: Config, most: int = 3) -> str:
     """The first few settings that are not the default, in one line; "" where there are none."""
-    usual = dict(settings_in(check_document(dag, {}).document()))
-    own = [f"{name}={value}" for name, value in settings_in(config.document()) if usual.get(name) != value]
+    own = [f"seed={config.seed}"] if config.seed else []
+    own += [f"{setting.name}={value}" for setting, value in config.settings() if value != setting.default]
     return ", ".join(own[:most]) + (f" and {len(own) - most} more" if len(own) > most else "")

@@ -9,6 +9,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 KIND_WORDS: Mapping[Any, str] = {
     int: "a whole number",
@@ -64,19 +65,36 @@ class Setting:
 
 def settings_of(section: str, model: type[BaseModel]) -> list[Setting]:
     """The settings of a stage in the order in which its model declares them."""
-    return list(_walk(section, model()))
+    defaults = model()
+    plain = dict(flattened(defaults.model_dump(mode="json")))
+    return [
+        Setting(
+            f"{section}.{name}",
+            plain[name],
+            allowed(field.annotation, field.metadata),
+            field.description or "",
+        )
+        for name, field, _ in fields_of(defaults)
+    ]
 
 
-def _walk(prefix: str, defaults: BaseModel) -> Iterator[Setting]:
-    plain = defaults.model_dump(mode="json")
-    for name, field in type(defaults).model_fields.items():
-        value, full = getattr(defaults, name), f"{prefix}.{name}"
+def fields_of(model: BaseModel, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
+    """Dotted name, declaration and value of each setting in a table and in the tables below it."""
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
         if isinstance(value, BaseModel):
-            yield from _walk(full, value)
+            yield from fields_of(value, f"{prefix}{name}.")
         else:
-            yield Setting(
-                full, plain[name], allowed(field.annotation, field.metadata), field.description or ""
-            )
+            yield prefix + name, field, value
+
+
+def flattened(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of each setting in nested tables."""
+    for name, value in tables.items():
+        if isinstance(value, dict):
+            yield from flattened(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:

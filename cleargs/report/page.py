@@ -16,10 +16,9 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.keys import settings
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.settings import settings_of
+from cleargs.pipeline.settings import flattened
 from cleargs.report import charts
 from cleargs.report.frame_pictures import LAYERS, Image, Picture, write_jpeg, write_pictures
 from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
@@ -210,22 +209,19 @@ def _stage_rows(
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     """Name, value, default and meaning of each setting of the stages that differs from its default."""
-    found = []
-    for section, model in config.sections.items():
-        values = dict(settings({section: model.model_dump(mode="json")}))
-        for setting in settings_of(section, type(model)):
-            value = values[setting.name]
-            if value != setting.default:
-                found.append((setting.name, _toml(value), _toml(setting.default), setting.meaning))
-    return found
+    return [
+        (setting.name, _toml(value), _toml(setting.default), setting.meaning)
+        for setting, value in config.settings()
+        if value != setting.default
+    ]
 
 
 def command(run: Run, dag: Dag) -> str:
     """The ``cleargs run`` that makes this run, called next to its folder: a recipe, then settings."""
-    wanted = dict(settings(run.config.document()))
+    wanted = dict(flattened(run.config.document()))
     candidates = []
     for recipe in ("default", *(name for name in recipe_names() if name != "default")):
-        have = dict(settings(load_config(dag, recipe).document()))
+        have = dict(flattened(load_config(dag, recipe).document()))
         changed = {name: value for name, value in wanted.items() if have.get(name) != value}
         candidates.append((len(changed), recipe, changed))
     _, recipe, changed = min(candidates, key=lambda item: item[0])

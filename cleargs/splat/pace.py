@@ -54,16 +54,15 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
     if milliseconds is None:
         return 1.0
     with suppress(StoreError):
-        write_json(_note(), {**_machine(), "milliseconds": milliseconds})
+        write_json(_note(), {"milliseconds": milliseconds})
     return milliseconds / REFERENCE_MS
 
 
 def remembered_pace() -> float | None:
     """What was measured on this machine before; None where nothing was, or the note of it is damaged."""
-    try:
+    with suppress(*FAULTS):
         return _sound(read_json(_note())["milliseconds"]) / REFERENCE_MS
-    except FAULTS:
-        return None
+    return None
 
 
 def processor_name() -> str:
@@ -106,14 +105,10 @@ def random_scene(
     return Gaussians(*tensors), Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
-def _machine() -> dict[str, str | int]:
-    """What has a pace of its own."""
-    return {"host": platform.node(), "processor": processor_name(), "probe": PROBE}
-
-
 def _note() -> Path:
-    """A file a machine: a cluster's machines share their home."""
-    name = hashlib.sha256(json.dumps(_machine(), sort_keys=True).encode()).hexdigest()[:16]
+    """A file for each machine (a cluster's machines share their home), and for each version of the probe."""
+    machine = {"host": platform.node(), "processor": processor_name(), "probe": PROBE}
+    name = hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:16]
     return cache_folder("pace") / f"{name}.json"
 
 

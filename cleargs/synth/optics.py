@@ -31,13 +31,6 @@ class Lens:
     cx: float
     cy: float
 
-    def fitted(self, width: int, height: int) -> Lens:
-        """The lens of the same view scaled to fill ``width`` x ``height``, cropped about its middle."""
-        scale = max(width / self.width, height / self.height)
-        left, top = (self.width * scale - width) / 2, (self.height * scale - height) / 2
-        cx, cy = self.cx * scale - left, self.cy * scale - top
-        return Lens(width, height, self.fx * scale, self.fy * scale, cx, cy)
-
 
 def phone_lens(width: int, height: int) -> Lens:
     """The main camera of a phone."""

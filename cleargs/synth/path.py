@@ -1,29 +1,24 @@
 """A handheld walk: a smooth course, walked at an uneven pace by a hand that trembles and swings.
 
-A course leads around the room's table, or along the cameras of a real capture, from share 0 to share 1.
+A course leads around the room's table from share 0 to share 1.
 One path gives every pose, those within an exposure included: blur and skew are what its speed makes of the
 exposure and the readout, and so frame quality varies along it. Poses are camera to world with OpenCV axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import BSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
-from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth.optics import Aperture, Array, Lens, Shutter, World
 
 UP = np.array([0.0, 1.0, 0.0])
 DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
-SMOOTHING = 0.5
-"""Weight of the curvature of a spline through cameras, which are one apart."""
-MIN_CAMERAS = 5
 
 
 class Course(Protocol):
@@ -48,7 +43,7 @@ class Setting:
     lens: Lens
     film: Callable[[Shutter, Lens, Aperture], tuple[Array, Array]] | None = None
     """The world with something that moves in it: light, and the share of the exposure in which a pixel sees
-    it. A trained scene has none."""
+    it."""
 
 
 def look_at(centres: Array, target: Array) -> Array:  # [..., 3], [3]
@@ -89,57 +84,6 @@ def orbit(focus: Array, frames: int, seed: int) -> Orbit:
     """A course on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
     arc = np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES))
     return Orbit(focus, float(arc), np.random.default_rng([seed, Stream.ORBIT]).uniform(0, 2 * np.pi, 2))
-
-
-@dataclass(frozen=True)
-class CameraCourse:
-    """A smoothing spline through real cameras in the order in which they were taken."""
-
-    spline: BSpline
-    """Number of a camera of the course -> the 12 numbers of a pose, its rotation not yet orthonormal."""
-    steps: float
-    """Number of the last camera."""
-    spacing: float
-    """Median distance of neighbouring cameras of the course, world units."""
-
-    def poses(self, shares: Array) -> Array:
-        raw = np.asarray(self.spline(shares * self.steps), np.float64).reshape(-1, 3, 4)
-        u, _, vt = np.linalg.svd(raw[:, :, :3])
-        return np.concatenate([u @ vt, raw[:, :, 3:]], 2)
-
-    def novel(self, share: float, rng: np.random.Generator) -> Array:
-        """Off by up to one and a half spacings in each of the camera's axes."""
-        pose: Array = self.poses(np.array([share]))[0]
-        pose[:, 3] += pose[:, :3] @ rng.uniform(-1.5, 1.5, 3) * self.spacing
-        return pose
-
-
-def camera_course(cameras: Sequence[Array], frames: int) -> CameraCourse:
-    """The course along ``frames`` consecutive ``cameras`` [3, 4] whose longest step is the shortest.
-
-    So that neighbours overlap as in the real capture, and the walk never crosses a gap that another stretch
-    avoids. Raises InputError when there are fewer cameras than frames, fewer than `MIN_CAMERAS`, or all at
-    one place.
-    """
-    poses = np.stack(cameras) if cameras else np.empty((0, 3, 4))
-    if len(poses) < max(frames, MIN_CAMERAS):
-        raise InputError(
-            f"{frames} frames cannot follow {len(poses)} cameras",
-            hint=f"give --frames at most the number of cameras, and at least {MIN_CAMERAS} cameras",
-        )
-    used = max(frames, MIN_CAMERAS)
-    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
-    windows = np.lib.stride_tricks.sliding_window_view(steps, used - 1)
-    start = int(np.argmin(windows.max(1)))
-    spacing = float(np.median(windows[start]))
-    if spacing <= 0:
-        raise InputError(
-            "the cameras stand at one place",
-            hint="give cameras that move, as those of a walk through the scene",
-        )
-    stretch = poses[start : start + used].reshape(used, 12)
-    spline = make_smoothing_spline(np.arange(used), stretch, lam=SMOOTHING)
-    return CameraCourse(spline, float(frames - 1), spacing)
 
 
 FPS = 6.0

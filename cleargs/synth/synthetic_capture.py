@@ -24,6 +24,7 @@ from cleargs.synth.optics import PINHOLE, Aperture, Array, disc, still
 from cleargs.synth.path import FPS, Setting, frame_times, make_path
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
+from cleargs.synth.raycast import room_setting
 
 NEAR_FOCUS = 0.2
 """Where a frame out of focus is focused, as a share of the mean distance: in front of everything."""
@@ -38,15 +39,14 @@ def make_capture(
     height: int,
     seed: int,
     reporter: Reporter,
-    scene: Path | None = None,
-    cameras: Path | None = None,
+    setting: Setting | None = None,
     video: bool = False,
 ) -> dict[str, Any]:
     """Write the capture ``protocol`` into the new folder ``out``; returns what ``truth/capture.json`` says.
 
-    The world is the room of ``seed``, or the Gaussian scene in ``scene``, walked along its real cameras (see
-    `cleargs.synth.splat_world.scene_setting`). ``out/images`` and ``out/transforms.json`` (and with ``video``
-    ``out/capture.mp4``) are what a user would have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
+    It is made in the room of ``seed``, or in another ``setting`` of as many frames of that size.
+    ``out/images`` and ``out/transforms.json`` (and with ``video`` ``out/capture.mp4``) are what a user would
+    have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
     views in the same form, 8-bit sRGB PNGs, with exact poses: at the middle of the frames' exposures, with
     ``depth/``, and off the path. ``out/truth/frames.parquet`` (`cleargs.synth.develop.FRAMES`) has the faults
     of each frame.
@@ -54,22 +54,15 @@ def make_capture(
     Where something moves, the truth is without it, and ``out/truth/moving`` has a mask for each frame: white
     where a pixel saw it at any time of the exposure (its shadow is not in the mask).
 
-    Raises InputError for an unknown protocol, a folder that already holds something, a size that the video
-    cannot have, or a scene or cameras that cannot be used.
+    Raises InputError for an unknown protocol, a folder that already holds something, or a size that the video
+    cannot have.
     """
     rules = find_protocol(protocol)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty", hint="name a new folder for the capture")
     if video or rules.phone:
         require_even(width, height)
-    if scene is None:
-        from cleargs.synth.raycast import room_setting
-
-        setting = room_setting(frames, width, height, seed)
-    else:
-        from cleargs.synth.splat_world import scene_setting
-
-        setting = scene_setting(scene, cameras, frames, width, height)
+    setting = setting or room_setting(frames, width, height, seed)
     look = phone_look(seed) if rules.phone else PLAIN
     formation = {
         "tone_contrast": look.contrast,

@@ -90,8 +90,13 @@ def test_damaged_memo_troubles_nobody(bench: Bench, content: bytes) -> None:
     bench.run()
     (bench.store / "digests.sqlite").write_bytes(content)
     assert [outcome.how for outcome in bench.run()] == ["found"] * 3
-    with DigestMemo(bench.store / "digests.sqlite") as memo:
-        assert memo._database is not None, "it works again"
+    file = bench.root / "file"
+    file.write_text("content")
+    for known in ("what was noted", file_digest(file)):
+        with DigestMemo(bench.store / "digests.sqlite") as memo:
+            memo.remember(file, known)
+        with DigestMemo(bench.store / "digests.sqlite") as memo:
+            assert memo.digest(file) == known, "it works again"
 
 
 def test_wrong_memo_does_not_condemn_a_healthy_file(tmp_path: Path, bench: Bench) -> None:
@@ -120,13 +125,23 @@ def test_two_processes_may_use_the_memo_at_once(tmp_path: Path) -> None:
     for file in files:
         file.write_text(file.name)
     with DigestMemo(tmp_path / "memo.sqlite") as one, DigestMemo(tmp_path / "memo.sqlite") as two:
-        for file in files:
+        for file in files[:15]:
             one.remember(file, "one")
+        for file in files[5:]:
             two.remember(file, "one")
-            one.flush()
-            two.flush()
     with DigestMemo(tmp_path / "memo.sqlite") as memo:
         assert {memo.digest(file) for file in files} == {"one"}
+
+
+def test_what_was_forgotten_stays_forgotten(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"one")
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        memo.remember(file, "what was noted")
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        memo.forget(file)
+    with DigestMemo(tmp_path / "memo.sqlite") as memo:
+        assert memo.digest(file) == file_digest(file)
 
 
 def test_leftovers_of_dead_writers_are_not_published(bench: Bench) -> None:

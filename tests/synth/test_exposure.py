@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.comparison.splat_world import SplatWorld, _camera
 from cleargs.media.colour import linear_from_srgb
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
@@ -14,7 +15,6 @@ from cleargs.synth.image_motion import INSTANTS, ROW_STEP, FrameMotion, duration
 from cleargs.synth.optics import MIN_SAMPLES, Aperture, Lens, Shutter, World, disc, phone_lens, still
 from cleargs.synth.path import frame_times, make_path
 from cleargs.synth.raycast import room_setting
-from cleargs.synth.splat_world import SplatWorld, _camera
 
 WIDTH, HEIGHT = 96, 54
 EXPOSURE, READOUT = 0.06, 0.05

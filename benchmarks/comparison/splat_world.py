@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import BSpline, make_smoothing_spline
 
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
@@ -19,10 +21,13 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 from cleargs.splat.views import view_of
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
-from cleargs.synth.path import Setting, camera_course
+from cleargs.synth.path import Setting
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
+SMOOTHING = 0.5
+"""Weight of the curvature of a spline through cameras, which are one apart."""
+MIN_CAMERAS = 5
 
 
 class SplatWorld:
@@ -73,6 +78,57 @@ class SplatWorld:
         )
 
 
+@dataclass(frozen=True)
+class CameraCourse:
+    """A smoothing spline through real cameras in the order in which they were taken."""
+
+    spline: BSpline
+    """Number of a camera of the course -> the 12 numbers of a pose, its rotation not yet orthonormal."""
+    steps: float
+    """Number of the last camera."""
+    spacing: float
+    """Median distance of neighbouring cameras of the course, world units."""
+
+    def poses(self, shares: Array) -> Array:
+        raw = np.asarray(self.spline(shares * self.steps), np.float64).reshape(-1, 3, 4)
+        u, _, vt = np.linalg.svd(raw[:, :, :3])
+        return np.concatenate([u @ vt, raw[:, :, 3:]], 2)
+
+    def novel(self, share: float, rng: np.random.Generator) -> Array:
+        """Off by up to one and a half spacings in each of the camera's axes."""
+        pose: Array = self.poses(np.array([share]))[0]
+        pose[:, 3] += pose[:, :3] @ rng.uniform(-1.5, 1.5, 3) * self.spacing
+        return pose
+
+
+def camera_course(cameras: Sequence[Array], frames: int) -> CameraCourse:
+    """The course along ``frames`` consecutive ``cameras`` [3, 4] whose longest step is the shortest.
+
+    So that neighbours overlap as in the real capture, and the walk never crosses a gap that another stretch
+    avoids. Raises InputError when there are fewer cameras than frames, fewer than `MIN_CAMERAS`, or all at
+    one place.
+    """
+    poses = np.stack(cameras) if cameras else np.empty((0, 3, 4))
+    if len(poses) < max(frames, MIN_CAMERAS):
+        raise InputError(
+            f"{frames} frames cannot follow {len(poses)} cameras",
+            hint=f"give --frames at most the number of cameras, and at least {MIN_CAMERAS} cameras",
+        )
+    used = max(frames, MIN_CAMERAS)
+    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(steps, used - 1)
+    start = int(np.argmin(windows.max(1)))
+    spacing = float(np.median(windows[start]))
+    if spacing <= 0:
+        raise InputError(
+            "the cameras stand at one place",
+            hint="give cameras that move, as those of a walk through the scene",
+        )
+    stretch = poses[start : start + used].reshape(used, 12)
+    spline = make_smoothing_spline(np.arange(used), stretch, lam=SMOOTHING)
+    return CameraCourse(spline, float(frames - 1), spacing)
+
+
 def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
     """The scene in ``path``, in its own units, and a walk along ``frames`` of its real cameras.
 
@@ -93,7 +149,15 @@ def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, hei
     real = _read_cameras(run if cameras is None else cameras)
     course = camera_course([pose for _, pose in real], frames)
     name = path.stem if cameras is not None else run.name
-    return Setting(name, world, course, real[0][0].fitted(width, height))
+    return Setting(name, world, course, _fitted(real[0][0], width, height))
+
+
+def _fitted(lens: Lens, width: int, height: int) -> Lens:
+    """The lens of the same view scaled to fill ``width`` x ``height``, cropped about its middle."""
+    scale = max(width / lens.width, height / lens.height)
+    left, top = (lens.width * scale - width) / 2, (lens.height * scale - height) / 2
+    cx, cy = lens.cx * scale - left, lens.cy * scale - top
+    return Lens(width, height, lens.fx * scale, lens.fy * scale, cx, cy)
 
 
 def _read_cameras(source: Path) -> list[tuple[Lens, Array]]:

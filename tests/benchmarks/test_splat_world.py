@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from benchmarks.comparison.splat_world import CameraCourse, camera_course, scene_setting
 from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES
 from cleargs.errors import InputError
@@ -19,8 +20,7 @@ from cleargs.progress import SilentReporter
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
 from cleargs.splat.scene import Scene
-from cleargs.synth.path import CameraCourse, camera_course, look_at
-from cleargs.synth.splat_world import scene_setting
+from cleargs.synth.path import look_at
 from cleargs.synth.synthetic_capture import make_capture
 
 CAMERAS = 9
@@ -74,7 +74,7 @@ def test_a_capture_of_a_run_follows_its_cameras(run: Path, tmp_path: Path) -> No
     out = tmp_path / "out"
     summary = make_capture(
         out, "gsotm-mb-rs", frames=6, width=96, height=54, seed=0, reporter=SilentReporter(),
-        scene=run / "g0" / "scene.ply",
+        setting=scene_setting(run / "g0" / "scene.ply", None, 6, 96, 54),
     )  # fmt: skip
     assert summary["world"] == "myrun"
     scale = 96 / 640

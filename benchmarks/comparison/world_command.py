@@ -1,0 +1,64 @@
+"""``world``: captures with known truth in a trained scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cleargs.cli.common import parse_size
+from cleargs.cli.progress_bars import make_reporter
+from cleargs.cli.synth import PROTOCOL_HELP, print_capture
+
+
+@click.command(
+    epilog="""\b
+Example:
+  python -m benchmarks world blurred --protocol gs2e-medium --scene run/g0/scene.ply
+"""
+)
+@click.argument("out", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--scene", required=True, type=click.Path(path_type=Path), metavar="FILE.ply", help="A trained scene."
+)
+@click.option(
+    "--cameras",
+    type=click.Path(path_type=Path),
+    metavar="DIR|FILE",
+    help="Whose cameras the walk through the scene follows: a transforms.json, its folder, or a run. "
+    "Without it, those of the run that the scene lies in.",
+)
+@click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
+@click.option(
+    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
+)
+@click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another walk.")
+def world(
+    out: Path,
+    scene: Path,
+    cameras: Path | None,
+    protocol: str,
+    frames: int,
+    size: tuple[int, int],
+    seed: int,
+) -> None:
+    """Make a synthetic handheld capture in a trained scene, in the new folder OUT.
+
+    OUT holds what ``cleargs synth`` makes of a procedural room.
+    """
+    from benchmarks.comparison.splat_world import scene_setting
+    from cleargs.synth.synthetic_capture import make_capture
+
+    width, height = size
+    summary = make_capture(
+        out,
+        protocol,
+        frames=frames,
+        width=width,
+        height=height,
+        seed=seed,
+        reporter=make_reporter(),
+        setting=scene_setting(scene, cameras, frames, width, height),
+    )
+    print_capture(out, summary)
