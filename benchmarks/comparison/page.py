@@ -38,7 +38,7 @@ from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import page_environment, write_page
+from cleargs.report.page import page_environment, write_page
 from cleargs.report.report_json import page_of
 
 POSES = 3

@@ -16,7 +16,7 @@ from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
 from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import write_page
+from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.words import count, duration, size
 

@@ -109,8 +109,8 @@ def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
 def fitted_bars(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
     """The figures of each frame's exposure, as far as they are known: frame id and value of each bar."""
     figures: dict[tuple[str, str], list[float | None]] = {
-        ("Motion blur", "px"): [row.blur_px for row in rows],
-        ("Rolling shutter", "px"): [row.skew_px for row in rows],
+        ("Motion blur", "px"): [row.motion("blur_px") for row in rows],
+        ("Rolling shutter", "px"): [row.motion("skew_px") for row in rows],
         ("Defocus", "px"): [row.formation.get("defocus_px") for row in rows],
         ("Exposure", "stops"): [row.gain_ev for row in rows],
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.report.frame_strip import FrameRow
+from cleargs.report.web_scene import camera_of
+from cleargs.splat.viewer import Viewer
 
 LAYERS = {
     "observed": "As filmed",
@@ -34,9 +36,10 @@ BYTES = 8_500_000
 _BYTES_A_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
 _THUMBNAIL, _QUALITY = 240, 84
 
+RENDERED = 40
+"""Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
+
 Image = NDArray[np.uint8]
-RenderFrame = Callable[[FrameRow, int], Image]
-"""The final scene at a frame, at most so many pixels long."""
 
 
 class Picture(NamedTuple):
@@ -53,24 +56,24 @@ FramePictures = tuple[Picture, dict[str, Picture]]
 
 
 def write_pictures(
-    rows: Sequence[FrameRow],
-    run: Path,
-    report: Path,
-    render: RenderFrame,
-    rendered: frozenset[int],
-    threads: int,
+    rows: Sequence[FrameRow], run: Path, report: Path, final: Viewer | None, threads: int
 ) -> dict[int, FramePictures]:
-    """Write all pictures below ``report``; ``rendered``: the frames for which ``render`` is asked."""
+    """Write all pictures below ``report``; ``final`` renders the last scene, where there is one."""
     (report / FOLDER).mkdir(parents=True)
+    placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
+    rendered = set(placed[:: -(-len(placed) // RENDERED) or 1])
     layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
     side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, BYTES)
-    # Renders come one after the other, since each uses all threads; the files are read and written beside.
+    # Renders come one after the other, since each uses all threads; the files are read and written meanwhile.
     with ThreadPoolExecutor(threads) as pool:
         futures = {}
         for row in rows:
-            frame_id = row.frame.frame_id
-            final = render(row, side) if frame_id in rendered else None
-            futures[frame_id] = pool.submit(_write_frame, row, run, report, final, side)
+            image = None
+            if final and row.frame.frame_id in rendered:
+                camera = camera_of(row.frame)
+                smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
+                image = final.view(smaller, row.affine)
+            futures[row.frame.frame_id] = pool.submit(_write_frame, row, run, report, image, side)
         return {frame_id: future.result() for frame_id, future in futures.items()}
 
 

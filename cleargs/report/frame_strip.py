@@ -6,10 +6,13 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame, load_frames
-from cleargs.formation.exposure import Exposure, read_exposure
+from cleargs.formation.exposure import read_exposure
 from cleargs.formation.table import FORMATION
 from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.tables import Selection, read_selection
@@ -34,15 +37,21 @@ class FrameRow:
     """One frame, and what the stages say of it."""
 
     frame: Frame
-    role: str
     judged: Mapping[str, Any] = field(default_factory=dict)
     """Its row of ``rva/frames.parquet``; empty without one."""
     rounds: tuple[Selection, ...] = ()
     """Its rows of ``rivr/selection.parquet``, in the order of the rounds."""
-    gain_ev: float | None = None
-    """Exposure next to the scene's at middle grey, stops; None without compensation."""
+    affine: NDArray[np.float64] | None = None  # [3, 4]
+    """The colours of the last scene to those of the frame; None without compensation."""
     formation: Mapping[str, Any] = field(default_factory=dict)
     """Column of the last scene's ``formation.parquet`` -> value; empty without one."""
+
+    @property
+    def role(self) -> str:
+        """RVA's, or one of the two above; "" where it is unknown."""
+        if not self.frame.registered:
+            return UNPLACED
+        return HELD_OUT if self.frame.split != "train" else str(self.judged.get("role", ""))
 
     @property
     def weight(self) -> float | None:
@@ -72,16 +81,16 @@ class FrameRow:
         return self.selection.chosen if kept else None
 
     @property
-    def blur_px(self) -> float | None:
-        """How far the pixels moved while exposed."""
-        return self._motion("blur_px")
+    def gain_ev(self) -> float | None:
+        """Exposure next to the scene's at middle grey, stops; None without compensation."""
+        if self.affine is None:
+            return None
+        grey = self.affine[:, :3].sum(axis=1) * 0.5 + self.affine[:, 3]
+        # sRGB to linear light near middle grey is a power of 2.4 or so; a stop is a factor of two there.
+        return 2.4 * math.log2(max(float(grey.mean()), 1e-3) / 0.5)
 
-    @property
-    def skew_px(self) -> float | None:
-        """How far the last line of pixels moved against the first."""
-        return self._motion("skew_px")
-
-    def _motion(self, name: str) -> float | None:
+    def motion(self, name: Literal["blur_px", "skew_px"]) -> float | None:
+        """The way of the pixels while exposed, or of the last line of pixels against the first."""
         found: float | None = self.formation.get(name, getattr(self.selection, name, None))
         return found
 
@@ -124,7 +133,7 @@ def last_scene(stages: Collection[str]) -> str | None:
 
 def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     """The frames of ``run`` in their order, as far as ``stages`` say something of them. Raises StoreError."""
-    judged = {}
+    judged: dict[int, dict[str, Any]] = {}
     if "rva" in stages:
         rows = read_table(run / "rva" / "frames.parquet", FRAMES).to_pylist()
         judged = {row["frame_id"]: row for row in rows}
@@ -132,39 +141,21 @@ def load_rows(run: Path, stages: Collection[str]) -> list[FrameRow]:
     if "rivr" in stages:
         for found in sorted(read_selection(run / "rivr" / "selection.parquet"), key=lambda row: row.round):
             rounds.setdefault(found.frame_id, []).append(found)
-    final = last_scene(stages)
-    exposure = read_exposure(run / final / "exposure.parquet") if final else None
-    formation = _formation(run / final / "formation.parquet") if final else {}
+    affines: dict[int, NDArray[np.float64]] = {}
+    formation: dict[int, dict[str, Any]] = {}  # a scene may be trained without asking what the camera did
+    if final := last_scene(stages):
+        exposure = read_exposure(run / final / "exposure.parquet")
+        if exposure.enabled:
+            affines = dict(zip(exposure.frame_ids.tolist(), exposure.affines, strict=True))
+        if (path := run / final / "formation.parquet").is_file():
+            formation = {row.pop("frame_id"): row for row in read_any_table(path).to_pylist()}
     return [
         FrameRow(
             frame,
-            _role(frame, judged.get(frame.frame_id, {})),
             judged.get(frame.frame_id, {}),
             tuple(rounds.get(frame.frame_id, ())),
-            _gain(exposure, frame.frame_id),
+            affines.get(frame.frame_id),
             formation.get(frame.frame_id, {}),
         )
         for frame in load_frames(run / "ingest")
     ]
-
-
-def _role(frame: Frame, judged: Mapping[str, Any]) -> str:
-    if not frame.registered:
-        return UNPLACED
-    return HELD_OUT if frame.split != "train" else str(judged.get("role", ""))
-
-
-def _formation(path: Path) -> dict[int, dict[str, Any]]:
-    """What the camera did to each frame; empty for a scene that was trained without asking."""
-    if not path.is_file():
-        return {}
-    return {row.pop("frame_id"): row for row in read_any_table(path).to_pylist()}
-
-
-def _gain(exposure: Exposure | None, frame_id: int) -> float | None:
-    if exposure is None or not exposure.enabled or frame_id not in exposure.frame_ids:
-        return None
-    affine = exposure.of(frame_id)
-    grey = affine[:, :3].sum(axis=1) * 0.5 + affine[:, 3]
-    # sRGB to linear light near middle grey is a power of 2.4 or so; a stop is a factor of two there.
-    return 2.4 * math.log2(max(float(grey.mean()), 1e-3) / 0.5)

@@ -196,7 +196,7 @@ class _Run:
         if weighted and self._unused > MANY_UNUSED * weighted:
             why = "A lower threshold of reliability lets more of them in."
             yield Caution(f"{self._unused} of {weighted} placed frames are unused", why, (lower,))
-        blurred = sum((row.blur_px or 0.0) > SOFT_PX for row in self._rows)
+        blurred = sum((row.motion("blur_px") or 0.0) > SOFT_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
             what = f"{count(blurred, 'frame')} moved by more than {SOFT_PX:g} px while exposed"
             yield Caution(what, "A shorter exposure or a slower hand gives sharper frames than any repair.")
