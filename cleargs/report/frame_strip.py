@@ -16,7 +16,7 @@ from cleargs.formation.exposure import read_exposure
 from cleargs.formation.table import FORMATION
 from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.tables import Selection, read_selection
-from cleargs.rva.tables import B_CUES, FRAMES, R_CUES
+from cleargs.rva.tables import FRAMES
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles of frames on which RVA has nothing to say."""
@@ -59,15 +59,6 @@ class FrameRow:
         return self.judged.get("weight")
 
     @property
-    def cues(self) -> dict[str, float]:
-        """Cue -> how bad it is, 0 to 1, qualities turned round; the worst first."""
-        lacking = {f"low {name}": self.judged.get(f"r_{name}") for name in R_CUES}
-        found = {name: 1.0 - value for name, value in lacking.items() if value is not None}
-        harms = {name.replace("_", " "): self.judged.get(f"b_{name}") for name in B_CUES}
-        found |= {name: value for name, value in harms.items() if value is not None}
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
-
-    @property
     def selection(self) -> Selection | None:
         """Its row of the latest round."""
         return self.rounds[-1] if self.rounds else None
@@ -93,23 +84,6 @@ class FrameRow:
         """The way of the pixels while exposed, or of the last line of pixels against the first."""
         found: float | None = self.formation.get(name, getattr(self.selection, name, None))
         return found
-
-    @property
-    def repair(self) -> str:
-        """The repair chosen, in words."""
-        if self.selection is None:
-            return "none tried"
-        words = CHOICES[self.selection.chosen]
-        return words if self.chosen else f"none: {words} was refused"
-
-    @property
-    def why(self) -> str:
-        """Why it was chosen."""
-        if self.selection is None:
-            return ""
-        metric, scores = scores_of(self.selection)[0]
-        found = ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
-        return f"{self.selection.reason}; {metric}: {found}"
 
 
 def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:

@@ -14,6 +14,7 @@ from typing import Any
 import tomli_w
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from rich.filesize import decimal
 
 import cleargs
 from cleargs.errors import InputError
@@ -27,11 +28,12 @@ from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.settings import settings_of
 from cleargs.report import charts
 from cleargs.report.frame_pictures import LAYERS, Picture, write_jpeg, write_pictures
-from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
+from cleargs.report.frame_strip import CHOICES, MEANINGS, SCENES, FrameRow, load_rows, scores_of
 from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.verdict import judge
 from cleargs.report.web_scene import camera_of, level_camera, opening, viewer_data, write_scene, write_viewer
-from cleargs.report.words import duration, size
+from cleargs.report.words import duration
+from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.viewer import Viewer
@@ -100,7 +102,6 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             "report.html.jinja",
             name=run.name,
             source=planner.run.source.name,
-            rows=rows,
             pictures=pictures,
             verdict=judge(manifests, rows, planner.run.config),
             scenes=scenes,
@@ -120,7 +121,10 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             data={
                 "layers": LAYERS,
                 "opening": {"left": "observed", "right": "final"},
-                "frames": [_frame_data(row, pictures[row.frame.frame_id][1], times) for row in rows],
+                "frames": [
+                    _frame_data(row, pictures[number][1], times.get(number))
+                    for number, row in zip(pictures, rows, strict=True)
+                ],
                 "viewer": viewer,
             },
         )
@@ -189,7 +193,7 @@ def _stage_rows(
             row |= {"state": STATES[plan.state], "reasons": plan.reasons}
         if manifest:
             row |= {"time": duration(manifest.seconds), "share": manifest.seconds / total}
-            row |= {"size": size(manifest.bytes), "key": manifest.key[:12]}
+            row |= {"size": decimal(manifest.bytes), "key": manifest.key[:12]}
         rows.append(row)
     return rows
 
@@ -239,24 +243,38 @@ def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return found
 
 
-def _frame_data(row: FrameRow, layers: Mapping[str, Picture], times: Mapping[int, float]) -> dict[str, Any]:
-    found = {"blur, px": row.motion("blur_px"), "exposure, stops": row.gain_ev}
+def _frame_data(row: FrameRow, layers: Mapping[str, Picture], time: float | None) -> dict[str, Any]:
+    """All that the page says of a frame."""
+    lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
+    cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}
+    harms = {name.replace("_", " "): row.judged.get(f"b_{name}") for name in B_CUES}
+    cues |= {name: value for name, value in harms.items() if value is not None}
+    repair, why, scores = "none tried", "", {}
+    if row.selection:
+        words = CHOICES[row.selection.chosen]
+        repair = words if row.chosen else f"none: {words} was refused"
+        scores = dict(scores_of(row.selection))
+        metric, deciding = scores_of(row.selection)[0]
+        found = ", ".join(f"{name} {score:.1f}" for name, score in deciding.items())
+        why = f"{row.selection.reason}; {metric}: {found}"
+    fitted = {"blur, px": row.motion("blur_px"), "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,
         "name": row.frame.name,
         "role": row.role,
         "weight": row.weight,
         "figures": {name: row.judged[name] for name in "RBGCDOZ" if row.judged.get(name) is not None},
-        "cues": row.cues,
-        "repair": row.repair,
-        "why": row.why,
+        "cues": dict(sorted(cues.items(), key=lambda item: -item[1])),  # how bad, the worst first
+        "repair": repair,
+        "why": why,
         "chosen": row.selection.chosen if row.selection and row.selection.accepted else None,
-        "scores": dict(scores_of(row.selection)) if row.selection else {},
-        "found": {name: value for name, value in found.items() if value is not None},
+        "scores": scores,
+        "found": {name: value for name, value in fitted.items() if value is not None},
+        "model": row.formation.get("model"),
         "formation": [
             {"name": name.replace("_", " "), "value": value, "meaning": MEANINGS.get(name, "")}
             for name, value in row.formation.items()
         ],
         "layers": {name: picture.path for name, picture in layers.items()},
-        "time": times.get(row.frame.frame_id),
+        "time": time,
     }
