@@ -17,7 +17,7 @@ from cleargs.errors import CleargsError
 from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
-from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
+from cleargs.report.frames import Picture, side_of, write_jpeg
 from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 from cleargs.report.words import count, duration

@@ -14,9 +14,17 @@ from cleargs.manifest import Manifest
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
 from cleargs.parquet import read_table
-from cleargs.report.frame_pictures import LAYERS, layers_of
-from cleargs.report.frame_strip import CHOICES, MEANINGS, FrameRow, last_scene, load_rows, scores_of
-from cleargs.report.web_scene import camera_of
+from cleargs.report.frames import (
+    CHOICES,
+    LAYERS,
+    MEANINGS,
+    FrameRow,
+    camera_of,
+    last_scene,
+    layers_of,
+    load_rows,
+    scores_of,
+)
 from cleargs.rivr.gates import REFUSED
 from cleargs.rivr.tables import REPAIRS
 from cleargs.splat.ply import read_ply

@@ -11,8 +11,7 @@ import pyarrow as pa
 from matplotlib.ticker import MaxNLocator
 
 from cleargs.parquet import read_table
-from cleargs.report.frame_strip import FrameRow
-from cleargs.report.web_scene import camera_of
+from cleargs.report.frames import FrameRow, camera_of
 from cleargs.splat.tables import TRAIN
 
 WIDTH, HEIGHT = 640, 220

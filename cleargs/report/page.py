@@ -27,11 +27,22 @@ from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.settings import settings_of
 from cleargs.report import charts
-from cleargs.report.frame_pictures import LAYERS, Picture, write_jpeg, write_pictures
-from cleargs.report.frame_strip import CHOICES, MEANINGS, SCENES, FrameRow, load_rows, scores_of
+from cleargs.report.frames import (
+    CHOICES,
+    LAYERS,
+    MEANINGS,
+    SCENES,
+    FrameRow,
+    Picture,
+    camera_of,
+    load_rows,
+    scores_of,
+    write_jpeg,
+    write_pictures,
+)
 from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.verdict import judge
-from cleargs.report.web_scene import camera_of, level_camera, opening, viewer_data, write_scene, write_viewer
+from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
 from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
-from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow, last_scene
+from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
 from cleargs.report.words import count, decibel
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0

@@ -16,14 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from cleargs.capture.tables import Frame
-from cleargs.report.frame_strip import FrameRow
+from cleargs.report.frames import FrameRow, camera_of
 from cleargs.splat.camera import Camera, look_at
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import view_of
 
 BYTES = 10_000_000
 """Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
@@ -68,11 +66,6 @@ def write_viewer(folder: Path) -> str:
 
 def _script(name: str, packed: bytes) -> bytes:
     return b'(window.packed ??= {})["%s"] = "%s";\n' % (name.encode(), base64.b64encode(packed))
-
-
-def camera_of(frame: Frame) -> Camera:
-    """The camera of a registered frame."""
-    return view_of(frame, Path(), 0.0).camera
 
 
 def viewer_pose(camera: Camera) -> dict[str, Any]:

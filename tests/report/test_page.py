@@ -26,7 +26,7 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report.charts import weight_colour
-from cleargs.report.frame_strip import FrameRow
+from cleargs.report.frames import FrameRow
 from cleargs.report.page import changed_settings, command, json_in_html, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import judge
