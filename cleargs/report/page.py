@@ -51,10 +51,6 @@ from cleargs.splat.viewer import Viewer
 
 _STILL = 960  # px, long side of the pictures that stand for the viewers
 
-STATES = {"done": "up to date", "partial": "done in part", "missing": "to be made"}
-HOW = {"made": "made anew", "found": "found in the store"}
-"""The actions of the last ``cleargs run``."""
-
 
 def write_page(folder: Path, template: str | Template, **values: Any) -> None:
     """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
@@ -80,7 +76,7 @@ def page_environment() -> Environment:
         lstrip_blocks=True,
     )
     static = files("cleargs.report").joinpath("static")
-    environment.filters["json"] = json_in_html
+    environment.filters |= {"json": json_in_html, "duration": duration, "bytes": decimal}
     environment.globals["static"] = lambda name: Markup(static.joinpath(name).read_text(encoding="utf-8"))
     environment.globals["weight_colour"] = charts.weight_colour
     return environment
@@ -120,11 +116,10 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             plan=charts.plan_of(rows),
             curves=charts.training_curves(run, trained),
             bars=charts.fitted_bars(rows),
-            stages=_stage_rows(planner, manifests, last.stages if last else {}),
-            total=duration(sum(manifest.seconds for manifest in manifests.values())),
-            memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
-            device=list(manifests.values())[-1].device,
-            started=manifests["ingest"].started.replace("T", " ").removesuffix("+00:00"),
+            stages=planner.dag.names,
+            manifests=manifests,
+            plans=_plans(planner),
+            last=last,
             settings=changed_settings(planner.run.config),
             versions=_versions(manifests),
             command=command(planner.run, planner.dag),
@@ -179,34 +174,13 @@ def _scenes(
     return views, renderer
 
 
-# -- how the run came about ----------------------------------------------------------------------------------
-
-
-def _stage_rows(
-    planner: Planner, manifests: Mapping[str, Manifest], last: Mapping[str, str]
-) -> list[dict[str, Any]]:
-    """What each stage cost, and whether its results are those of today's settings and input.
-
-    last: stage -> ``made`` or ``found``, as the last run had it.
-    """
-    plans: dict[str, StagePlan] = {}
+def _plans(planner: Planner) -> dict[str, StagePlan]:
+    """The state of every stage; empty when the capture has gone."""
     try:
-        plans = {plan.stage: plan for plan in planner.plan()}
-    except InputError as error:  # the capture has gone
+        return {plan.stage: plan for plan in planner.plan()}
+    except InputError as error:
         planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
-    total = sum(manifest.seconds for manifest in manifests.values()) or 1.0
-    rows = []
-    for name in planner.dag.names:
-        manifest, plan = manifests.get(name), plans.get(name)
-        row = {"name": name, "how": HOW.get(last.get(name, ""), ""), "state": "unknown", "reasons": ()}
-        row |= {"time": "", "share": 0.0, "size": "", "key": ""}
-        if plan:
-            row |= {"state": STATES[plan.state], "reasons": plan.reasons}
-        if manifest:
-            row |= {"time": duration(manifest.seconds), "share": manifest.seconds / total}
-            row |= {"size": decimal(manifest.bytes), "key": manifest.key[:12]}
-        rows.append(row)
-    return rows
+        return {}
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
