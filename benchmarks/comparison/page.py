@@ -37,8 +37,8 @@ from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
-from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import page_environment, write_page
+from cleargs.report.frames import Picture, side_of, write_jpeg
+from cleargs.report.page import page_environment, write_page
 from cleargs.report.report_json import page_of
 
 POSES = 3

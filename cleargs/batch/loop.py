@@ -20,6 +20,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
+from rich.filesize import decimal
+
 from cleargs.batch.sheet import Scene, SheetError
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
@@ -30,7 +32,7 @@ from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import asked_run, opened_store, usable_cores
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.report.report_json import linked_manifests
-from cleargs.report.words import decibel, duration, size
+from cleargs.report.words import decibel, duration
 
 State = Literal["failed", "waiting", "partial", "done"]
 """`waiting`: there are stages to make, and no try has failed."""
@@ -64,7 +66,7 @@ class Result:
         if self.minutes:
             found.append((duration(60 * self.minutes), "of work"))
             found.append((f"{self.memory_gb:.1f} GB", "of memory"))
-            found.append((size(round(1e9 * self.disk_gb)), "on disk"))
+            found.append((decimal(round(1e9 * self.disk_gb)), "on disk"))
         return found
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import quote
 
+from rich.filesize import decimal
+
 from cleargs.batch.loop import Batch, Result, State
 from cleargs.batch.sheet import Scene
 from cleargs.capture.tables import load_frames
@@ -15,10 +17,10 @@ from cleargs.errors import CleargsError
 from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
-from cleargs.report.frame_pictures import Picture, side_of, write_jpeg
-from cleargs.report.html import write_page
+from cleargs.report.frames import Picture, side_of, write_jpeg
+from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
-from cleargs.report.words import count, duration, size
+from cleargs.report.words import count, duration
 
 BYTES = 15_000_000
 """About how much all thumbnails together may take."""
@@ -48,7 +50,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
             kinds=[(kind, kinds[kind]) for kind in order if kinds[kind]],
             done=kinds["done"],
             total=duration(60 * sum(result.minutes for result in results)),
-            bytes=size(round(1e9 * sum(result.disk_gb for result in results))),
+            bytes=decimal(round(1e9 * sum(result.disk_gb for result in results))),
             stages=batch.dag.until(batch.until),
             cards=[_card(batch, scene, result, report, side) for scene, result in pairs],
         )

@@ -10,14 +10,21 @@ from typing import Any
 import numpy as np
 
 from cleargs.errors import InputError
-from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import Manifest
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
 from cleargs.parquet import read_table
-from cleargs.report.frame_pictures import LAYERS, layers_of
-from cleargs.report.frame_strip import CHOICES, MEANINGS, FrameRow, last_scene, load_rows, scores_of
-from cleargs.report.web_scene import camera_of
+from cleargs.report.frames import (
+    CHOICES,
+    LAYERS,
+    MEANINGS,
+    FrameRow,
+    camera_of,
+    last_scene,
+    layers_of,
+    load_rows,
+    scores_of,
+)
 from cleargs.rivr.gates import REFUSED
 from cleargs.rivr.tables import REPAIRS
 from cleargs.splat.ply import read_ply
@@ -186,8 +193,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     images = layers_of(row, run)
     scene = last_scene(stages)
     if scene is not None and row.frame.registered:
-        affine = read_exposure(run / scene / "exposure.parquet").of(row.frame.frame_id)
-        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), affine)
+        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
     shown = [name for name in LAYERS if name in images]
     tiles = []
     for name in shown:

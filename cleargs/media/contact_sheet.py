@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,8 +18,7 @@ _TEXT = (235, 235, 235)
 _MARKED = (40, 120, 60)
 
 
-@dataclass(frozen=True, eq=False)
-class Tile:
+class Tile(NamedTuple):
     """One image of a sheet with its label above it."""
 
     image: NDArray[np.float32] | None
@@ -32,15 +31,14 @@ class Tile:
 
 def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> NDArray[np.uint8]:  # [H, W, 3]
     """The rows of tiles below one another, each image resampled to ``tile_width`` px. At least one tile."""
-    strips = [_row(row, tile_width) for row in rows]
-    width = max(strip.shape[1] for strip in strips)
-    return np.concatenate([_padded(strip, strip.shape[0], width) for strip in strips])
-
-
-def _row(tiles: Sequence[Tile], width: int) -> NDArray[np.uint8]:
-    cells = [_cell(tile, width) for tile in tiles]
-    height = max(cell.shape[0] for cell in cells)
-    return np.concatenate([_padded(cell, height + _GAP, width + _GAP) for cell in cells], axis=1)[:, :-_GAP]
+    lines = [[_cell(tile, tile_width) for tile in row] for row in rows]
+    heights = [max(len(cell) for cell in line) + _GAP for line in lines]
+    step = tile_width + _GAP
+    sheet = np.full((sum(heights), max(map(len, lines)) * step - _GAP, 3), _BACKGROUND, np.uint8)
+    for line, height, bottom in zip(lines, heights, np.cumsum(heights), strict=True):
+        for column, cell in enumerate(line):
+            sheet[bottom - height :, column * step :][: len(cell), :tile_width] = cell
+    return sheet
 
 
 def _cell(tile: Tile, width: int) -> NDArray[np.uint8]:
@@ -55,8 +53,3 @@ def _cell(tile: Tile, width: int) -> NDArray[np.uint8]:
     return np.concatenate(
         [label, np.asarray(cv2.resize(image, (width, height), interpolation=kernel), np.uint8)]
     )
-
-
-def _padded(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    below, right = height - image.shape[0], width - image.shape[1]
-    return np.pad(image, ((0, below), (0, right), (0, 0)), constant_values=_BACKGROUND)

@@ -59,7 +59,8 @@ def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> N
     plain = [] if shown is None else [image.layers[shown]]
     pixels = np.concatenate([*plain, *image.layers.values()], axis=2)
     layered = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
-    _write(path, pixels, (*_CHANNELS[: 3 * len(plain)], *layered), (), image.attributes)
+    channels = (*_CHANNELS[: 3 * len(plain)], *layered)
+    _write(path, pixels, channels, (HALF,) * len(channels), image.attributes)
 
 
 def write_view(
@@ -89,12 +90,9 @@ def _write(
     formats: tuple[Any, ...],
     attributes: Mapping[str, Attribute],
 ) -> None:
-    """Write ``pixels``; ``formats`` are those of the channels, empty where all are half floats."""
     height, width, count = pixels.shape
-    spec = ImageSpec(width, height, count, formats[0] if formats else HALF)
-    spec.channelnames = channels
-    if formats:
-        spec.channelformats = formats
+    spec = ImageSpec(width, height, count, formats[0])
+    spec.channelnames, spec.channelformats = channels, formats
     spec.attribute("compression", "zip")
     if count > 1:  # depth alone has no colour
         spec.attribute("oiio:ColorSpace", "lin_rec709")

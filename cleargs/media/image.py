@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -111,12 +110,13 @@ def write_rgb(
     """
     rgb = image if image.dtype == np.uint8 else to_uint8(image)
     options = [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality]
-    _encode(path, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8), options)
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    write_bytes(path, data.tobytes())
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:  # [H, W]
     """Write a one-channel image atomically. Raises StoreError like `write_rgb`."""
-    _encode(path, mask)
+    write_bytes(path, cv2.imencode(path.suffix, mask)[1].tobytes())
 
 
 def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
@@ -156,10 +156,3 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
         image = image.swapaxes(0, 1)
     down, across = _MIRRORED[turn]
     return np.ascontiguousarray(image[::down, ::across])
-
-
-def _encode(path: Path, image: NDArray[np.uint8], options: Sequence[int] = ()) -> None:
-    ok, data = cv2.imencode(path.suffix, image, options)
-    if not ok:
-        raise ValueError(f"cannot encode {path.suffix}")
-    write_bytes(path, data.tobytes())

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
-from av.video.plane import VideoPlane
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -68,11 +67,12 @@ def read_timeline(path: Path) -> Timeline:
                 end = max(end, packet.pts + (packet.duration or 0))
         if not pts:
             raise InputError(f"{path.name} has no frames", hint=_HINT)
-        if stream.frames > len(pts) + 1 and not _edited(stream):
-            raise _broken(path, len(pts), stream)
         assert stream.time_base is not None
         stated = _stated_seconds(container, stream)
-        if stated - float(end * stream.time_base) > max(_SLACK_S, _SLACK * stated):
+        short = stated - float(end * stream.time_base) > max(_SLACK_S, _SLACK * stated)
+        # An edit list hides frames: the container counts them, the demuxer drops them.
+        edited = stream.start_time is not None and stream.start_time < 0
+        if short or (stream.frames > len(pts) + 1 and not edited):
             raise _broken(path, len(pts), stream)
         transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
         return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
@@ -92,13 +92,9 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
     missing = set(pts)
     for number, frame, aspect in _decoded(path, pts):
         missing.discard(number)
-        wide, high = _square_width(frame, aspect), frame.height
-        if wide * high > MAX_PIXELS:
-            raise InputError(
-                f"{path.name}: a frame would have {wide}x{high} square pixels; at most {MAX_PIXELS} are read",
-                hint=_HINT,
-            )
-        yield number, frame_rgb(frame, aspect)
+        wide = max(1, round(aspect * frame.width))
+        _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
+        yield number, _upright(frame, wide)
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
@@ -126,16 +122,17 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
                 return
 
 
-def frame_rgb(frame: VideoFrame, aspect: float = 1.0) -> NDArray[np.uint8]:  # [H, W, 3]
-    """A decoded frame as upright sRGB of square pixels; its own are ``aspect`` times as wide as high."""
+def _require_few(subject: str, width: int, height: int, what: str = "pixels") -> None:
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{subject} {width}x{height} {what}; at most {MAX_PIXELS} are read", hint=_HINT)
+
+
+def _upright(frame: VideoFrame, width: int) -> NDArray[np.uint8]:  # [H, W, 3]
+    """A decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
-    if (wide := _square_width(frame, aspect)) != rgb.shape[1]:
-        rgb = np.asarray(cv2.resize(rgb, (wide, rgb.shape[0]), interpolation=cv2.INTER_CUBIC), np.uint8)
+    if width != frame.width:
+        rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_CUBIC), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
-
-
-def _square_width(frame: VideoFrame, aspect: float) -> int:
-    return max(1, round(aspect * frame.width))
 
 
 def _signal(frame: VideoFrame) -> NDArray[np.float32]:  # [H, W, 3]
@@ -151,19 +148,13 @@ def _signal(frame: VideoFrame) -> NDArray[np.float32]:  # [H, W, 3]
     planar = frame.reformat(
         format=layout, src_color_range=side, dst_color_range=side, interpolation="BICUBIC"
     )
-    yuv = np.stack([_plane(plane, np.uint8 if bits == 8 else np.uint16) for plane in planar.planes])
+    yuv = np.moveaxis(planar.to_ndarray(channel_last=True).astype(np.float32), -1, 0)
     matrix = _MATRICES.get(
         int(frame.colorspace), "bt709" if min(frame.width, frame.height) >= 720 else "bt601"
     )
     rgb = rgb_from_yuv(yuv, matrix, 8 if bits == 8 else 16, full_range=full)
     transfer = _TRANSFERS.get(int(frame.color_trc))
     return rgb if transfer is None else srgb_from_hdr(np.clip(rgb, 0, 1), transfer)
-
-
-def _plane(plane: VideoPlane, code: type[np.uint8] | type[np.uint16]) -> NDArray[np.float32]:  # [H, W]
-    """The code values of a plane, without the padding at the end of its lines."""
-    rows = np.frombuffer(memoryview(plane), np.dtype(code)).reshape(plane.height, -1)
-    return np.asarray(rows[:, : plane.width], np.float32)
 
 
 @contextmanager
@@ -180,11 +171,7 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             stream = container.streams.video[0]
             if stream.codec_context is None:  # of a form that FFmpeg does not know
                 raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
-            width, height = stream.width, stream.height
-            if width * height > MAX_PIXELS:
-                raise InputError(
-                    f"{path.name} has {width}x{height} pixels; at most {MAX_PIXELS} are read", hint=_HINT
-                )
+            _require_few(f"{path.name} has", stream.width, stream.height)
             yield container, stream
     except (av.error.FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
@@ -204,8 +191,3 @@ def _stated_seconds(container: InputContainer, stream: VideoStream) -> float:
 def _broken(path: Path, frames: int, stream: VideoStream) -> InputError:
     whole = f" of {stream.frames}" if stream.frames else ""
     return InputError(f"{path.name} is damaged or breaks off after {frames}{whole} frames", hint=_HINT)
-
-
-def _edited(stream: VideoStream) -> bool:
-    """Whether an edit list hides frames (the container counts them, the demuxer drops them)."""
-    return stream.start_time is not None and stream.start_time < 0

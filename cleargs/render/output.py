@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.files import disk_error, sync_tree, whole_folder, write_json
+from cleargs.files import disk_errors, sync_tree, whole_folder, write_json
 from cleargs.media.encode import Codec, require_even, write_video
 from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, write_rgb
@@ -109,10 +109,8 @@ def write_shots(
     if kind == "film":
         require_even(camera.width, camera.height)
     photographer = Photographer(scene, device)
-    try:
+    with disk_errors(output):
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(error, output) from error
 
     def pictures() -> Iterator[Picture]:
         for shot in shots:
@@ -125,28 +123,23 @@ def write_shots(
         photographer.write(output, shots[0])
         task.advance()
     else:
-        _write_folder(output, photographer, shots, task)
-
-
-def _write_folder(output: Path, photographer: Photographer, shots: Sequence[Shot], task: Task) -> None:
-    """Write stills into a folder next to its place, and rename it when all are there."""
-    (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
-    named = [(f"{before}{digits % number}{after}", shot) for number, shot in enumerate(shots)]
-    with whole_folder(output.parent) as folder:
-        for name, shot in named:
-            photographer.write(folder / name, shot)
-            task.advance()
-        write_json(folder / "cameras.json", cameras_json([(name, shot.camera) for name, shot in named]))
-        sync_tree(folder)
+        (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
+        names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
+        with whole_folder(output.parent) as folder:
+            for name, shot in zip(names, shots, strict=True):
+                photographer.write(folder / name, shot)
+                task.advance()
+            cameras = cameras_json(list(zip(names, (shot.camera for shot in shots), strict=True)))
+            write_json(folder / "cameras.json", cameras)
+            sync_tree(folder)
 
 
 def _fitted(image: Picture, height: int, width: int) -> Picture:
     """``image`` at the place that `cleargs.render.paths.framed` gives its content, black around it."""
     scale = min(width / image.shape[1], height / image.shape[0])
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    wide, high = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    small = image if scale == 1 else cv2.resize(image, size, interpolation=way)
-    left, top = (width - size[0]) // 2, (height - size[1]) // 2
-    canvas = np.zeros((height, width, 3), np.uint8)
-    canvas[top : top + size[1], left : left + size[0]] = small
-    return canvas
+    small = cv2.resize(image, (wide, high), interpolation=way)
+    left, top = (width - wide) // 2, (height - high) // 2
+    borders = (top, height - high - top, left, width - wide - left)
+    return np.asarray(cv2.copyMakeBorder(small, *borders, cv2.BORDER_CONSTANT), np.uint8)

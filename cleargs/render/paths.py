@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera, look_at
@@ -50,8 +50,11 @@ def smooth_path(
     Raises InputError when no camera moves.
     """
     centres = np.stack([camera.centre for camera in cameras])
-    turns = Rotation.from_matrix([camera.world_to_camera[:3, :3].T for camera in cameras])
-    motion = _motion(centres, turns)
+    quaternions = Rotation.from_matrix([camera.world_to_camera[:3, :3].T for camera in cameras]).as_quat()
+    jumps = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0  # q and -q are the same turn
+    quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
+    path = np.hstack([centres, quaternions])
+    motion = _motion(path)
     kept = np.concatenate([[True], np.diff(motion) > 1e-9])
     if kept.sum() < 2:
         raise InputError(
@@ -60,18 +63,20 @@ def smooth_path(
         )
     numbers, motion = np.flatnonzero(kept), motion[kept]
     samples = np.linspace(0, motion[-1], max(_SAMPLES, 20 * len(cameras)))
-    width = len(samples) * np.clip(0.75 / (len(numbers) - 1), *_SMOOTHING)
-    centres = _filtered(_at(samples, motion, centres[kept]), width)
-    quaternions = Slerp(motion, turns[kept])(samples).as_quat()
-    jumps = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0  # q and -q are the same turn
-    quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
-    turns = Rotation.from_quat(_filtered(quaternions, width))
+    sigma = len(samples) * np.clip(0.75 / (len(numbers) - 1), *_SMOOTHING)
+    border = int(4 * sigma) + 1
+    path = _at(samples, motion, path[kept])
+    path = np.pad(path, ((border, border), (0, 0)), mode="reflect", reflect_type="odd")
+    path = gaussian_filter1d(path, sigma, axis=0)[border:-border]
     passed = np.interp(samples, motion, numbers)
 
-    motion = _motion(centres, turns)
+    motion = _motion(path)
     even = np.linspace(0, motion[-1], count)
-    nearest = np.rint(np.interp(even, motion, passed)).astype(np.int64)
-    return _poses(_at(even, motion, centres), Slerp(motion, turns)(even)), nearest
+    path = _at(even, motion, path)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(path[:, 3:]).inv().as_matrix()
+    poses[:, :3, 3] = -np.einsum("kij,kj->ki", poses[:, :3, :3], path[:, :3])
+    return poses, np.rint(np.interp(even, motion, passed)).astype(np.int64)
 
 
 def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
@@ -89,17 +94,17 @@ def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] 
     offsets = np.stack([camera.centre for camera in cameras]) - centre
     heights = offsets @ up
     away = offsets - heights[:, None] * up
+    radii = np.linalg.norm(away, axis=1)
     distance = float(np.median(np.linalg.norm(offsets, axis=1)))
-    radius = max(float(np.median(np.linalg.norm(away, axis=1))), _FLATTEST * distance)
-    ahead = _unit(away[np.argmax(np.linalg.norm(away, axis=1) > 1e-6 * distance)])
+    radius = max(float(np.median(radii)), _FLATTEST * distance)
+    ahead = _unit(away[np.argmax(radii > 1e-6 * distance)])
     aside = np.cross(up, ahead)
     phases = 2 * np.pi * np.arange(count) / count
-    seen = np.sort(np.arctan2(away @ np.cross(up, ahead), away @ ahead))
+    seen = np.sort(np.arctan2(away @ aside, away @ ahead))
     gaps = np.diff(seen, append=seen[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
-    if gaps[widest] <= WIDEST_GAP:
-        angles = phases
-    else:
+    angles = phases
+    if gaps[widest] > WIDEST_GAP:
         half = 0.5 * (2 * np.pi - gaps[widest])
         middle = seen[widest] - half
         first = min(0.0, -2 * np.pi, key=lambda angle: abs(angle - middle))  # where the first camera stands
@@ -153,32 +158,18 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _motion(centres: Array, turns: Rotation) -> Array:  # [N], from 0
-    """Motion up to each pose; see `smooth_path`."""
+def _motion(path: Array) -> Array:  # [N, 7] -> [N], from 0
+    """Motion up to each centre and quaternion; see `smooth_path`."""
+    centres, turns = path[:, :3], Rotation.from_quat(path[:, 3:])
     distance = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     angle = (turns[:-1].inv() * turns[1:]).magnitude()
     return np.concatenate([[0.0], np.cumsum(distance / max(extent, 1e-12) + angle / np.pi)])
 
 
-def _at(places: Array, motion: Array, values: Array) -> Array:
-    """``values`` [N, C] given at ``motion`` [N], at ``places`` [K]."""
-    return np.stack([np.interp(places, motion, column) for column in values.T], axis=1)
-
-
-def _filtered(values: Array, sigma: float) -> Array:
-    """``values`` [N, C] through a Gaussian of ``sigma`` samples, mirrored through the first and the last."""
-    border = int(4 * sigma) + 1
-    padded = np.pad(values, ((border, border), (0, 0)), mode="reflect", reflect_type="odd")
-    return np.asarray(gaussian_filter1d(padded, sigma, axis=0)[border:-border], np.float64)
-
-
-def _poses(centres: Array, turns: Rotation) -> Array:  # [K, 4, 4] world to camera
-    """Poses from centres [K, 3] and camera-to-world rotations."""
-    poses = np.tile(np.eye(4), (len(centres), 1, 1))
-    poses[:, :3, :3] = turns.inv().as_matrix()
-    poses[:, :3, 3] = -np.einsum("kij,kj->ki", poses[:, :3, :3], centres)
-    return poses
+def _at(places: Array, motion: Array, path: Array) -> Array:
+    """The rows of ``path`` [N, C], given at ``motion`` [N], at ``places`` [K]."""
+    return np.stack([np.interp(places, motion, column) for column in path.T], axis=1)
 
 
 def _unit(vector: Array) -> Array:

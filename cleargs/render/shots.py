@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
@@ -30,6 +29,9 @@ World = Literal["normalised", "input"]
 _OPENGL = np.array([1.0, -1.0, -1.0])
 """By what the axes of an OpenCV camera are multiplied to be those of an OpenGL one."""
 _HINT = "give cameras.json as `cleargs export` writes it, or transforms.json as nerfstudio does"
+
+_NERFSTUDIO = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+"""Field of transforms.json -> that of a camera."""
 
 Size = tuple[int, int]
 
@@ -52,16 +54,15 @@ class CaptureShots:
 
     def still(self, frame_id: int | None) -> list[Shot]:
         """At the pose of a frame; None: of the one in the middle of the capture."""
-        index = len(self._frames) // 2
-        if frame_id is not None:
-            numbers = [frame.frame_id for frame in self._frames]
-            if frame_id not in numbers:
-                there = any(frame.frame_id == frame_id for frame in self._all)
-                raise InputError(
-                    f"frame {frame_id} {'has no pose' if there else 'is not in this capture'}",
-                    hint=f"choose one from {numbers[0]} to {numbers[-1]}",
-                )
-            index = numbers.index(frame_id)
+        numbers = [frame.frame_id for frame in self._frames]
+        wanted = numbers[len(numbers) // 2] if frame_id is None else frame_id
+        if wanted not in numbers:
+            there = any(frame.frame_id == wanted for frame in self._all)
+            raise InputError(
+                f"frame {wanted} {'has no pose' if there else 'is not in this capture'}",
+                hint=f"choose one from {numbers[0]} to {numbers[-1]}",
+            )
+        index = numbers.index(wanted)
         return self._shots([self._cameras[index]], [self._frames[index]])
 
     def path(self, count: int) -> list[Shot]:
@@ -105,14 +106,13 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
     """
     try:
         document = read_json(path)
+        usual: World = "normalised" if isinstance(document, list) else "input"
         if isinstance(document, list):
-            usual: World = "normalised"
             listed = [_of_cameras_json(entry, lens, f"camera {n}") for n, entry in enumerate(document)]
         else:
-            usual, common = "input", {key: document[key] for key in document if key != "frames"}
+            frames = document.pop("frames")
             listed = [
-                _of_transforms({**common, **entry}, lens, f"frame {n}")
-                for n, entry in enumerate(document["frames"])
+                _of_transforms({**document, **entry}, lens, f"frame {n}") for n, entry in enumerate(frames)
             ]
         if not listed:
             raise ValueError("it lists no pose")
@@ -120,15 +120,19 @@ def read_poses(path: Path, lens: Camera, similarity: Similarity, world: World | 
         raise InputError(f"{path}: {error}", hint=error.hint) from error
     except FAULTS as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    normalised = (world or usual) == "normalised"
-    return [_posed(camera, pose if normalised else similarity.pose(pose)) for camera, pose in listed]
+    cameras = []
+    for camera, pose in listed:
+        moved = pose if (world or usual) == "normalised" else similarity.pose(pose)
+        matrix = np.vstack([np.column_stack([moved.rotation, moved.translation]), [0.0, 0.0, 0.0, 1.0]])
+        cameras.append(replace(camera, world_to_camera=matrix))
+    return cameras
 
 
 def _of_cameras_json(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[Camera, Pose]:
     """An entry in the layout of the Inria code: the camera's position, and its axes in the world."""
     axes = np.array(entry["rotation"], np.float64).reshape(3, 3) * _OPENGL
     matrix = np.column_stack([axes, np.array(entry["position"], np.float64).reshape(3)])
-    return _with_lens(lens, entry, "width", "height", "fx", "fy"), rigid_pose(matrix, name, _HINT)
+    return _with_lens(lens, entry), rigid_pose(matrix, name, _HINT)
 
 
 def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[Camera, Pose]:
@@ -136,23 +140,17 @@ def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[C
     matrix = np.array(entry["transform_matrix"], np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"the transform_matrix of {name} is not 4x4")
-    if "camera_angle_x" in entry and "fl_x" not in entry:
-        width = float(entry.get("w", lens.width))
-        entry = {**entry, "fl_x": 0.5 * width / math.tan(0.5 * float(entry["camera_angle_x"]))}
-    return _with_lens(lens, entry, "w", "h", "fl_x", "fl_y"), rigid_pose(matrix, name, _HINT)
+    values = {ours: entry[theirs] for theirs, ours in _NERFSTUDIO.items() if theirs in entry}
+    if "camera_angle_x" in entry and "fx" not in values:
+        half = math.tan(0.5 * float(entry["camera_angle_x"]))
+        values["fx"] = 0.5 * float(values.get("width", lens.width)) / half
+    return _with_lens(lens, values), rigid_pose(matrix, name, _HINT)
 
 
-def _with_lens(lens: Camera, entry: Mapping[str, Any], w: str, h: str, x: str, y: str) -> Camera:
-    """``lens`` with the size, focal lengths and principal point of ``entry``, under these names."""
-    width, height = int(entry.get(w, lens.width)), int(entry.get(h, lens.height))
-    scaled = lens if (width, height) == (lens.width, lens.height) else lens.resized(width, height)
-    fx = float(entry.get(x, scaled.fx))
-    fy = float(entry.get(y, fx if x in entry else scaled.fy))
-    cx, cy = float(entry.get("cx", scaled.cx)), float(entry.get("cy", scaled.cy))
-    return replace(scaled, fx=fx, fy=fy, cx=cx, cy=cy)
-
-
-def _posed(camera: Camera, pose: Pose) -> Camera:
-    matrix: NDArray[np.float64] = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
-    return replace(camera, world_to_camera=matrix)
+def _with_lens(lens: Camera, entry: Mapping[str, Any]) -> Camera:
+    """``lens`` with the size, focal lengths and principal point of ``entry``, as far as they are there."""
+    scaled = lens.resized(int(entry.get("width", lens.width)), int(entry.get("height", lens.height)))
+    numbers = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
+    if "fx" in numbers:
+        numbers.setdefault("fy", numbers["fx"])
+    return replace(scaled, **numbers)

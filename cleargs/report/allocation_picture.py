@@ -18,7 +18,7 @@ from cleargs.files import atomic_path
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import read_rgb
 from cleargs.parquet import read_table
-from cleargs.report.web_scene import camera_of
+from cleargs.report.frames import camera_of
 from cleargs.rva.allocation import Role, effective_sample_size
 from cleargs.rva.tables import BINS, FRAMES
 

@@ -11,8 +11,7 @@ import pyarrow as pa
 from matplotlib.ticker import MaxNLocator
 
 from cleargs.parquet import read_table
-from cleargs.report.frame_strip import FrameRow
-from cleargs.report.web_scene import camera_of
+from cleargs.report.frames import FrameRow, camera_of
 from cleargs.splat.tables import TRAIN
 
 WIDTH, HEIGHT = 640, 220
@@ -108,24 +107,21 @@ def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
 
 def fitted_bars(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
     """The figures of each frame's exposure, as far as they are known: frame id and value of each bar."""
-    figures: dict[tuple[str, str], list[float | None]] = {
-        ("Motion blur", "px"): [row.blur_px for row in rows],
-        ("Rolling shutter", "px"): [row.skew_px for row in rows],
-        ("Defocus", "px"): [row.formation.get("defocus_px") for row in rows],
-        ("Exposure", "stops"): [row.gain_ev for row in rows],
-    }
     bars = []
-    for (title, unit), found in figures.items():
-        numbered = zip((row.frame.frame_id for row in rows), found, strict=True)
-        known = [(frame_id, float(value)) for frame_id, value in numbered if value is not None]
+    for title, unit, found in (
+        ("Motion blur", "px", [row.motion("blur_px") for row in rows]),
+        ("Rolling shutter", "px", [row.motion("skew_px") for row in rows]),
+        ("Defocus", "px", [row.formation.get("defocus_px") for row in rows]),
+        ("Exposure", "stops", [row.gain_ev for row in rows]),
+    ):
+        numbered = zip(rows, found, strict=True)
+        known = [(row.frame.frame_id, float(value)) for row, value in numbered if value is not None]
         if not known:
             continue
-        values = np.array([value for _, value in known])
-        summary = f"median {np.median(values):.1f} {unit}, at most {values.max():.1f} {unit}"
+        values = [value for _, value in known]
+        summary = f"median {np.median(values):.1f} {unit}, at most {max(values):.1f} {unit}"
         if unit == "stops":
-            summary = f"from {values.min():+.2f} to {values.max():+.2f} {unit}"
-        low, high = min(0.0, float(values.min())), max(float(values.max()), 0.0) or 1.0
-        bars.append(
-            {"title": title, "unit": unit, "known": known, "low": low, "high": high, "summary": summary}
-        )
+            summary = f"from {min(values):+.2f} to {max(values):+.2f} {unit}"
+        span = {"low": min(0.0, *values), "high": max(0.0, *values) or 1.0}
+        bars.append({"title": title, "unit": unit, "known": known, "summary": summary, **span})
     return bars

@@ -2,61 +2,83 @@
 
 from __future__ import annotations
 
+import filecmp
+import json
 import os
 import shlex
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import tomli_w
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+from rich.filesize import decimal
 
+import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder
-from cleargs.formation.exposure import read_exposure
-from cleargs.manifest import Manifest
+from cleargs.manifest import Manifest, plain_json
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Run
 from cleargs.pipeline.settings import flattened
 from cleargs.report import charts
-from cleargs.report.frame_pictures import LAYERS, Image, Picture, write_jpeg, write_pictures
-from cleargs.report.frame_strip import MEANINGS, SCENES, FrameRow, load_rows, scores_of
-from cleargs.report.html import write_page
-from cleargs.report.report_json import LastRun, linked_manifests, noted, page_of, write_record
-from cleargs.report.verdict import judge
-from cleargs.report.web_scene import (
+from cleargs.report.frames import (
+    CHOICES,
+    LAYERS,
+    MEANINGS,
+    SCENES,
+    FrameRow,
+    Picture,
     camera_of,
-    level_camera,
-    opening,
-    viewer_pose,
-    viewer_settings,
-    write_scene,
-    write_viewer,
+    load_rows,
+    scores_of,
+    write_jpeg,
+    write_pictures,
 )
-from cleargs.report.words import duration, size
+from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
+from cleargs.report.verdict import judge
+from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
+from cleargs.report.words import duration
+from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
 from cleargs.splat.viewer import Viewer
 
-RENDERED = 40
-"""Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
-
 _STILL = 960  # px, long side of the pictures that stand for the viewers
-_SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
 
-TITLES = {
-    "before": ("Before", "trained on the frames as filmed"),
-    "after": ("After", "trained on, repairs included"),
-}
-"""The two scenes, and what each is."""
 
-UNCHANGED = "the same scene: no repair changed it"
-"""What the second is where it has the bytes of the first."""
+def write_page(folder: Path, template: str | Template, **values: Any) -> None:
+    """Write ``index.html`` into ``folder`` from one of the templates; all text in ``values`` is escaped."""
+    html = page_environment().get_template(template).render(version=cleargs.__version__, **values)
+    (folder / PAGE).write_bytes(html.encode())
 
-STATES = {"done": "up to date", "partial": "done in part", "missing": "to be made"}
-HOW = {"made": "made anew", "found": "found in the store"}
-"""What the last ``cleargs run`` did."""
+
+def json_in_html(value: Any) -> Markup:
+    """``value`` as JSON that is inert inside a script element, whatever its strings hold."""
+    text = json.dumps(plain_json(value), ensure_ascii=True, separators=(",", ":"))
+    for letter in "<>&":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)
+
+
+def page_environment() -> Environment:
+    """Return the templates of the report, with the filters and globals that they use."""
+    environment = Environment(
+        loader=PackageLoader("cleargs.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    static = files("cleargs.report").joinpath("static")
+    environment.filters |= {"json": json_in_html, "duration": duration, "bytes": decimal}
+    environment.globals["static"] = lambda name: Markup(static.joinpath(name).read_text(encoding="utf-8"))
+    environment.globals["weight_colour"] = charts.weight_colour
+    return environment
 
 
 def write_report(planner: Planner, last: LastRun | None = None) -> Path:
@@ -73,90 +95,75 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
     last = last or noted(run)
+    set_threads(planner.threads)
+    rows = load_rows(run, manifests)
+    placed = [row for row in rows if row.frame.registered]
+    trained = [stage for stage in SCENES if stage in manifests]
     with whole_folder(page_of(run).parent, replace=True) as folder:
-        _fill(folder, planner, manifests, last)
+        scenes, final = _scenes(folder, run, trained, placed) if trained and placed else ([], None)
+        pictures = write_pictures(rows, run, folder, final, planner.threads)
+        viewer, times = viewer_data(placed, scenes) if scenes else (None, {})
+        write_page(
+            folder,
+            "report.html.jinja",
+            name=run.name,
+            source=planner.run.source.name,
+            pictures=pictures,
+            verdict=judge(manifests, rows, planner.run.config),
+            scenes=scenes,
+            viewer=write_viewer(folder) if scenes else "",
+            plan=charts.plan_of(rows),
+            curves=charts.training_curves(run, trained),
+            bars=charts.fitted_bars(rows),
+            stages=planner.dag.names,
+            manifests=manifests,
+            plans=_plans(planner),
+            last=last,
+            settings=changed_settings(planner.run.config),
+            versions=_versions(manifests),
+            command=command(planner.run, planner.dag),
+            aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
+            data={
+                "layers": LAYERS,
+                "opening": {"left": "observed", "right": "final"},
+                "frames": [
+                    _frame_data(row, pictures[number][1], times.get(number))
+                    for number, row in zip(pictures, rows, strict=True)
+                ],
+                "viewer": viewer,
+            },
+        )
         write_record(folder, manifests, last)
     return page_of(run)
 
 
-def _fill(folder: Path, planner: Planner, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
-    """Write the page and all that it needs into ``folder``."""
-    run = planner.run.folder
-    set_threads(planner.threads)
-    trained = [stage for stage in SCENES if stage in manifests]
-    rows = load_rows(run, manifests)
-    placed = [row for row in rows if row.frame.registered]
-    scenes, renderer = _scenes(folder, run, {stage: manifests[stage] for stage in trained}, placed)
-    exposure = read_exposure(run / trained[-1] / "exposure.parquet") if trained else None
-
-    def render(row: FrameRow, side: int) -> Image:
-        camera = camera_of(row.frame)
-        assert renderer is not None and exposure is not None  # asked for only where there is a scene
-        smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-        return renderer.view(smaller, exposure.of(row.frame.frame_id))
-
-    shown = placed[:: -(-len(placed) // RENDERED) or 1] if renderer else []
-    rendered = frozenset(row.frame.frame_id for row in shown)
-    pictures = write_pictures(rows, run, folder, render, rendered, planner.threads)
-    times = {row.frame.frame_id: index * _SECONDS_A_FRAME for index, row in enumerate(placed)}
-    write_page(
-        folder,
-        "report.html.jinja",
-        name=run.name,
-        source=planner.run.source.name,
-        rows=rows,
-        pictures=pictures,
-        verdict=judge(manifests, rows, planner.run.config),
-        scenes=scenes,
-        viewer=write_viewer(folder) if scenes else "",
-        plan=charts.plan_of(rows),
-        curves=charts.training_curves(run, trained),
-        bars=charts.fitted_bars(rows),
-        stages=_stage_rows(planner.dag.names, manifests, _plans(planner), last.stages if last else {}),
-        total=duration(sum(manifest.seconds for manifest in manifests.values())),
-        memory=f"{last.peak_memory_gb:.1f} GB" if last else None,
-        device=list(manifests.values())[-1].device,
-        started=next(iter(manifests.values())).started.replace("T", " ").removesuffix("+00:00"),
-        settings=changed_settings(planner.run.config),
-        versions=_versions(manifests),
-        command=command(planner.run, planner.dag),
-        aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
-        data={
-            "layers": LAYERS,
-            "opening": {"left": "observed", "right": "final"},
-            "frames": [_frame_data(row, pictures[row.frame.frame_id][1], times) for row in rows],
-            "viewer": _viewer_data(placed, scenes) if scenes else None,
-        },
-    )
-
-
 def _scenes(
-    folder: Path, run: Path, trained: Mapping[str, Manifest], placed: Sequence[FrameRow]
-) -> tuple[list[dict[str, Any]], Viewer | None]:
-    """Write the first and the last scene, each with a still; returns what the page says of them, and what
-    renders the last."""
-    if not trained or not placed:
-        return [], None
-    first, *_, last = [*trained] * 2
+    folder: Path, run: Path, trained: Sequence[str], placed: Sequence[FrameRow]
+) -> tuple[list[dict[str, Any]], Viewer]:
+    """Write the first and the last scene, each with a still.
+
+    Returns the words of the page on them, and the renderer of the last.
+    """
+    camera = camera_of(opening(placed).frame)
+    factor = _STILL / max(camera.width, camera.height)
+    still = level_camera(camera, *(max(1, round(factor * side)) for side in (camera.width, camera.height)))
     views: list[dict[str, Any]] = []
-    start = placed[opening([row.weight or 0.0 for row in placed])]
-    for (key, (title, what)), stage in zip(TITLES.items(), (first, last), strict=True):
-        if views and trained[first].files["scene.ply"] == trained[last].files["scene.ply"]:
-            what = UNCHANGED
-        scene = read_ply(run / stage / "scene.ply")
+    for key, stage, what in (
+        ("before", trained[0], "trained on the frames as filmed"),
+        ("after", trained[-1], "trained on, repairs included"),
+    ):
+        file = run / stage / "scene.ply"
+        unchanged = views and filecmp.cmp(file, run / trained[0] / "scene.ply", shallow=False)
+        scene = read_ply(file)
         renderer = Viewer(scene)
-        camera = camera_of(start.frame)
-        longer = max(camera.width, camera.height)
-        size = [max(1, round(_STILL / longer * side)) for side in (camera.width, camera.height)]
-        still = renderer.view(level_camera(camera, *size))
         views.append(
             {
                 "key": key,
-                "title": title,
-                "what": what,
+                "title": key.capitalize(),
+                "what": "the same scene: no repair changed it" if unchanged else what,
                 "stage": stage,
                 "gaussians": scene.gaussians.num,
-                "still": write_jpeg(folder, f"{key}.jpg", still, _STILL),
+                "still": write_jpeg(folder, f"{key}.jpg", renderer.view(still), _STILL),
                 "sh_degree": scene.gaussians.sh_degree,
                 "shown_degree": write_scene(folder / f"scene-{key}.js", key, scene),
                 "antialias": scene.antialias,
@@ -173,38 +180,6 @@ def _plans(planner: Planner) -> dict[str, StagePlan]:
     except InputError as error:
         planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
         return {}
-
-
-# -- how the run came about ----------------------------------------------------------------------------------
-
-
-def _stage_rows(
-    names: Sequence[str],
-    manifests: Mapping[str, Manifest],
-    plans: Mapping[str, StagePlan],
-    last: Mapping[str, str],
-) -> list[dict[str, Any]]:
-    """What each stage cost, and whether its results are those of today's settings and input.
-
-    last: stage -> ``made`` or ``found``, as the last run had it.
-    """
-    total = sum(manifest.seconds for manifest in manifests.values()) or 1.0
-    rows = []
-    for name in names:
-        manifest, plan = manifests.get(name), plans.get(name)
-        rows.append(
-            {
-                "name": name,
-                "state": STATES[plan.state] if plan else "unknown",
-                "reasons": plan.reasons if plan else (),
-                "how": HOW.get(last.get(name, ""), ""),
-                "time": duration(manifest.seconds) if manifest else "",
-                "share": manifest.seconds / total if manifest else 0.0,
-                "size": size(manifest.bytes) if manifest else "",
-                "key": manifest.key[:12] if manifest else "",
-            }
-        )
-    return rows
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
@@ -249,64 +224,38 @@ def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return found
 
 
-# -- what the scripts of the page know ----------------------------------------------------------------------
-
-
-def _frame_data(row: FrameRow, layers: Mapping[str, Picture], times: Mapping[int, float]) -> dict[str, Any]:
-    found = {"blur, px": row.blur_px, "exposure, stops": row.gain_ev}
+def _frame_data(row: FrameRow, layers: Mapping[str, Picture], time: float | None) -> dict[str, Any]:
+    """All that the page says of a frame."""
+    lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
+    cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}
+    harms = {name.replace("_", " "): row.judged.get(f"b_{name}") for name in B_CUES}
+    cues |= {name: value for name, value in harms.items() if value is not None}
+    repair, why, scores = "none tried", "", {}
+    if row.selection:
+        words = CHOICES[row.selection.chosen]
+        repair = words if row.chosen else f"none: {words} was refused"
+        scores = dict(scores_of(row.selection))
+        metric, deciding = scores_of(row.selection)[0]
+        found = ", ".join(f"{name} {score:.1f}" for name, score in deciding.items())
+        why = f"{row.selection.reason}; {metric}: {found}"
+    fitted = {"blur, px": row.motion("blur_px"), "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,
         "name": row.frame.name,
         "role": row.role,
         "weight": row.weight,
         "figures": {name: row.judged[name] for name in "RBGCDOZ" if row.judged.get(name) is not None},
-        "cues": row.cues,
-        "repair": row.repair,
-        "why": row.why,
+        "cues": dict(sorted(cues.items(), key=lambda item: -item[1])),  # how bad, the worst first
+        "repair": repair,
+        "why": why,
         "chosen": row.selection.chosen if row.selection and row.selection.accepted else None,
-        "scores": dict(scores_of(row.selection)) if row.selection else {},
-        "found": {name: value for name, value in found.items() if value is not None},
+        "scores": scores,
+        "found": {name: value for name, value in fitted.items() if value is not None},
+        "model": row.formation.get("model"),
         "formation": [
             {"name": name.replace("_", " "), "value": value, "meaning": MEANINGS.get(name, "")}
             for name, value in row.formation.items()
         ],
         "layers": {name: picture.path for name, picture in layers.items()},
-        "time": times.get(row.frame.frame_id),
-    }
-
-
-def _viewer_data(placed: Sequence[FrameRow], scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The settings of the two viewers (SuperSplat Viewer's schema, version 2), and their scenes.
-
-    The trajectory is an animation track: its keys are the frames' poses, to which the page goes by time.
-    """
-    poses = [viewer_pose(camera_of(row.frame)) for row in placed]
-    start = opening([row.weight or 0.0 for row in placed])
-    track = {
-        "name": "trajectory",
-        "duration": max(_SECONDS_A_FRAME * len(poses), _SECONDS_A_FRAME),
-        "frameRate": 1 / _SECONDS_A_FRAME,
-        "loopMode": "none",
-        "interpolation": "spline",
-        "smoothness": 1,
-        "keyframes": {
-            "times": list(range(len(poses))),
-            "values": {
-                "position": [x for pose in poses for x in pose["position"]],
-                "target": [x for pose in poses for x in pose["target"]],
-                "fov": [pose["fov"] for pose in poses],
-            },
-        },
-    }
-    return {
-        "scenes": [{name: scene[name] for name in ("key", "antialias", "background")} for scene in scenes],
-        "start": start * _SECONDS_A_FRAME,
-        "settings": {
-            **viewer_settings(),
-            "background": {"color": list(scenes[-1]["background"])},
-            "animTracks": [track],
-            "cameras": [{"initial": poses[start]}],
-            "annotations": [],
-            "startMode": "animTrack",
-        },
+        "time": time,
     }

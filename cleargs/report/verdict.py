@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
-from cleargs.report.frame_strip import HELD_OUT, UNPLACED, FrameRow, last_scene
+from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
 from cleargs.report.words import count, decibel
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
@@ -52,12 +52,9 @@ class Verdict(NamedTuple):
 
 
 def judge(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> Verdict:
-    """The verdict on a run that shows these ``manifests``."""
+    """Return the verdict on a run that shows these ``manifests``."""
     run = _Run(manifests, rows, config)
-    warnings = (*run.parts_missing(), *run.capture_warnings(), *run.allocation_warnings())
-    if "g0" in manifests:
-        warnings += (*run.scene_warnings(),)
-    return Verdict(*run.headline(), run.text(), tuple(run.figures()), warnings)
+    return Verdict(*run.headline(), run.text(), tuple(run.figures()), tuple(run.warnings()))
 
 
 class _Run:
@@ -67,6 +64,10 @@ class _Run:
         self._manifests, self._rows, self._config = manifests, rows, config
         self._placed = [row for row in rows if row.frame.registered]
         self._unused = sum(row.weight == 0.0 for row in self._placed)
+        # PSNR of the first scene on the best frames of its training, dB, and the name of these frames.
+        self._psnr, self._judged_on = self._figure("g0", "psnr_strong"), "the trusted training frames"
+        if self._psnr is None:
+            self._psnr, self._judged_on = self._figure("g0", "psnr_active"), "its training frames"
 
     def _figure(self, stage: str, *path: str) -> Any:
         """A figure that a stage reported; None without the stage or the figure."""
@@ -75,13 +76,6 @@ class _Run:
             value = value.get(name) if isinstance(value, Mapping) else None
         return value
 
-    def _training_psnr(self) -> tuple[float | None, str]:
-        """PSNR of the first scene on the best frames of its training, dB, and what these are called."""
-        strong = self._figure("g0", "psnr_strong")
-        if strong is not None:
-            return strong, "the trusted training frames"
-        return self._figure("g0", "psnr_active"), "its training frames"
-
     def _setting(self, section: str, name: str) -> Any:
         return getattr(self._config.sections[section], name)
 
@@ -89,30 +83,27 @@ class _Run:
         """The tone and the first line."""
         if "g0" not in self._manifests:
             return "fair", "The capture is prepared; no scene is trained yet."
-        psnr, frames = self._training_psnr()
-        if psnr is None:
+        if self._psnr is None:
             return "fair", "The scene is trained."
-        follows = f"The first scene follows {frames}"
-        if psnr >= CLOSE_DB:
+        follows = f"The first scene follows {self._judged_on}"
+        if self._psnr >= CLOSE_DB:
             return "good", f"{follows} closely."
-        if psnr >= LOOSE_DB:
+        if self._psnr >= LOOSE_DB:
             return "fair", f"{follows} fairly closely."
         return "poor", f"{follows} only loosely."
 
     def text(self) -> str:
         """The lines under the headline."""
-        frames = count(len(self._rows), "frame")
-        parts = [f"{len(self._placed)} of {frames} found their place in the scene"]
+        parts = [f"{len(self._placed)} of {count(len(self._rows), 'frame')} found their place in the scene"]
         if strong := sum(row.role == "strong" for row in self._rows):
             parts[0] += f", {strong} of them sharp and reliable enough to lead the training"
         if self._unused:
             parts.append(f"{count(self._unused, 'frame')} took no part in it")
-        if harm := self._harm():
-            parts.append(harm)
-        return ". ".join(part[:1].upper() + part[1:] for part in parts) + "."
+        parts.append(self._harm())
+        return " ".join(f"{part[0].upper()}{part[1:]}." for part in parts if part)
 
     def _harm(self) -> str:
-        """What the repairs did to frames that no repair was trained on; "" where it is unknown."""
+        """The effect of the repairs on frames that no repair was trained on; "" where it is unknown."""
         stage = "consolidate" if "consolidate" in self._manifests else "rivr"
         before, after = (self._figure(stage, "held_back", f"psnr_{when}") for when in ("before", "after"))
         if before is None or after is None:
@@ -135,10 +126,10 @@ class _Run:
             active = sum(bool(row.weight) for row in self._rows)
             whole = f"as much as {self._figure('rva', 'effective_frames'):.1f} whole ones together"
             yield f"{active}", "frames train the scene", whole
-        psnr, frames = self._training_psnr()
-        if psnr is not None:
+        if self._psnr is not None:
             rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
-            yield decibel(psnr), f"on {frames}", f"PSNR of the first scene on training poses; {rule}"
+            note = f"PSNR of the first scene on training poses; {rule}"
+            yield decibel(self._psnr), f"on {self._judged_on}", note
         unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
         if unseen is not None:
             note = "PSNR of the last scene on a hundredth of every frame; views off the path are worse"
@@ -148,14 +139,18 @@ class _Run:
             views = "repaired views" if repairs != 1 else "repaired view"
             yield str(repairs), views, "carried into the final scene"
 
-    def parts_missing(self) -> Iterator[Caution]:
-        """Stages that are done only in part."""
+    def warnings(self) -> Iterator[Caution]:
+        """All cautions, in the order of the stages."""
         for manifest in self._manifests.values():
             for missing in manifest.missing:
                 yield Caution(f"{manifest.stage} is done only in part", missing)
+        yield from self._of_capture()
+        yield from self._of_allocation()
+        if "g0" in self._manifests:
+            yield from self._of_scenes()
 
-    def capture_warnings(self) -> Iterator[Caution]:
-        """What the frames and their poses lack."""
+    def _of_capture(self) -> Iterator[Caution]:
+        """The faults of the frames and their poses."""
         rows = self._rows
         unplaced = sum(row.role == UNPLACED for row in rows)
         available = self._figure("ingest", "frames_available") or 0
@@ -181,18 +176,15 @@ class _Run:
             why = "All figures here are of frames that the scene has seen; new views may look worse."
             yield Caution("No frame was held out", why, ("ingest.holdout=every:8",))
 
-    def allocation_warnings(self) -> Iterator[Caution]:
-        """What RVA found wanting."""
-        tau = {name: self._setting("rva", name) for name in ("tau_R", "tau_B")}
+    def _of_allocation(self) -> Iterator[Caution]:
+        """The faults that RVA found."""
+        lower = f"rva.tau_R={max(self._setting('rva', 'tau_R') - 0.1, 0.0):.2f}"
         if self._figure("rva", "stand_in"):
             yield Caution(
                 "No frame counts as reliable",
                 "The best of them are used instead. Thresholds nearer to this capture would separate good "
                 "frames from bad ones.",
-                (
-                    f"rva.tau_R={max(tau['tau_R'] - 0.1, 0.0):.2f}",
-                    f"rva.tau_B={min(tau['tau_B'] + 0.1, 1.0):.2f}",
-                ),
+                (lower, f"rva.tau_B={min(self._setting('rva', 'tau_B') + 0.1, 1.0):.2f}"),
             )
         if uncovered := self._figure("rva", "bins_uncovered_before"):
             yield Caution(
@@ -202,20 +194,15 @@ class _Run:
             )
         weighted = sum(row.weight is not None for row in self._placed)
         if weighted and self._unused > MANY_UNUSED * weighted:
-            yield Caution(
-                f"{self._unused} of {weighted} placed frames are unused",
-                "A lower threshold of reliability lets more of them in.",
-                (f"rva.tau_R={max(0.0, tau['tau_R'] - 0.1):.2f}",),
-            )
-        blurred = sum((row.blur_px or 0.0) > SOFT_PX for row in self._rows)
+            why = "A lower threshold of reliability lets more of them in."
+            yield Caution(f"{self._unused} of {weighted} placed frames are unused", why, (lower,))
+        blurred = sum((row.motion("blur_px") or 0.0) > SOFT_PX for row in self._rows)
         if blurred > len(self._rows) / 2:
-            yield Caution(
-                f"{count(blurred, 'frame')} moved by more than {SOFT_PX:g} px while exposed",
-                "A shorter exposure or a slower hand gives sharper frames than any repair.",
-            )
+            what = f"{count(blurred, 'frame')} moved by more than {SOFT_PX:g} px while exposed"
+            yield Caution(what, "A shorter exposure or a slower hand gives sharper frames than any repair.")
 
-    def scene_warnings(self) -> Iterator[Caution]:
-        """What the trainings found wanting."""
+    def _of_scenes(self) -> Iterator[Caution]:
+        """The faults that the trainings found."""
         psnr = self._figure("g0", "psnr_strong")
         if psnr is not None and psnr < CLOSE_DB:
             size = self._setting("ingest", "max_size") * 3 // 2

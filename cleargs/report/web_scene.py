@@ -9,26 +9,26 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from cleargs.capture.tables import Frame
+from cleargs.report.frames import FrameRow, camera_of
 from cleargs.splat.camera import Camera, look_at
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.constants import SH_DEGREES
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import view_of
 
 BYTES = 10_000_000
 """Most that a scene of up to half a million Gaussians may take; SH degrees that do not fit are left out."""
 
 _VIEWER = Path(__file__).parent / "static" / "viewer"
 _TURN = np.array([-1.0, -1.0, 1.0])
+_SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
 _INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
 _BASE64, _GZIP = 4 / 3, 0.9  # at worst, of what was measured on trained scenes
 
@@ -64,18 +64,8 @@ def write_viewer(folder: Path) -> str:
     return (_VIEWER / "VERSION").read_text(encoding="utf-8").strip()
 
 
-def viewer_settings() -> dict[str, Any]:
-    """The viewer's settings that are the same in all reports."""
-    return dict(json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8")))
-
-
 def _script(name: str, packed: bytes) -> bytes:
     return b'(window.packed ??= {})["%s"] = "%s";\n' % (name.encode(), base64.b64encode(packed))
-
-
-def camera_of(frame: Frame) -> Camera:
-    """The camera of a registered frame."""
-    return view_of(frame, Path(), 0.0).camera
 
 
 def viewer_pose(camera: Camera) -> dict[str, Any]:
@@ -98,7 +88,50 @@ def level_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 
 
-def opening(weights: Sequence[float]) -> int:
-    """The registered frame that the viewers open at: of the heaviest, the one halfway along."""
-    heaviest = [index for index, weight in enumerate(weights) if weight >= 0.95 * max(weights)]
+def opening(placed: Sequence[FrameRow]) -> FrameRow:
+    """The frame that the viewers open at: of the heaviest, the one halfway along."""
+    weights = [row.weight or 0.0 for row in placed]
+    heaviest = [row for row, weight in zip(placed, weights, strict=True) if weight >= 0.95 * max(weights)]
     return heaviest[len(heaviest) // 2]
+
+
+def viewer_data(
+    placed: Sequence[FrameRow], scenes: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, Any], dict[int, float]]:
+    """The settings of the two viewers (SuperSplat Viewer's schema, version 2), and their scenes.
+
+    The trajectory is an animation track: its keys are the frames' poses, to which the page goes by the times
+    that are also returned, by frame.
+    """
+    poses = {row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed}
+    times = {frame_id: index * _SECONDS_A_FRAME for index, frame_id in enumerate(poses)}
+    start = opening(placed).frame.frame_id
+    track = {
+        "name": "trajectory",
+        "duration": _SECONDS_A_FRAME * len(poses),
+        "frameRate": 1 / _SECONDS_A_FRAME,
+        "loopMode": "none",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": list(range(len(poses))),
+            "values": {
+                "position": [x for pose in poses.values() for x in pose["position"]],
+                "target": [x for pose in poses.values() for x in pose["target"]],
+                "fov": [pose["fov"] for pose in poses.values()],
+            },
+        },
+    }
+    data = {
+        "scenes": [{name: scene[name] for name in ("key", "antialias", "background")} for scene in scenes],
+        "start": times[start],
+        "settings": {
+            **json.loads((_VIEWER / "settings.json").read_text(encoding="utf-8")),
+            "background": {"color": list(scenes[-1]["background"])},
+            "animTracks": [track],
+            "cameras": [{"initial": poses[start]}],
+            "annotations": [],
+            "startMode": "animTrack",
+        },
+    }
+    return data, times

@@ -120,6 +120,13 @@ def test_frames_at_one_place_and_repeated_frames() -> None:
         smooth_path([cameras[0]] * 4, 20)
 
 
+def test_a_camera_goes_to_and_fro() -> None:
+    there = handheld(1, 4)
+    poses, _ = smooth_path([*there, *there[-2::-1]], 41)
+    assert np.isfinite(poses).all()
+    np.testing.assert_allclose(poses, poses[::-1], atol=1e-9)
+
+
 def test_opposite_signs_of_a_quaternion_are_one_turn() -> None:
     """Two and a half turns about one axis: every step goes the same way round."""
     angles = np.linspace(0, 900, 60)

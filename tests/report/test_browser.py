@@ -14,8 +14,9 @@ from report_run import HOSTILE, FinishedRun
 from cleargs.capture.tables import load_frames
 from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
+from cleargs.report.frames import camera_of
 from cleargs.report.page import write_report
-from cleargs.report.web_scene import camera_of, level_camera
+from cleargs.report.web_scene import level_camera
 from cleargs.splat.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]

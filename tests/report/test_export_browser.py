@@ -15,7 +15,8 @@ from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
 from cleargs.cli.main import invoke
-from cleargs.report.web_scene import camera_of, level_camera, viewer_pose, write_viewer
+from cleargs.report.frames import camera_of
+from cleargs.report.web_scene import level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
 from cleargs.splat.viewer import Viewer
 

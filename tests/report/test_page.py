@@ -26,9 +26,8 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import Outcome
 from cleargs.pipeline.store import Store
 from cleargs.report.charts import weight_colour
-from cleargs.report.frame_strip import UNPLACED
-from cleargs.report.html import json_in_html
-from cleargs.report.page import changed_settings, command, write_report
+from cleargs.report.frames import FrameRow
+from cleargs.report.page import changed_settings, command, json_in_html, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import judge
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
@@ -217,9 +216,7 @@ def test_weights_run_from_amber_to_teal() -> None:
 
 def test_advice_is_only_what_can_help() -> None:
     def advice(frames: int, available: int, *settings: str) -> list[str]:
-        lost = SimpleNamespace(
-            role=UNPLACED, frame=SimpleNamespace(registered=False), weight=None, blur_px=None
-        )
+        lost = FrameRow(SimpleNamespace(registered=False))  # type: ignore[arg-type]
         manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
         rows: Any = [lost] * frames
         judged = judge(manifests, rows, load_config(installed(), "default", settings))
