@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.folders import chosen, name_below_images, natural_key
@@ -270,10 +271,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         if stems[stem] > 1:  # as of the cameras of a rig, in folders of their own
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
-        mask = None if frame.mask is None else ingest / frame.mask
-        stored = SourceFrame(stem, ingest / frame.image, mask=mask)
-        load = partial(_load, stored, (frame.width, frame.height), None)
-        views.append(ReferenceView(stem, view.camera, load))
+        views.append(ReferenceView(stem, view.camera, view.load))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
@@ -327,28 +325,27 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
         way = way_of(lens)
         flat = way.pinhole
         camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, np.eye(4))
-        load = partial(_load, entry, (lens.width, lens.height), way)
-        view = ReferenceView(stem_of(entry.name), camera, load).at(pose)
+        view = ReferenceView(stem_of(entry.name), camera, partial(_load, entry, lens, way)).at(pose)
         views.append((view.name, view))
     return _by_stem(views)
 
 
-def _load(frame: SourceFrame, size: tuple[int, int], way: Undistorter | None) -> tuple[Pixels, Mask | None]:
-    """The pinhole image of a reference whose file should have ``size`` (width, height), and its mask."""
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[Pixels, Mask | None]:
+    """The pinhole image of a reference, and its mask."""
     image, stencil = read_image(frame), read_stencil(frame)
-    if image.shape[1::-1] != size:
+    if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
-            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels, its camera {size[0]}x{size[1]}",
+            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels, "
+            f"its camera {lens.width}x{lens.height}",
             hint="give the images at the size that transforms.json states (w, h)",
         )
     if stencil is not None and stencil.shape != image.shape[:2]:
         raise InputError(
             f"the mask {frame.mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "
-            f"its image {size[0]}x{size[1]}",
+            f"its image {lens.width}x{lens.height}",
             hint="make masks of the size of their images",
         )
-    if way is not None:
-        image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
+    image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
     if min(image.shape[:2]) < MIN_SIDE:
         raise InputError(
             f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be judged",
