@@ -157,13 +157,22 @@ def _shares(database: Path) -> list[Path]:
 def _gather(database: Path, share: Path) -> None:
     """Copy the matches in ``share`` to ``database``. Raises sqlite3.DatabaseError, and copies none, where one
     cannot be read or the other not be written."""
+    if not is_sound(share):
+        raise sqlite3.DatabaseError(f"{share} is damaged")
     with closing(sqlite3.connect(database)) as opened:
         opened.execute("ATTACH ? AS share", (str(share),))
-        if opened.execute("PRAGMA share.integrity_check").fetchone() != ("ok",):
-            raise sqlite3.DatabaseError(f"{share} is damaged")
         for table in ("matches", "two_view_geometries"):
             opened.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table}")
         opened.commit()
+
+
+def is_sound(database: Path) -> bool:
+    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
+    try:
+        with closing(sqlite3.connect(database)) as opened:
+            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def remove_database(database: Path) -> None:
