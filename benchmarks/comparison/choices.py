@@ -16,7 +16,7 @@ from cleargs.media.exr import from_layer, read_exr
 from cleargs.parquet import read_table
 from cleargs.record import Record
 from cleargs.rivr.tables import read_selection
-from cleargs.synth.develop import FRAMES
+from cleargs.synth.synthetic_capture import FRAMES
 
 Image = NDArray[np.float32]
 Distance = Callable[[Image, Image], float]

@@ -68,7 +68,7 @@ def _check(run: Path, dag: Dag) -> Check:
     from cleargs.parquet import read_table
     from cleargs.rva.arrays import Floats
     from cleargs.rva.tables import B_CUES, FRAMES
-    from cleargs.synth.develop import FRAMES as TRUE_FRAMES
+    from cleargs.synth.synthetic_capture import FRAMES as TRUE_FRAMES
 
     source = read_run_file(run, dag).source
     if linked_manifest(run, "rva") is None:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol
 
 from cleargs.capture.config import CaptureConfig
+from cleargs.files import External as External
 
 if TYPE_CHECKING:
     from cleargs.capture.cameras import Camera, Pose
     from cleargs.capture.model import SparseModel
-
-External: TypeAlias = Path | Mapping[str, Path]
-"""Files that are read of an input: one file, all of a folder that are not hidden, or single ones by name."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 The child writes JSON objects, one a line, to its standard output: ``{"phase": label, "total": n}`` opens
 a phase, ``{"done": k}`` moves it, ``{"error": cause, "hint": remedy}`` ends in failure. Its standard error
-(COLMAP's log) goes to a file. It dies with its parent: it watches its standard input, whose other end closes
-when the parent is gone, however it went.
+(COLMAP's log) goes to a file. It and the processes that it started die with its parent: it watches its
+standard input, whose other end closes when the parent is gone, however it went.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from cleargs.children import module_command
@@ -32,7 +32,8 @@ _FULL = 8 * 2**20
 def reports_to_parent() -> Callable[..., None]:
     """Take standard output for reports alone, and return the function that sends one, given by name.
 
-    Whatever a library prints goes to the log instead. From now on this process dies when its parent does.
+    Whatever a library prints goes to the log instead. From now on the group of this process dies when its
+    parent does.
     """
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -44,7 +45,7 @@ def _die_with_parent() -> None:
     # Not sys.stdin: its lock, held by this thread, would abort the interpreter's shutdown.
     while os.read(0, 1024):
         pass
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.killpg(0, signal.SIGKILL)
 
 
 def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
@@ -52,7 +53,7 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
 
     Raises StageError with the child's own cause, or with the last failed check in ``log`` when it aborted;
     StoreError where the disk is full.
-    Whatever ends this call early (Ctrl-C above all) kills the child first.
+    Whatever ends this call early (Ctrl-C above all) kills the child, and what it started, first.
     """
     # Sums in COLMAP's and numpy's linear algebra must not depend on threads. Features of several frames at a
     # time are found by threads of COLMAP's own, matches by processes, as many as the job says.
@@ -75,18 +76,18 @@ def run_child(module: str, job: Path, log: Path, reporter: Reporter) -> None:
         try:
             failure = _follow(child, reporter)
             status = child.wait()
-        except BaseException:
-            if child.poll() is None:
+        finally:
+            with suppress(OSError):  # none of them is left
                 os.killpg(child.pid, signal.SIGKILL)
-            raise
     # On a full disk, COLMAP and SQLite fail at whatever they were doing.
     if status != 0 and shutil.disk_usage(log.parent).free < _FULL:
         raise disk_error(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), log)
     if failure is not None:
         raise failure
     if status != 0:
+        reason = f"exit {status}" if status > 0 else signal.strsignal(-status)
         raise StageError(
-            f"COLMAP stopped ({_exit_reason(status)}): {_last_failure(log)}",
+            f"COLMAP stopped ({reason}): {_last_failure(log)}",
             hint="try other images, another ingest.camera_model or fewer ingest.max_features",
         )
 
@@ -107,15 +108,6 @@ def _follow(child: subprocess.Popen[str], reporter: Reporter) -> StageError | No
             elif task is not None:
                 task.update(done=message["done"])
     return failure
-
-
-def _exit_reason(status: int) -> str:
-    if status >= 0:
-        return f"exit {status}"
-    try:
-        return signal.Signals(-status).name
-    except ValueError:
-        return f"signal {-status}"
 
 
 def _last_failure(log: Path) -> str:

@@ -11,14 +11,12 @@ database. Its matches are gathered in the end, or by the next run when this one 
 from __future__ import annotations
 
 import os
-import signal
 import sqlite3
-import threading
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, suppress
 from functools import partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -125,25 +123,13 @@ def match_pairs(
     size = min(_PAIRS_PER_BLOCK, max(1, -(-len(todo) // processes)))
     lines = [f"{names[i]} {names[j]}\n" for i, j in todo]
     blocks = [lines[start : start + size] for start in range(0, len(lines), size)]
-    with ProcessPoolExecutor(processes, get_context("spawn"), _end_with_parent) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         for count in pool.map(partial(_match_block, database, seed), blocks):
             through += count
             done(through)
     for share in _shares(database):
         _gather(database, share)
         remove_database(share)
-
-
-def _end_with_parent() -> None:
-    """Let this process end when its parent does, however that went."""
-
-    def wait() -> None:
-        parent = parent_process()
-        assert parent is not None
-        parent.join()
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 def _match_block(database: Path, seed: int, block: Sequence[str]) -> int:
@@ -171,13 +157,22 @@ def _shares(database: Path) -> list[Path]:
 def _gather(database: Path, share: Path) -> None:
     """Copy the matches in ``share`` to ``database``. Raises sqlite3.DatabaseError, and copies none, where one
     cannot be read or the other not be written."""
+    if not is_sound(share):
+        raise sqlite3.DatabaseError(f"{share} is damaged")
     with closing(sqlite3.connect(database)) as opened:
         opened.execute("ATTACH ? AS share", (str(share),))
-        if opened.execute("PRAGMA share.integrity_check").fetchone() != ("ok",):
-            raise sqlite3.DatabaseError(f"{share} is damaged")
         for table in ("matches", "two_view_geometries"):
             opened.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table}")
         opened.commit()
+
+
+def is_sound(database: Path) -> bool:
+    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
+    try:
+        with closing(sqlite3.connect(database)) as opened:
+            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def remove_database(database: Path) -> None:

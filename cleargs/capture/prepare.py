@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,13 +47,19 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
     make_folder(masks)
     names = [f"{index:06d}.png" for index in range(len(capture.frames))]
     with reporter.task("reading frames", len(names)) as task:
-        if capture.kind == "video":
-            _decode_video(capture, images, names, long_side, task.advance, reporter)
-        else:
-            for frame, name in zip(capture.frames, names, strict=True):
-                if not resumable(images / name, reporter):
-                    write_rgb(images / name, reduced(_upright(frame), long_side))
+        todo = {}
+        for frame, name in zip(capture.frames, names, strict=True):
+            if resumable(images / name, reporter):
                 task.advance()
+            else:
+                todo[name] = frame
+        if capture.kind == "video":
+            pictures = _decoded(capture.frames[0].path, todo)
+        else:
+            pictures = ((name, read_image(frame)) for name, frame in todo.items())
+        for name, rgb in pictures:
+            write_rgb(images / name, reduced(rgb, long_side))
+            task.advance()
     prepared = [
         _work_frame(frame, images / name, masks / f"{name}.png", reporter)
         for frame, name in zip(capture.frames, names, strict=True)
@@ -99,28 +105,14 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decode_video(
-    capture: Capture,
-    images: Path,
-    names: list[str],
-    long_side: int,
-    advance: Callable[[], None],
-    reporter: Reporter,
-) -> None:
-    todo: dict[int, Path] = {}
-    for frame, name in zip(capture.frames, names, strict=True):
-        assert frame.pts is not None
-        if resumable(images / name, reporter):
-            advance()
-        else:
-            todo[frame.pts] = images / name
-    if todo:
-        for pts, rgb in decode_frames(capture.frames[0].path, todo):
-            write_rgb(todo[pts], reduced(rgb, long_side))
-            advance()
+def _decoded(video: Path, frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """The names and pictures of these frames of a video, in its order."""
+    names = {frame.pts: name for name, frame in frames.items() if frame.pts is not None}
+    if names:
+        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, names))
 
 
-def _upright(frame: SourceFrame) -> NDArray[np.uint8]:
+def read_image(frame: SourceFrame) -> NDArray[np.uint8]:  # [H, W, 3]
     """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
     return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
@@ -149,7 +141,7 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
                 hint="give the images that the poses were made from, or set ingest.poses=sfm",
             )
         camera = camera.resized(width, height)
-    stencil = _stencil(frame)
+    stencil = read_stencil(frame)
     if stencil is not None and not resumable(mask, reporter, read_mask):
         # To whole pixels, a mask of one pixel has any proportions.
         coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
@@ -163,7 +155,7 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
     return WorkFrame(frame, image.name, width, height, stencil is not None, camera)
 
 
-def _stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
+def read_stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
     """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
     if frame.mask is not None:
         return read_mask(frame.mask)

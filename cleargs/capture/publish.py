@@ -174,6 +174,6 @@ def _frame_row(
         "placed": placed,
     }
     if image is not None:
-        row.update(zip(("qw", "qx", "qy", "qz"), image.pose.quaternion, strict=True))
-        row.update(zip(("tx", "ty", "tz"), image.pose.translation.tolist(), strict=True))
+        pose = (*image.pose.quaternion, *image.pose.translation.tolist())
+        row.update(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), pose, strict=True))
     return row

@@ -6,9 +6,7 @@ COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +15,7 @@ import numpy as np
 from cleargs.capture.cameras import Camera, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
-from cleargs.capture.matching import remove_database
+from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_worker import OUTCOME, Job, Outcome
@@ -179,7 +177,7 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | 
         except InputError as error:
             reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
             remove(model)
-    if database.exists() and not _sound(database):
+    if database.exists() and not is_sound(database):
         reporter.warn("the damaged features of an interrupted run are found again")
         remove_database(database)
     return None
@@ -191,15 +189,6 @@ def _read(folder: Path) -> tuple[SparseModel, Outcome]:
         return read_model(folder), Outcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
         raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
-
-
-def _sound(database: Path) -> bool:
-    """Whether SQLite finds every page of ``database`` in order; COLMAP would abort at one that is not."""
-    try:
-        with closing(sqlite3.connect(database)) as opened:
-            return bool(opened.execute("PRAGMA integrity_check").fetchone() == ("ok",))
-    except sqlite3.Error:
-        return False
 
 
 def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, str]:

@@ -16,7 +16,7 @@ import filecmp
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
 
 import numpy as np
@@ -228,15 +228,15 @@ class _Sfm:
 
     def _pairs(self) -> list[tuple[int, int]]:
         """All pairs of frames, or neighbours and distant frames that look alike."""
-        count, config = len(self._job.names), self._job.config
-        if count < config.exhaustive_below:
-            return list(combinations(range(count), 2))
-        near = sequential_pairs(count, config.overlap)
+        frames, config = len(self._job.names), self._job.config
+        if frames < config.exhaustive_below:
+            return list(combinations(range(frames), 2))
+        near = sequential_pairs(frames, config.overlap)
         if not config.loop_candidates:
             return near
         self._report(phase="looking for loops", total=None)
         with pycolmap.Database.open(self._database) as opened:
-            descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(count)]
+            descriptors = [np.asarray(opened.read_descriptors(index + 1).data) for index in range(frames)]
         loops = loop_pairs(descriptors, config.loop_candidates, 2 * config.overlap, self._job.seed)
         return sorted({*near, *loops})
 
@@ -249,25 +249,14 @@ class _Sfm:
         # COLMAP's 1.1 adjusts the whole model after every tenth frame more: half as much again, equal errors.
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         self._report(phase="reconstructing", total=total)
-        registered = 0
-
-        def started() -> None:
-            nonlocal registered
-            registered = 2
-            self._report(done=registered)
-
-        def registered_next() -> None:
-            nonlocal registered
-            registered = min(registered + 1, total)
-            self._report(done=registered)
-
+        registered = count(3)  # after the first pair
         models = pycolmap.incremental_mapping(
             self._database,
             self._job.images,
             self._output,
             options,
-            initial_image_pair_callback=started,
-            next_image_callback=registered_next,
+            initial_image_pair_callback=lambda: self._report(done=2),
+            next_image_callback=lambda: self._report(done=min(next(registered), total)),
         )
         if not models:
             raise StageError(

@@ -8,9 +8,11 @@ from pathlib import Path
 from cleargs.capture.capture import Capture, External, Layout
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.layouts import colmap, images, llff, transforms, video
-from cleargs.capture.layouts.video import MIN_FRAMES
 from cleargs.errors import InputError
 from cleargs.plugins import load_part
+
+MIN_FRAMES = 3
+"""Two frames have no third to confirm what they see."""
 
 LAYOUTS: tuple[Layout, ...] = (video, transforms, colmap, llff, images)
 
@@ -42,8 +44,8 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     capture = layout_of(source, config).open_capture(source, config)
     if len(capture.frames) < MIN_FRAMES:
         raise InputError(
-            f"{source} has {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
-            hint="give more images, or raise ingest.fps",
+            f"{source} gives {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",
+            hint="give more images, record longer, or raise ingest.fps",
         )
     return capture
 

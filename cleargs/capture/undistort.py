@@ -96,8 +96,8 @@ def _covered(lens: Camera) -> tuple[float, float, float, float]:
     left, right = edge(zero, t)[:, 0], edge(one, t)[:, 0]
     top, bottom = edge(t, zero)[:, 1], edge(t, one)[:, 1]
     return (
-        float(max(left.max(initial=-MAX_TANGENT), -MAX_TANGENT)),
-        float(max(top.max(initial=-MAX_TANGENT), -MAX_TANGENT)),
-        float(min(right.min(initial=MAX_TANGENT), MAX_TANGENT)),
-        float(min(bottom.min(initial=MAX_TANGENT), MAX_TANGENT)),
+        float(left.max(initial=-MAX_TANGENT)),
+        float(top.max(initial=-MAX_TANGENT)),
+        float(right.min(initial=MAX_TANGENT)),
+        float(bottom.min(initial=MAX_TANGENT)),
     )

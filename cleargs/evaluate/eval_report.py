@@ -14,13 +14,21 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.files import disk_error, write_json
+from cleargs.files import disk_errors, write_json
 from cleargs.parquet import column, write_table
 from cleargs.record import Record
 from cleargs.untrusted import read_bytes
 
 PosesFrom = Literal["reference", "given"]
 World = Literal["scene", "ingest", "umeyama"]
+
+_MEANINGS = {
+    "psnr": "dB, of the mean squared error of an image; higher is better",
+    "ssim": "Gaussian window 11, sigma 1.5, border mirrored; higher is better",
+    "lpips_alex": "LPIPS v0.1, AlexNet; lower is better",
+    "lpips_vgg": "LPIPS v0.1, VGG16; lower is better",
+}
+_SCORE = "no-reference score; higher is better"
 
 _REGIONS = {
     "far": "where the scene shows something behind all sparse points of the view, or nothing",
@@ -155,10 +163,8 @@ def split_hash(references: Mapping[str, str]) -> str:
 
 def write_report(path: Path, report: Report) -> None:
     """Write ``path`` (.json) and the table beside it (.parquet). Raises StoreError."""
-    try:
+    with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(error, path) from error
     write_json(path, report.document())
     metrics = dict.fromkeys(metric for found in report.evaluations for metric in found.options.metrics)
     schema = table_schema(tuple(metrics))
@@ -187,7 +193,7 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             column("name", pa.string(), "stem of the reference's file"),
             column("width", pa.int32(), "px"),
             column("height", pa.int32(), "px"),
-            *(column(metric, pa.float64(), meaning(metric), nullable=True) for metric in metrics),
+            *(column(name, pa.float64(), _MEANINGS.get(name, _SCORE), nullable=True) for name in metrics),
             *(
                 column(f"{region}_{figure}", pa.float64(), words, nullable=True)
                 for region, where in _REGIONS.items()
@@ -202,17 +208,6 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
             ),
         ]
     )
-
-
-def meaning(metric: str) -> str:
-    """What a metric is, in one line."""
-    known = {
-        "psnr": "dB, of the mean squared error of an image; higher is better",
-        "ssim": "Gaussian window 11, sigma 1.5, border mirrored; higher is better",
-        "lpips_alex": "LPIPS v0.1, AlexNet; lower is better",
-        "lpips_vgg": "LPIPS v0.1, VGG16; lower is better",
-    }
-    return known.get(metric, "no-reference score; higher is better")
 
 
 def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
@@ -30,9 +31,9 @@ from cleargs.evaluate.metrics import (
     pooled,
     region,
 )
-from cleargs.evaluate.references import Reference, ReferenceView, images_by_stem, matching
+from cleargs.evaluate.references import Reference, ReferenceView, matching
 from cleargs.evaluate.refinement import refine_pose
-from cleargs.files import disk_error
+from cleargs.files import disk_errors
 from cleargs.manifest import versions
 from cleargs.media.image import read_rgb, to_uint8, write_rgb
 from cleargs.models.lpips import one_thread
@@ -104,7 +105,7 @@ def evaluate_images(
         raise InputError("finished images have no pose to refine", hint="leave out --refine-poses")
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of images", hint="give the folder of rendered images")
-    files = images_by_stem(folder)
+    files = {path.stem: path for path in sorted(image_files(folder))}
     names = matching(files, [view.name for view in reference.views], "name the images like the references")
     matched = tuple(view for view in reference.views if view.name in names)
 
@@ -177,10 +178,8 @@ def _evaluate(
     """Predictions are made one after the other (a render uses all threads) and measured in parallel."""
     metrics = load_metrics(options)
     if save is not None:
-        try:
+        with disk_errors(save):
             save.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(error, save) from error
     images: list[ImageResult] = []
     waiting: deque[Future[ImageResult]] = deque()
     with (

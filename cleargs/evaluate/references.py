@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -13,20 +13,22 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose, Similarity
+from cleargs.capture.capture import SourceFrame
 from cleargs.capture.folders import chosen, name_below_images, natural_key
 from cleargs.capture.layouts.transforms import read_transforms
+from cleargs.capture.prepare import read_image, read_stencil
 from cleargs.capture.tables import Frame, load_frames, load_points
 from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
-from cleargs.evaluate.alignment import align_cameras
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.manifest import linked_manifest
-from cleargs.media.image import IMAGE_SUFFIXES, read_alpha, read_mask, read_rgb
+from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
@@ -41,6 +43,9 @@ SAME_VIEW = 0.05
 """Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
 their axes than this in radians: pose noise is smaller, and the next view of a set mostly farther."""
 
+_ROUNDING = 1e-9  # extent of centres, relative to their coordinates, below which they are one place
+_FLAT = 1e-3  # second-largest over largest extent of centres below which the turn about their line is open
+
 
 @dataclass(frozen=True, eq=False)
 class ReferenceView:
@@ -52,6 +57,17 @@ class ReferenceView:
     """Pinhole of the image, in the scene's world."""
     load: Callable[[], tuple[Pixels, Mask | None]]
     """Gives the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
+
+    @property
+    def pose(self) -> Pose:
+        """Of the camera, in the scene's world."""
+        return Pose(self.camera.world_to_camera[:3, :3], self.camera.world_to_camera[:3, 3])
+
+    def at(self, pose: Pose) -> ReferenceView:
+        """The same image, taken from ``pose``."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
+        return replace(self, camera=replace(self.camera, world_to_camera=matrix))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +103,7 @@ def reference_of(
     if run is None:
         if directory is None:
             raise InputError("there is nothing to compare with", hint="give --reference DIR: sharp images")
-        views = [view for view, _ in _listed(directory).values()]
+        views = list(_listed(directory).values())
         return _reference(directory.resolve().name, views, "reference", Alignment(world="scene", matched=0))
     ingest = run / "ingest"
     manifest = linked_manifest(run, "ingest")
@@ -105,7 +121,7 @@ def reference_of(
         hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
-            views = [_posed(listed[stem][0], own[stem]) for stem in matching(listed, own, hint)]
+            views = [listed[stem].at(own[stem]) for stem in matching(listed, own, hint)]
             if missing := len(listed) - len(views):
                 reporter.warn(f"{missing} of {len(listed)} references match no frame: left out")
             alignment = Alignment(world="scene", matched=len(views))
@@ -113,12 +129,12 @@ def reference_of(
             if manifest.summary.get("poses") in ("sfm", "refined"):
                 known = listed if align is None else _listed(align)
                 stems = matching(known, own, hint)
-                theirs, ours = [known[stem][1] for stem in stems], [own[stem] for stem in stems]
+                theirs, ours = [known[stem].pose for stem in stems], [own[stem] for stem in stems]
                 similarity, alignment = align_cameras(theirs, ours)
                 _report_fit(alignment, align or directory, reporter)
             else:
                 similarity = Similarity.from_json(manifest.summary.get("similarity"), ingest)
-            views = [_posed(view, similarity.pose(pose)) for view, pose in listed.values()]
+            views = [view.at(similarity.pose(view.pose)) for view in listed.values()]
         found = _reference(directory.resolve().name, views, poses, alignment)
     try:
         return replace(found, points=load_points(ingest).xyz)
@@ -163,25 +179,79 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.info(text)
 
 
-# -- cameras -----------------------------------------------------------------------------------------------
-
-
-def _posed(view: ReferenceView, pose: Pose) -> ReferenceView:
-    """The same image, taken from ``pose``."""
-    return replace(view, camera=replace(view.camera, world_to_camera=_matrix(pose)))
-
-
-def _matrix(pose: Pose) -> NDArray[np.float64]:  # [4, 4]
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
-    return matrix
-
-
 def _own_pose(frame: Frame) -> Pose:
     """The pose that the run has of a registered frame."""
     values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     numbers = np.array([value for value in values if value is not None], np.float64)
     return Pose.from_quaternion(numbers[:4], numbers[4:])
+
+
+# -- two worlds -------------------------------------------------------------------------------------------
+
+
+def align_cameras(
+    source: Sequence[Pose],  # cameras in the world to leave
+    target: Sequence[Pose],  # the same ones in the world to enter
+) -> tuple[Similarity, Alignment]:
+    """The similarity that takes cameras nearest to their like, by place and by direction; how well it fits.
+
+    The centres of a handheld walk lie near a line or a plane, and say little about the turn: half a degree
+    may be left, which costs an image decibels. So they only fix the size; then each camera counts as four
+    points, its centre and one on each axis, as far away as the centres spread.
+
+    Raises InputError for fewer than three cameras, or centres that lie on one line.
+    """
+    theirs, ours = (np.stack([pose.centre for pose in poses]) for poses in (source, target))
+    scale = umeyama(theirs, ours).scale
+    spread = float(np.sqrt(ours.var(axis=0).sum()))
+    fit = umeyama(_with_axes(source, theirs, spread * scale), _with_axes(target, ours, spread))
+    errors = np.linalg.norm(fit.points(theirs) - ours, axis=1)
+    extent = float(np.linalg.norm(ours[:, None] - ours[None], axis=2).max())
+    angles = [
+        rotation_between(fit.pose(their).rotation, our.rotation)
+        for their, our in zip(source, target, strict=True)
+    ]
+    return fit, Alignment(
+        world="umeyama",
+        matched=len(source),
+        residual=float(np.sqrt((errors**2).mean())) / extent,
+        rotation_deg=float(np.mean(angles)),
+    )
+
+
+def _with_axes(
+    poses: Sequence[Pose], centres: NDArray[np.float64], length: float
+) -> NDArray[np.float64]:  # [4 N, 3]
+    axes = np.stack([pose.rotation for pose in poses])  # rows: the camera's axes in the world
+    return np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)])
+
+
+def umeyama(
+    source: NDArray[np.float64],  # [N, 3] centres in the world to leave
+    target: NDArray[np.float64],  # [N, 3] the same cameras' centres in the world to enter
+) -> Similarity:
+    """The similarity of least squares from ``source`` to ``target`` (Umeyama, PAMI 1991), in float64.
+
+    Raises InputError for fewer than three centres, or centres that lie on one line.
+    """
+    hint = "give at least three references, taken at places that do not lie on one line"
+    if len(source) < 3:
+        raise InputError(f"{len(source)} matched frames cannot align two worlds", hint=hint)
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - source_mean, target - target_mean
+    for places, centred in ((source, a), (target, b)):
+        spread = np.linalg.svd(centred, compute_uv=False)
+        if spread[0] <= _ROUNDING * np.abs(places).max() or spread[1] <= _FLAT * spread[0]:
+            raise InputError(
+                "the matched cameras stand at one place or on one line, which fixes no turn about it",
+                hint=hint,
+            )
+    u, stretch, vt = np.linalg.svd(np.einsum("ni,nj->ij", b, a) / len(a))
+    mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * mirror) @ vt
+    scale = float((stretch * mirror).sum() / ((a * a).sum() / len(a)))
+    # The similarity of ingest divides by its scale: x_target = rotation (x_source - origin) / (1 / scale).
+    return Similarity(rotation, source_mean - rotation.T @ target_mean / scale, 1.0 / scale)
 
 
 # -- the run's own held-out frames -------------------------------------------------------------------------
@@ -201,9 +271,7 @@ def _held_out(ingest: Path, frames: list[Frame]) -> Reference:
         if stems[stem] > 1:  # as of the cameras of a rig, in folders of their own
             stem = f"{frame.frame_id:06d}-{stem}"
         view = view_of(frame, ingest, 1.0)
-        mask = None if frame.mask is None else ingest / frame.mask
-        size = (frame.width, frame.height)
-        views.append(ReferenceView(stem, view.camera, partial(_load, ingest / frame.image, mask, size, None)))
+        views.append(ReferenceView(stem, view.camera, view.load))
     return _reference("holdout", views, "given", Alignment(world="scene", matched=len(views)))
 
 
@@ -237,8 +305,8 @@ def _about_there(camera: Camera, frame: Frame) -> bool:
 # -- a folder ----------------------------------------------------------------------------------------------
 
 
-def _listed(directory: Path) -> dict[str, tuple[ReferenceView, Pose]]:
-    """Stem -> view in the folder's own world and its pose, of a folder with ``transforms.json``."""
+def _listed(directory: Path) -> dict[str, ReferenceView]:
+    """Stem -> view in the folder's own world, of a folder with ``transforms.json``."""
     path = directory / "transforms.json"
     if not path.is_file():
         raise InputError(
@@ -256,45 +324,31 @@ def _listed(directory: Path) -> dict[str, tuple[ReferenceView, Pose]]:
         assert lens is not None and pose is not None  # asked for with poses=True
         way = way_of(lens)
         flat = way.pinhole
-        camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, _matrix(pose))
-        load = partial(_load, entry.path, entry.mask, (lens.width, lens.height), way)
-        view = ReferenceView(stem_of(entry.name), camera, load)
-        views.append((view.name, (view, pose)))
+        camera = Camera(flat.width, flat.height, *flat.focal, *flat.centre, np.eye(4))
+        view = ReferenceView(stem_of(entry.name), camera, partial(_load, entry, lens, way)).at(pose)
+        views.append((view.name, view))
     return _by_stem(views)
 
 
-def images_by_stem(folder: Path) -> dict[str, Path]:
-    """The image files of a folder; of two of a stem, the later by name."""
-    files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
-    return {path.stem: path for path in files}
-
-
-def _load(
-    path: Path, mask: Path | None, size: tuple[int, int], way: Undistorter | None
-) -> tuple[Pixels, Mask | None]:
-    """The pinhole image of a reference whose file should have ``size`` (width, height), and its mask: that in
-    ``mask``, else the image's transparency."""
-    image, upright = read_rgb(path), True
-    if image.shape[1::-1] != size:
-        # A camera belongs to the image as it is stored, unless it fits it upright.
-        image, upright = read_rgb(path, upright=False), False
-    if image.shape[1::-1] != size:
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[Pixels, Mask | None]:
+    """The pinhole image of a reference, and its mask."""
+    image, stencil = read_image(frame), read_stencil(frame)
+    if image.shape[1::-1] != (lens.width, lens.height):
         raise InputError(
-            f"{path} has {image.shape[1]}x{image.shape[0]} pixels, its camera {size[0]}x{size[1]}",
+            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels, "
+            f"its camera {lens.width}x{lens.height}",
             hint="give the images at the size that transforms.json states (w, h)",
         )
-    stencil = read_alpha(path, upright=upright) if mask is None else read_mask(mask)
     if stencil is not None and stencil.shape != image.shape[:2]:
         raise InputError(
-            f"the mask {mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "
-            f"its image {size[0]}x{size[1]}",
+            f"the mask {frame.mask} has {stencil.shape[1]}x{stencil.shape[0]} pixels, "
+            f"its image {lens.width}x{lens.height}",
             hint="make masks of the size of their images",
         )
-    if way is not None:
-        image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
+    image, stencil = way.image(image), None if stencil is None else way.mask(stencil)
     if min(image.shape[:2]) < MIN_SIDE:
         raise InputError(
-            f"{path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be judged",
+            f"{frame.path} has {image.shape[1]}x{image.shape[0]} pixels: too small to be judged",
             hint=f"give references of at least {MIN_SIDE} pixels on each side",
         )
     return image, None if stencil is None else stencil > 0

@@ -45,7 +45,10 @@ def refine_pose(
     small = camera.scaled(min(1.0, LONG_SIDE / max(camera.width, camera.height)))
     size = (small.width, small.height)
     target = np.asarray(cv2.resize(reference / 255.0, size, interpolation=cv2.INTER_AREA))
-    counts = np.ones(target.shape[:2]) if mask is None else _reduced_mask(mask, size)
+    counts = np.ones(target.shape[:2])
+    if mask is not None:  # where every pixel under a reduced one counts
+        covered = cv2.resize(mask.astype(np.float64), size, interpolation=cv2.INTER_AREA)
+        counts = (np.asarray(covered) > 0.999).astype(np.float64)
     pixel = np.repeat([1.0 / small.fx, depth / small.fx], 3)  # of turning (rad) and of moving (scene units)
 
     def difference(pose: Camera) -> Floats:
@@ -98,10 +101,3 @@ def moved(camera: Camera, twist: Floats) -> Camera:
 def rotation_between(a: Floats, b: Floats) -> float:  # [3, 3] each
     """Angle between two rotations, degrees."""
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
-
-
-def _reduced_mask(mask: Mask, size: tuple[int, int]) -> Floats:
-    """1 where every pixel under a reduced one counts, else 0."""
-    return np.asarray(
-        cv2.resize(mask.astype(np.float64), size, interpolation=cv2.INTER_AREA) > 0.999, np.float64
-    )

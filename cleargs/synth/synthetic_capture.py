@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import write_json
+from cleargs.media.colour import srgb_from_linear
 from cleargs.media.encode import require_even, write_video
 from cleargs.media.exr import write_depth
 from cleargs.media.image import write_rgb
-from cleargs.parquet import write_table
+from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
-from cleargs.synth.develop import FRAMES, develop, write_transforms
 from cleargs.synth.image_motion import FrameMotion, follow
-from cleargs.synth.optics import PINHOLE, Aperture, Array, disc, still
+from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, disc, still
 from cleargs.synth.path import FPS, Setting, frame_times, make_path
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
@@ -28,6 +30,30 @@ from cleargs.synth.raycast import room_setting
 
 NEAR_FOCUS = 0.2
 """Where a frame out of focus is focused, as a share of the mean distance: in front of everything."""
+
+FRAMES = pa.schema(
+    [
+        column("frame_id", pa.int32(), "number of the frame, as in images/"),
+        column("image", pa.string(), "file below the capture"),
+        column("time_s", pa.float64(), "middle of the exposure, of the middle row, seconds"),
+        column("blur_px", pa.float64(), "mean length of the motion path in the image, pixels"),
+        column("defocus_px", pa.float64(), "mean radius of the blur disc, pixels"),
+        column("exposure_ev", pa.float64(), "exposure error, stops"),
+        column("noise", pa.float64(), "deviation of the sensor noise at mid grey, sRGB units"),
+        column(
+            "rolling_shutter_px", pa.float64(), "mean distance in the image between first and last row's pose"
+        ),
+        column("exposure_s", pa.float64(), "time that the shutter is open for a row, seconds; 0: an instant"),
+        column("readout_s", pa.float64(), "time from first to last row, seconds; 0: global shutter"),
+        column("shutter_share", pa.float64(), "exposure_s over the time from frame to frame"),
+        column("tone_contrast", pa.float64(), "contrast of the tone curve, as in phone.Look; 0: none"),
+        column("tone_pivot", pa.float64(), "its pivot, sRGB in [0, 1]"),
+        column("sharpening", pa.float64(), "share of the fine detail that is added; 0: none"),
+        column("codec_bits_per_pixel", pa.float64(), "stated rate of the H.264 coding; 0: not coded"),
+        column("moving_share", pa.float64(), "share of the pixels that see what moves; 0: nothing does"),
+    ]
+)
+"""``truth/frames.parquet``; pixels are those of the capture's own images."""
 
 
 def make_capture(
@@ -48,7 +74,7 @@ def make_capture(
     ``out/images`` and ``out/transforms.json`` (and with ``video`` ``out/capture.mp4``) are what a user would
     have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
     views in the same form, 8-bit sRGB PNGs, with exact poses: at the middle of the frames' exposures, with
-    ``depth/``, and off the path. ``out/truth/frames.parquet`` (`cleargs.synth.develop.FRAMES`) has the faults
+    ``depth/``, and off the path. ``out/truth/frames.parquet`` (`FRAMES`) has the faults
     of each frame.
 
     Where something moves, the truth is without it, and ``out/truth/moving`` has a mask for each frame: white
@@ -118,7 +144,7 @@ def make_capture(
         write_video(out / "capture.mp4", shots, FPS)
     write_table(out / "truth" / "frames.parquet", pa.Table.from_pylist(rows), FRAMES)
     for kind, names, exact in (("observed", stems, poses), ("novel", novel_stems, novel)):
-        write_transforms(out / "truth" / kind, setting.lens, [f"images/{name}.png" for name in names], exact)
+        _write_transforms(out / "truth" / kind, setting.lens, [f"images/{name}.png" for name in names], exact)
     mean_depth = float(np.mean(depths))
     noise = {"rotation_deg": rules.rotation_noise, "translation": rules.translation_noise * mean_depth}
     given = noisy_poses(poses, rules, mean_depth, seed)
@@ -140,7 +166,7 @@ def make_capture(
         "pose_noise": noise if any(noise.values()) else None,  # deviations about and along each axis
     }
     write_json(out / "truth" / "capture.json", summary)
-    write_transforms(out, setting.lens, images, given)
+    _write_transforms(out, setting.lens, images, given)
     return summary
 
 
@@ -177,6 +203,28 @@ def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: L
     return light
 
 
+def develop(
+    image: Array,
+    *,
+    stops: float = 0.0,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+    look: Look = PLAIN,
+) -> NDArray[np.uint8]:
+    """Exposure error, sensor noise, clipping, sRGB encoding, the camera's look, 8 bits: RGB [H, W, 3] from
+    linear light.
+
+    The noise is signal-dependent: ``noise`` is its deviation in sRGB units at mid grey of a frame exposed
+    by ``stops``, of whose square 70 % is shot noise and the rest is read noise.
+    """
+    image = image * 2.0**stops
+    if rng is not None:
+        mid_grey_slope = 0.6  # d linear / d sRGB at mid grey: carries the stated deviation into linear light
+        shape = np.sqrt(np.clip(image, 0, None) / 0.2 * 0.7 + 0.3)
+        image = image + rng.standard_normal(image.shape) * noise * mid_grey_slope * shape
+    return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
+
+
 def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str, Any]:
     return {
         "frame_id": number,
@@ -191,6 +239,16 @@ def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str
         "shutter_share": fault.exposure * FPS,
         "readout_s": fault.readout,
     }
+
+
+def _write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: Array) -> None:  # [F, 3, 4]
+    """``transforms.json`` as nerfstudio reads it: OpenGL camera to world."""
+    frames = []
+    for image, pose in zip(images, poses, strict=True):
+        matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": image, "transform_matrix": matrix.tolist()})
+    camera = {"camera_model": "OPENCV", "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    write_json(folder / "transforms.json", {**camera, "w": lens.width, "h": lens.height, "frames": frames})
 
 
 def _distribution(values: list[float]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison.choices import Choice, agreement, exposed
-from cleargs.synth.develop import develop
+from cleargs.synth.synthetic_capture import develop
 
 
 def row(chosen: str, render: float, restored: float, observed: float) -> Choice:

@@ -27,7 +27,7 @@ from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.layouts.video import choose_times
 from cleargs.capture.matching import loop_pairs, sequential_pairs
 from cleargs.capture.model import ModelImage, SparseModel, read_model, write_model
-from cleargs.capture.prepare import WorkFrame, _stencil, _upright
+from cleargs.capture.prepare import WorkFrame, read_image, read_stencil
 from cleargs.capture.sfm import job_of
 from cleargs.capture.sfm_worker import apply_exif_focal
 from cleargs.capture.sources import externals, open_capture
@@ -399,12 +399,12 @@ def test_a_camera_that_fits_the_stored_image_keeps_it_so(tmp_path: Path, orienta
     path = tmp_path / "turned.png"
     write_oriented(path, pixels, orientation)
     camera = Camera("PINHOLE", 6, 4, (5.0, 5.0, 3.0, 2.0))
-    stored = _upright(SourceFrame("turned.png", path, camera=camera))
+    stored = read_image(SourceFrame("turned.png", path, camera=camera))
     assert np.array_equal(stored, pixels[..., :3])
     alone = SourceFrame("turned.png", path)
     turns = {1: 0, 3: 2, 6: 3}[orientation]
-    assert np.array_equal(_upright(alone), np.rot90(pixels[..., :3], turns))
-    stencil = _stencil(alone)
+    assert np.array_equal(read_image(alone), np.rot90(pixels[..., :3], turns))
+    stencil = read_stencil(alone)
     assert stencil is not None and np.array_equal(stencil > 0, np.rot90(pixels[..., 3] > 127, turns))
 
 

@@ -25,17 +25,17 @@ from eval_world import (
     write_run,
 )
 from numpy.typing import NDArray
+from OpenImageIO import ImageOutput, ImageSpec
 from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Camera as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
-from cleargs.evaluate.alignment import align_cameras, umeyama
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, Report, read_report, split_hash, write_report
 from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
 from cleargs.evaluate.metrics import apply_affine, fit_affine
-from cleargs.evaluate.references import Reference, reference_of
+from cleargs.evaluate.references import Reference, align_cameras, reference_of, umeyama
 from cleargs.media.image import write_mask, write_rgb
 
 SAME = Similarity(np.eye(3), np.zeros(3), 1.0)
@@ -230,6 +230,22 @@ def test_a_mask_beside_the_references(tmp_path: Path) -> None:
     after = measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))
     assert (before.images[2].values["psnr"] or 0) < 30
     assert psnr_of(after) > NEARLY_EQUAL and after.split != before.split
+
+
+def test_a_half_turn_of_exif_is_taken_as_ingest_does(tmp_path: Path) -> None:
+    """Half a turn keeps the proportions, so the camera is that of the image as it is stored."""
+    scene = make_scene()
+    run = write_run(tmp_path / "run", scene, cameras())
+    folder = write_reference(tmp_path / "truth", scene, cameras())
+    spec = ImageSpec(WIDTH, HEIGHT, 3, "uint8")
+    spec.attribute("Orientation", 3)
+    output = ImageOutput.create("turned.png")
+    assert output.open(str(folder / "images" / "002.png"), spec)
+    assert output.write_image(picture(scene, cameras()[2]))
+    output.close()
+    assert psnr_of(measured(run / "g0" / "scene.ply", reference_of(run, folder, reporter=Remarks()))) > (
+        NEARLY_EQUAL
+    )
 
 
 def test_another_methods_images(tmp_path: Path) -> None:

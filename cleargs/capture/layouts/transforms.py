@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
@@ -22,8 +21,7 @@ _FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
 
 
-@dataclass(frozen=True)
-class _Entry:
+class _Entry(NamedTuple):
     """One entry of ``frames`` and the files that it names."""
 
     values: Mapping[str, Any]
@@ -172,7 +170,7 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
             if not isinstance(values.get("mask_path", ""), str):
                 raise ValueError(f"frames[{number}] has a mask_path that is no text")
             mask = _find(path.parent, values["mask_path"]) if "mask_path" in values else None
-            entries.append(_Entry(values, _find_image(path.parent, values["file_path"]), mask))
+            entries.append(_Entry(values, _find(path.parent, values["file_path"]), mask))
         return data, entries
     except FAULTS as error:
         raise InputError(
@@ -182,20 +180,10 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
 
 
 def _find(root: Path, listed: str) -> Path | None:
-    path = root / listed.replace("\\", "/")
-    return path if path.is_file() else None
-
-
-def _find_image(root: Path, listed: str) -> Path | None:
     """The listed file; where it is listed without an extension, the image of that stem."""
-    if (file := _find(root, listed)) is not None:
-        return file
     path = root / listed.replace("\\", "/")
-    if not path.name or path.suffix.lower() in IMAGE_SUFFIXES:
-        return None
-    for suffix in sorted(IMAGE_SUFFIXES):
-        for spelling in (suffix, suffix.upper()):
-            candidate = path.with_name(path.name + spelling)
-            if candidate.is_file():
-                return candidate
-    return None
+    candidates = [path]
+    if path.name and path.suffix.lower() not in IMAGE_SUFFIXES:
+        endings = [ending for suffix in sorted(IMAGE_SUFFIXES) for ending in (suffix, suffix.upper())]
+        candidates += [path.with_name(path.name + ending) for ending in endings]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

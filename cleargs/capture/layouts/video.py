@@ -8,16 +8,12 @@ from typing import TYPE_CHECKING
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from cleargs.media.video import Timeline
-
-MIN_FRAMES = 3
-"""Two frames have no third to confirm what they see."""
 
 
 def detect(source: Path, *, poses: bool) -> bool:
@@ -36,11 +32,6 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 
     timeline = read_timeline(source)
     chosen = choose_times(timeline, config.fps, config.max_frames)
-    if len(chosen) < MIN_FRAMES:
-        raise InputError(
-            f"{source.name} gives {len(chosen)} frames; a scene needs at least {MIN_FRAMES}",
-            hint="record longer, or raise ingest.fps or ingest.max_frames",
-        )
     frames = tuple(video_frame(source, timeline, index) for index in chosen)
     return Capture("video", frames, len(timeline.pts), hdr=timeline.transfer)
 
