@@ -1,7 +1,12 @@
-"""Settings for all tests."""
+"""Settings and fixtures for all tests."""
+
+from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # A busy machine is no failure: examples have no deadline, and drawing them may be slow.
@@ -10,3 +15,12 @@ settings.load_profile("cleargs")
 
 # As the program does (`cleargs.cli.entry`): tests that run beside each other have more threads than cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """One browser for all tests of pages: Playwright refuses a second one in the same process."""
+    from helpers.chromium import chromium
+
+    with chromium() as opened:
+        yield opened

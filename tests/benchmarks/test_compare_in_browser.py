@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CHROMIUM, NO_CHROMIUM, Opened
 from compared_runs import HOSTILE, compare_runs
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, Opened
 
 from benchmarks.comparison.page import write_comparison
 

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_CHROMIUM, Opened
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, Opened
 from report_run import HOSTILE, FinishedRun
 
 from cleargs.capture.tables import load_frames

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
 from colmap_model import write_sparse
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
 from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CHROMIUM, NO_CHROMIUM, Opened
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, Opened
 from made_pages import batch_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from browser import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
 from report_run import camera, wall
 from watched import reported, serving, working
 
