@@ -49,14 +49,13 @@ def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     folder = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     old = folder.with_name(f"{folder.name}.old")
     try:
-        folder.mkdir()
-        yield folder
-        if replace and path.exists():
-            path.rename(old)
-        folder.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise disk_error(error, path) from error
+        with disk_errors(path):
+            folder.mkdir()
+            yield folder
+            if replace and path.exists():
+                path.rename(old)
+            folder.rename(path)
+            shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -64,10 +64,18 @@ class SplatWorld:
         return total
 
     def depth(self, pose: Array, lens: Lens) -> Array:
-        """The expected depth of the render; 0 where it is mostly transparent."""
+        """The expected depth of the render; 0 where it is mostly transparent.
+
+        Raises InputError where all of it is transparent.
+        """
         rendered = self._rendered(pose, lens, depth=True)
         assert rendered.depth is not None
         alpha = rendered.alpha.numpy().astype(np.float64)
+        if (alpha < OPAQUE).all():
+            raise InputError(
+                "a frame of the walk sees nothing of the scene",
+                hint="give cameras in the scene's own world, or a scene that fills their view",
+            )
         mean = rendered.depth.numpy() / np.maximum(alpha, OPAQUE)
         return np.where(alpha >= OPAQUE, mean, 0.0)
 

@@ -88,11 +88,6 @@ def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> FrameMo
     z = depth[y.astype(int), x.astype(int)]
     rays = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy, np.ones_like(x)], -1)
     seen = z > 0
-    if not seen.any():
-        raise InputError(
-            "a frame of the walk sees nothing of the scene",
-            hint="give cameras in the scene's own world, or a scene that fills their view",
-        )
     pose = path.poses(np.array([time]))[0]
     return FrameMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
 

@@ -32,7 +32,6 @@ class Protocol:
     as stated; how they vary from frame to frame is the walk's doing. ``shutter`` states the exposure itself.
     """
 
-    summary: str
     blur: float = 0.0
     """Mean over the frames of the mean length of the motion path in the image; 0 for instants."""
     shutter: float = 0.0
@@ -54,28 +53,18 @@ class Protocol:
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "sharp": Protocol("no fault but a little noise: the control that nothing may harm"),
-    "mixed": Protocol(
-        "half the frames sharp, the rest blurred, defocused or misexposed", mixed=True, jpeg=92
-    ),
-    "gs2e-slight": Protocol("motion blur of 6 px on average", blur=6),
-    "gs2e-medium": Protocol("motion blur of 12 px on average", blur=12),
-    "gs2e-severe": Protocol("motion blur of 20 px on average", blur=20),
-    "gs2e-stretches": Protocol(
-        "motion blur of 14 px on average, most of it in stretches in one piece", blur=14, stretched=True
-    ),
-    "gsotm-mb": Protocol("motion blur of 8 px on average", blur=8),
-    "gsotm-rs": Protocol("rolling shutter, 12 px of skew on average", skew=12),
-    "gsotm-mb-rs": Protocol("motion blur of 8 px and rolling shutter of 12 px", blur=8, skew=12),
-    "gsotm-pn": Protocol("sharp, with noise on the given poses", rotation_noise=0.4, translation_noise=0.005),
+    "sharp": Protocol(),  # no fault but a little noise: the control that nothing may harm
+    "mixed": Protocol(mixed=True, jpeg=92),
+    "gs2e-slight": Protocol(blur=6),
+    "gs2e-medium": Protocol(blur=12),
+    "gs2e-severe": Protocol(blur=20),
+    "gs2e-stretches": Protocol(blur=14, stretched=True),
+    "gsotm-mb": Protocol(blur=8),
+    "gsotm-rs": Protocol(skew=12),
+    "gsotm-mb-rs": Protocol(blur=8, skew=12),
+    "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
     # Every fifth frame of a video of 30 a second whose shutter is open for 5/6 of the time.
-    "phone": Protocol(
-        "a phone's video: its processing, auto exposure, H.264, something that moves, blurred stretches",
-        shutter=1 / 6,
-        skew=4,
-        stretched=True,
-        phone=True,
-    ),
+    "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
 }
 
 

@@ -72,10 +72,9 @@ def make_capture(
 
     It is made in the room of ``seed``, or in another ``setting`` of as many frames of that size.
     ``out/images`` and ``out/transforms.json`` (and with ``video`` ``out/capture.mp4``) are what a user would
-    have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp
-    views in the same form, 8-bit sRGB PNGs, with exact poses: at the middle of the frames' exposures, with
-    ``depth/``, and off the path. ``out/truth/frames.parquet`` (`FRAMES`) has the faults
-    of each frame.
+    have. ``out/truth/observed`` and ``out/truth/novel`` hold sharp views in the same form, 8-bit sRGB PNGs,
+    with exact poses: at the middle of the frames' exposures, with ``depth/``, and off the path.
+    ``out/truth/frames.parquet`` (`FRAMES`) has the faults of each frame.
 
     Where something moves, the truth is without it, and ``out/truth/moving`` has a mask for each frame: white
     where a pixel saw it at any time of the exposure (its shadow is not in the mask).

@@ -132,3 +132,10 @@ def test_refuses_what_is_not_a_scene(run: Path, tmp_path: Path) -> None:
         assert "\n" not in str(error.value) and error.value.hint
     with pytest.raises(InputError):
         scene_setting(tmp_path / "missing.ply", None, 4, 32, 18)
+
+
+def test_a_camera_that_sees_nothing_is_refused(run: Path) -> None:
+    setting = scene_setting(run / "g0" / "scene.ply", None, 6, 32, 18)
+    away = setting.course.poses(np.array([0.5]))[0] @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(InputError, match="sees nothing of the scene"):
+        setting.world.depth(away, setting.lens)
