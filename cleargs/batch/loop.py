@@ -32,7 +32,7 @@ from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import asked_run, opened_store, usable_cores
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.report.report_json import linked_manifests
-from cleargs.report.words import decibel, duration
+from cleargs.report.words import duration
 
 State = Literal["failed", "waiting", "partial", "done"]
 """`waiting`: there are stages to make, and no try has failed."""
@@ -62,7 +62,7 @@ class Result:
         if self.frames is not None:
             found.append((f"{self.frames_placed} of {self.frames}", "frames placed"))
         if self.psnr_unseen is not None:
-            found.append((decibel(self.psnr_unseen), "PSNR on pixels that no training saw"))
+            found.append((f"{self.psnr_unseen:.1f} dB", "PSNR on pixels that no training saw"))
         if self.minutes:
             found.append((duration(60 * self.minutes), "of work"))
             found.append((f"{self.memory_gb:.1f} GB", "of memory"))

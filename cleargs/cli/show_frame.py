@@ -7,8 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.media.contact_sheet import Tile, contact_sheet
@@ -199,7 +197,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
     for name in shown:
         chosen = name == row.chosen
         label = f"{LAYERS[name]} (chosen)" if chosen else LAYERS[name]
-        tiles.append(Tile(images[name].astype(np.float32) / np.float32(255), label, marked=chosen))
+        tiles.append(Tile(images[name], label, marked=chosen))
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [tiles[start : start + _ACROSS] for start in range(0, len(tiles), _ACROSS)]
     write_rgb(path, contact_sheet(lines, tile_width=min(_WIDEST, max(240, row.frame.width))))

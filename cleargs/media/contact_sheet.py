@@ -21,8 +21,8 @@ _MARKED = (40, 120, 60)
 class Tile(NamedTuple):
     """One image of a sheet with its label above it."""
 
-    image: NDArray[np.float32] | None
-    """[H, W, 3] sRGB in [0, 1]; None leaves the place empty."""
+    image: NDArray[np.float32] | NDArray[np.uint8] | None
+    """[H, W, 3] sRGB, floats in [0, 1] or bytes; None leaves the place empty."""
     label: str
     """ASCII; what does not fit is cut off."""
     marked: bool = False

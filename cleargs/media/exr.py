@@ -56,11 +56,11 @@ def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> N
     The layer ``shown`` is also written as the plain channels R, G, B. Raises StoreError when the disk is full
     or not writable.
     """
-    plain = [] if shown is None else [image.layers[shown]]
-    pixels = np.concatenate([*plain, *image.layers.values()], axis=2)
-    layered = tuple(f"{name}.{channel}" for name in image.layers for channel in _CHANNELS)
-    channels = (*_CHANNELS[: 3 * len(plain)], *layered)
-    _write(path, pixels, channels, (HALF,) * len(channels), image.attributes)
+    layers = {f"{name}.": layer for name, layer in image.layers.items()}
+    if shown is not None:
+        layers = {"": image.layers[shown], **layers}
+    channels = {f"{prefix}{letter}": HALF for prefix in layers for letter in _CHANNELS}
+    _write(path, np.concatenate(list(layers.values()), axis=2), channels, image.attributes)
 
 
 def write_view(
@@ -74,25 +74,21 @@ def write_view(
     Raises StoreError when the disk is full or not writable.
     """
     layer = to_layer(image).astype(np.float32)
-    pixels = np.concatenate([layer, alpha[..., None], depth[..., None]], axis=2)
-    _write(path, pixels, (*_CHANNELS, "A", "Z"), (HALF, HALF, HALF, HALF, FLOAT), {})
+    _write(path, np.dstack([layer, alpha, depth]), dict.fromkeys("RGBA", HALF) | {"Z": FLOAT}, {})
 
 
 def write_depth(path: Path, depth: NDArray[Any]) -> None:  # [H, W]
     """Write one float channel Z, atomically. Raises StoreError when the disk is full or not writable."""
-    _write(path, np.asarray(depth[..., None], np.float32), ("Z",), (FLOAT,), {})
+    _write(path, np.asarray(depth[..., None], np.float32), {"Z": FLOAT}, {})
 
 
 def _write(
-    path: Path,
-    pixels: NDArray[Any],  # [H, W, C]
-    channels: tuple[str, ...],
-    formats: tuple[Any, ...],
-    attributes: Mapping[str, Attribute],
+    path: Path, pixels: NDArray[Any], channels: Mapping[str, Any], attributes: Mapping[str, Attribute]
 ) -> None:
+    """Write ``pixels`` [H, W, C]; ``channels`` are their names, each with its format in the file."""
     height, width, count = pixels.shape
-    spec = ImageSpec(width, height, count, formats[0])
-    spec.channelnames, spec.channelformats = channels, formats
+    spec = ImageSpec(width, height, count, next(iter(channels.values())))
+    spec.channelnames, spec.channelformats = tuple(channels), tuple(channels.values())
     spec.attribute("compression", "zip")
     if count > 1:  # depth alone has no colour
         spec.attribute("oiio:ColorSpace", "lin_rec709")

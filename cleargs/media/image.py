@@ -81,7 +81,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     """
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
     border = 127 if grey.max() > 1 else 0
-    return np.where(grey > border, np.uint8(255), np.uint8(0))
+    return np.asarray(np.where(grey > border, 255, 0), np.uint8)
 
 
 def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:  # [H, W]
@@ -95,7 +95,7 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
     if image.ndim != 3 or image.shape[2] != 4:
         return None
     opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
-    return None if opaque.all() else np.where(opaque, np.uint8(255), np.uint8(0))
+    return None if opaque.all() else np.asarray(np.where(opaque, 255, 0), np.uint8)
 
 
 def write_rgb(
@@ -108,7 +108,7 @@ def write_rgb(
 
     ``quality`` is that of a JPEG. Raises StoreError when the disk is full or not writable.
     """
-    rgb = image if image.dtype == np.uint8 else to_uint8(image)
+    rgb = to_uint8(image)
     options = [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality]
     _, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     write_bytes(path, data.tobytes())
@@ -120,7 +120,9 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:  # [H, W]
 
 
 def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Floats in [0, 1] (clipped) rounded to 0..255."""
+    """Floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays as it is."""
+    if image.dtype == np.uint8:
+        return image
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 

@@ -150,7 +150,7 @@ def _of_transforms(entry: Mapping[str, Any], lens: Camera, name: str) -> tuple[C
 def _with_lens(lens: Camera, entry: Mapping[str, Any]) -> Camera:
     """``lens`` with the size, focal lengths and principal point of ``entry``, as far as they are there."""
     scaled = lens.resized(int(entry.get("width", lens.width)), int(entry.get("height", lens.height)))
-    numbers = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
+    numbers: dict[str, Any] = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
     if "fx" in numbers:
         numbers.setdefault("fy", numbers["fx"])
     return replace(scaled, **numbers)

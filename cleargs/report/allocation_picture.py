@@ -158,4 +158,4 @@ def _mark_frames(panel: Axes, x: NDArray[Any], y: NDArray[Any], rows: Sequence[R
 def _tile(path: Path, row: Row) -> Tile:
     place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
     label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
-    return Tile(read_rgb(path).astype(np.float32) / np.float32(255), label, marked=bool(row["weight"]))
+    return Tile(read_rgb(path), label, marked=bool(row["weight"]))

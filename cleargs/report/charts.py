@@ -44,16 +44,12 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
         x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
         y = np.array([np.median(values[part]) for part in stretches])
         ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
-        low, high = ticks[0], ticks[-1]
-
-        def height(value: float) -> float:
-            return float(HEIGHT * (1.0 - (value - low) / (high - low)))
-
+        down = np.interp(y, (ticks[0], ticks[-1]), (HEIGHT, 0.0))
         return {
             "title": title,
             "unit": unit,
-            "path": "M" + " L".join(f"{a:.1f},{height(b):.1f}" for a, b in zip(x, y, strict=True)),
-            "ticks": [(height(tick), f"{tick:,g}") for tick in ticks],
+            "path": "M" + " L".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, down, strict=True)),
+            "ticks": list(zip(np.linspace(HEIGHT, 0.0, len(ticks)), (f"{t:,g}" for t in ticks), strict=True)),
             "parts": parts,
             "steps": len(values),
             "first": f"{y[0]:,.{digits}f}",

@@ -40,7 +40,7 @@ from cleargs.report.frames import (
     write_pictures,
 )
 from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
-from cleargs.report.verdict import judge
+from cleargs.report.verdict import Verdict
 from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
 from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
@@ -109,7 +109,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             name=run.name,
             source=planner.run.source.name,
             pictures=pictures,
-            verdict=judge(manifests, rows, planner.run.config),
+            verdict=Verdict(manifests, rows, planner.run.config),
             scenes=scenes,
             viewer=write_viewer(folder) if scenes else "",
             plan=charts.plan_of(rows),

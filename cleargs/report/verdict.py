@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
-from cleargs.report.words import count, decibel
+from cleargs.report.words import count
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
 """Training PSNR from which a scene is said to follow its frames closely, and below which only loosely. What
@@ -37,28 +37,8 @@ class Caution(NamedTuple):
     """As ``--set`` takes them; empty where no setting helps."""
 
 
-Figure = tuple[str, str, str]
-"""A number that stands for a part of the run, its label, and a note."""
-
-
-class Verdict(NamedTuple):
-    """The first screen of a report."""
-
-    tone: Tone
-    headline: str
-    text: str
-    figures: tuple[Figure, ...]
-    warnings: tuple[Caution, ...]
-
-
-def judge(manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> Verdict:
-    """Return the verdict on a run that shows these ``manifests``."""
-    run = _Run(manifests, rows, config)
-    return Verdict(*run.headline(), run.text(), tuple(run.figures()), tuple(run.warnings()))
-
-
-class _Run:
-    """A run under judgement."""
+class Verdict:
+    """The first screen of a report of a run that shows these ``manifests``."""
 
     def __init__(self, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> None:
         self._manifests, self._rows, self._config = manifests, rows, config
@@ -115,25 +95,25 @@ class _Run:
         return (
             f"{lead}, the scene explains training frames that were kept aside from repairs "
             f"{abs(after - before):.1f} dB {'more' if after >= before else 'less'} exactly "
-            f"({decibel(before)} before, {decibel(after)} now)"
+            f"({before:.1f} dB before, {after:.1f} dB now)"
         )
 
-    def figures(self) -> Iterator[Figure]:
-        """The numbers of the first screen."""
+    def figures(self) -> Iterator[tuple[str, str, str]]:
+        """The numbers of the first screen, each with its label and a note."""
         placed = f"{len(self._placed)} of {len(self._rows)}"
         yield placed, "frames placed", "with a pose that fits the others"
         if "rva" in self._manifests:
             active = sum(bool(row.weight) for row in self._rows)
             whole = f"as much as {self._figure('rva', 'effective_frames'):.1f} whole ones together"
-            yield f"{active}", "frames train the scene", whole
+            yield str(active), "frames train the scene", whole
         if self._psnr is not None:
             rule = f"by rule of thumb {CLOSE_DB:g} dB are close and less than {LOOSE_DB:g} loose"
             note = f"PSNR of the first scene on training poses; {rule}"
-            yield decibel(self._psnr), f"on {self._judged_on}", note
+            yield f"{self._psnr:.1f} dB", f"on {self._judged_on}", note
         unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
         if unseen is not None:
             note = "PSNR of the last scene on a hundredth of every frame; views off the path are worse"
-            yield decibel(unseen), "on pixels that no training saw", note
+            yield f"{unseen:.1f} dB", "on pixels that no training saw", note
         repairs = self._figure("consolidate", "repairs")
         if repairs is not None:
             views = "repaired views" if repairs != 1 else "repaired view"
@@ -207,7 +187,7 @@ class _Run:
         if psnr is not None and psnr < CLOSE_DB:
             size = self._setting("ingest", "max_size") * 3 // 2
             yield Caution(
-                f"The first scene reaches {decibel(psnr)} on the frames it trusts",
+                f"The first scene reaches {psnr:.1f} dB on the frames it trusts",
                 "A longer training, or larger images, bring out finer detail.",
                 (f"g0.steps={2 * self._figure('g0', 'steps')}", f"ingest.max_size={size}"),
             )

@@ -8,11 +8,6 @@ def count(number: int, one: str, many: str = "") -> str:
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
-def decibel(value: float) -> str:
-    """``31.2 dB``."""
-    return f"{value:.1f} dB"
-
-
 def duration(seconds: float) -> str:
     """``4.0 s``, ``3.4 min``, ``2.1 h``."""
     if seconds < 120:

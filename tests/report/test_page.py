@@ -29,7 +29,7 @@ from cleargs.report.charts import weight_colour
 from cleargs.report.frames import FrameRow
 from cleargs.report.page import changed_settings, command, json_in_html, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
-from cleargs.report.verdict import judge
+from cleargs.report.verdict import Verdict
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
 
 
@@ -219,8 +219,8 @@ def test_advice_is_only_what_can_help() -> None:
         lost = FrameRow(SimpleNamespace(registered=False))  # type: ignore[arg-type]
         manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
         rows: Any = [lost] * frames
-        judged = judge(manifests, rows, load_config(installed(), "default", settings))
-        return list(judged.warnings[0].settings)
+        verdict = Verdict(manifests, rows, load_config(installed(), "default", settings))
+        return list(next(verdict.warnings()).settings)
 
     assert advice(40, 40) == []  # every frame is used, and compared with every other
     assert advice(40, 60) == ["ingest.max_frames=60"]
