@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
 from benchmarks.comparison.tables import TITLES, metric_title
 from benchmarks.images import read_rgb_float
+from cleargs.capture.folders import image_files
 from cleargs.evaluate.eval_report import Evaluation
-from cleargs.evaluate.references import images_by_stem
 from cleargs.files import atomic_path
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
@@ -151,5 +151,5 @@ def _telling(out: Path, cell: Cell, capture: Path) -> str:
 
 def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
     """The image of that stem as sRGB in [0, 1]; None without one."""
-    found = images_by_stem(folder).get(stem) if folder.is_dir() else None
-    return None if found is None else read_rgb_float(found)
+    found = [path for path in image_files(folder) if path.stem == stem] if folder.is_dir() else []
+    return read_rgb_float(max(found)) if found else None

@@ -55,35 +55,32 @@ def look_at(centres: Array, target: Array) -> Array:  # [..., 3], [3]
     return np.stack([right, np.cross(forward, right), forward, centres], -1)
 
 
-@dataclass(frozen=True)
 class Orbit:
-    """An arc around ``focus`` at changing height and distance, in metres."""
+    """An arc around ``focus`` at changing height and distance, in metres.
 
-    focus: Array  # [3]
-    arc: float
-    """Radians."""
-    phases: Array  # [2] of distance and height
+    ``frames`` neighbours on it are about 4 degrees apart, over at most 150 degrees.
+    """
+
+    def __init__(self, focus: Array, frames: int, seed: int) -> None:
+        self._focus = focus
+        self._arc = float(np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES)))
+        rng = np.random.default_rng([seed, Stream.ORBIT])
+        self._phases = rng.uniform(0, 2 * np.pi, 2)  # of distance and height
 
     def poses(self, shares: Array) -> Array:
-        return look_at(self._centres(shares), self.focus)
+        return look_at(self._centres(shares), self._focus)
 
     def novel(self, share: float, rng: np.random.Generator) -> Array:
         """Nearer or farther, higher or lower: off by up to one and a half frames' way in each axis."""
         centre = self._centres(np.array([share]))[0] + rng.uniform(-0.22, 0.22, 3)
-        return look_at(centre, self.focus + rng.uniform(-0.08, 0.08, 3))
+        return look_at(centre, self._focus + rng.uniform(-0.08, 0.08, 3))
 
     def _centres(self, shares: Array) -> Array:
-        angle = (shares - 0.5) * self.arc
-        distance = 2.15 + 0.2 * np.sin(2 * np.pi * shares + self.phases[0])
-        height = 1.4 + 0.18 * np.sin(4 * np.pi * shares + self.phases[1])
-        east, south = self.focus[0] + distance * np.sin(angle), self.focus[2] + distance * np.cos(angle)
+        angle = (shares - 0.5) * self._arc
+        distance = 2.15 + 0.2 * np.sin(2 * np.pi * shares + self._phases[0])
+        height = 1.4 + 0.18 * np.sin(4 * np.pi * shares + self._phases[1])
+        east, south = self._focus[0] + distance * np.sin(angle), self._focus[2] + distance * np.cos(angle)
         return np.stack([east, height, south], 1)
-
-
-def orbit(focus: Array, frames: int, seed: int) -> Orbit:
-    """A course on which ``frames`` neighbours are about 4 degrees apart, over at most 150 degrees."""
-    arc = np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES))
-    return Orbit(focus, float(arc), np.random.default_rng([seed, Stream.ORBIT]).uniform(0, 2 * np.pi, 2))
 
 
 FPS = 6.0
@@ -106,29 +103,40 @@ STRETCH_EDGE = 1 / FPS
 """Seconds over which the shaking comes and goes."""
 
 
-@dataclass(frozen=True)
 class Hand:
     """Turns of the aim about the camera's axes. Tremor of position is left out: at more than a step's
-    distance the turn moves the image far more."""
+    distance the turn moves the image far more.
 
-    frequencies: Array  # [harmonics, 3] Hz
-    phases: Array  # [harmonics, 3]
-    amplitudes: Array  # [harmonics, 3] radians
-    swing_times: Array  # [swings] seconds
-    swing_turns: Array  # [swings, 3] radians
-    stretches: Array  # [stretches, 2] seconds from and to which the hand shakes
+    The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames.
+    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
+    """
+
+    def __init__(self, duration: float, seed: int, *, stretched: bool = False) -> None:
+        rng = np.random.default_rng([seed, Stream.HAND])
+        self._frequencies = np.geomspace(*TREMOR_HZ, 12)[:, None] * rng.uniform(0.92, 1.0, (12, 3))  # Hz
+        amplitudes = 1 / self._frequencies
+        amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
+        self._amplitudes = amplitudes  # [harmonics, 3] radians
+        count = max(1, round(duration * FPS / FRAMES_A_SWING))
+        self._swing_times = (np.arange(count) + rng.uniform(0, 1, count)) / count * duration  # seconds
+        direction = rng.uniform(0, 2 * np.pi, count)
+        axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
+        self._swing_turns = rng.uniform(*SWING_RADIANS, (count, 1)) * axes  # [swings, 3] radians
+        self._phases = rng.uniform(0, 2 * np.pi, (12, 3))
+        self.stretches = _stretches(duration, seed) if stretched else np.empty((0, 2))
+        """Seconds [stretches, 2] from and to which the hand shakes."""
 
     def turns(self, times: Array) -> Array:  # [T]
         """Rotation vectors [T, 3]."""
-        waves = np.sin(2 * np.pi * self.frequencies * times[:, None, None] + self.phases)
-        tremor = (self.amplitudes * waves).sum(1)
+        waves = np.sin(2 * np.pi * self._frequencies * times[:, None, None] + self._phases)
+        tremor = (self._amplitudes * waves).sum(1)
         # Out to one side, through the middle at full speed, back from the other: 1 at the extremes.
-        share = (times[:, None] - self.swing_times) / SWING_SECONDS
+        share = (times[:, None] - self._swing_times) / SWING_SECONDS
         swings = share * np.exp((1 - share**2) / 2)
         if len(self.stretches):
             strength = self.shake_strength(times)[:, None]
             tremor, swings = tremor * (1 + (SHAKING - 1) * strength), swings * strength
-        return np.asarray(tremor + swings @ self.swing_turns, np.float64)
+        return np.asarray(tremor + swings @ self._swing_turns, np.float64)
 
     def shake_strength(self, times: Array) -> Array:  # [T] seconds
         """1 [T] within a stretch, 0 outside."""
@@ -138,24 +146,6 @@ class Hand:
         return np.asarray((share**2 * (3 - 2 * share)).sum(1))
 
 
-def make_hand(duration: float, seed: int, *, stretched: bool = False) -> Hand:
-    """A hand whose tremor has the same speed in each band from 1 to 12 Hz, and swings every few frames.
-
-    ``stretched``: and that shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
-    """
-    rng = np.random.default_rng([seed, Stream.HAND])
-    frequencies = np.geomspace(*TREMOR_HZ, 12)[:, None] * rng.uniform(0.92, 1.0, (12, 3))
-    amplitudes = 1 / frequencies
-    amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
-    count = max(1, round(duration * FPS / FRAMES_A_SWING))
-    times = (np.arange(count) + rng.uniform(0, 1, count)) / count * duration
-    direction = rng.uniform(0, 2 * np.pi, count)
-    axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
-    turns = rng.uniform(*SWING_RADIANS, (count, 1)) * axes
-    stretches = _stretches(duration, seed) if stretched else np.empty((0, 2))
-    return Hand(frequencies, rng.uniform(0, 2 * np.pi, (12, 3)), amplitudes, times, turns, stretches)
-
-
 def _stretches(duration: float, seed: int) -> Array:
     count = max(1, round(duration * FPS / FRAMES_A_STRETCH))
     free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
@@ -163,37 +153,30 @@ def _stretches(duration: float, seed: int) -> Array:
     return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
 
 
-@dataclass(frozen=True)
 class HandheldPath:
-    """Where the camera is at any time."""
+    """Where the camera is at any time of a walk along ``course`` that takes ``frames`` frames at `FPS`; for
+    ``stretched`` see `Hand`."""
 
-    course: Course
-    hand: Hand
-    duration: float
-    """Seconds."""
-    pauses: int
-    phase: float
-    """Of the pace, radians."""
+    def __init__(self, course: Course, frames: int, seed: int, *, stretched: bool = False) -> None:
+        self.duration = frames / FPS
+        """Seconds."""
+        self.hand = Hand(self.duration, seed, stretched=stretched)
+        self._course = course
+        self._pauses = max(1, round(frames / FRAMES_A_PAUSE))
+        rng = np.random.default_rng([seed, Stream.WALK])
+        self._phase = rng.uniform(0, 2 * np.pi)  # of the pace, radians
 
     def poses(self, times: Array) -> Array:  # [T] seconds
         """Camera to world [T, 3, 4] with OpenCV axes."""
-        poses = self.course.poses(self.progress(times))
+        poses = self._course.poses(self.progress(times))
         turns = Rotation.from_rotvec(self.hand.turns(times)).as_matrix()
         return np.concatenate([poses[:, :, :3] @ turns, poses[:, :, 3:]], 2)
 
     def progress(self, times: Array) -> Array:
         """Share of the course walked: its speed is 1 + PAUSE cos, so that frames bunch at the pauses."""
-        share, turn = times / self.duration, 2 * np.pi * self.pauses
-        wave = np.sin(turn * share + self.phase) - np.sin(self.phase)
+        share, turn = times / self.duration, 2 * np.pi * self._pauses
+        wave = np.sin(turn * share + self._phase) - np.sin(self._phase)
         return np.asarray(share + PAUSE / turn * wave, np.float64)
-
-
-def make_path(course: Course, frames: int, seed: int, *, stretched: bool = False) -> HandheldPath:
-    """The walk of ``seed`` along ``course`` that takes ``frames`` frames at `FPS`; see `make_hand`."""
-    rng = np.random.default_rng([seed, Stream.WALK])
-    duration, pauses = frames / FPS, max(1, round(frames / FRAMES_A_PAUSE))
-    hand = make_hand(duration, seed, stretched=stretched)
-    return HandheldPath(course, hand, duration, pauses, rng.uniform(0, 2 * np.pi))
 
 
 def frame_times(frames: int) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy, phone_lens
-from cleargs.synth.path import Setting, orbit
+from cleargs.synth.path import Orbit, Setting
 from cleargs.synth.room import (
     BOX,
     LEVEL_STARTS,
@@ -27,7 +27,6 @@ from cleargs.synth.room import (
     TEXELS_PER_METRE,
     Balloon,
     Room,
-    make_balloon,
     make_room,
 )
 
@@ -393,5 +392,5 @@ class RoomWorld:
 def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
     """The procedural room of ``seed``, in metres, and a walk around its table."""
     room = make_room(seed)
-    world, course, lens = RoomWorld(room), orbit(room.focus, frames, seed), phone_lens(width, height)
-    return Setting("room", world, course, lens, partial(world.film, make_balloon(room, seed)))
+    world, course, lens = RoomWorld(room), Orbit(room.focus, frames, seed), phone_lens(width, height)
+    return Setting("room", world, course, lens, partial(world.film, Balloon(room, seed)))

@@ -116,20 +116,8 @@ class Room:
     focus: NDArray[np.float64]  # [3] what a visitor looks at
 
 
-@dataclass(frozen=True)
-class Balloon:
-    """A ball that drifts to and fro above the table: it touches nothing."""
-
-    item: NDArray[np.void]  # of PRIMITIVE, at rest
-    sway: NDArray[np.float64]  # [3] metres
-    rates: NDArray[np.float64]  # [3] radians a second
-    phases: NDArray[np.float64]  # [3]
-
-    def centres(self, times: NDArray[np.float64]) -> NDArray[np.float64]:  # [...] seconds
-        """Metres [..., 3]."""
-        waves = np.sin(self.rates * times[..., None] + self.phases)
-        return np.asarray(self.item["centre"] + self.sway * waves, np.float64)
-
+SWAY = np.array([0.75, 0.08, 0.2])
+"""How far a balloon drifts to either side of where it is at rest, metres."""
 
 WIDTH, HEIGHT, DEPTH = 5.0, 2.7, 4.5
 FLOOR = 0.004
@@ -212,10 +200,20 @@ def make_room(seed: int) -> Room:
     return Room(np.array(items, PRIMITIVE), textures, light, np.array([table[0], 0.95, table[2] - 0.3]))
 
 
-def make_balloon(room: Room, seed: int) -> Balloon:
-    """The balloon of ``seed``: it crosses the view from side to side in two or three seconds."""
-    rng = np.random.default_rng([seed, Stream.BALLOON])
-    centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
-    item = _primitive(SPHERE, centre, (0.11, 0, 0), SURFACES + int(rng.integers(PRINTS)), gloss=0.5)
-    rates = 2 * np.pi / rng.uniform(4, 6, 3)
-    return Balloon(item, np.array([0.75, 0.08, 0.2]), rates, rng.uniform(0, 2 * np.pi, 3))
+class Balloon:
+    """A ball that drifts to and fro above the table of ``room``: it touches nothing, and crosses the view
+    from side to side in two or three seconds."""
+
+    def __init__(self, room: Room, seed: int) -> None:
+        rng = np.random.default_rng([seed, Stream.BALLOON])
+        centre = (room.focus[0], 1.36, room.focus[2] + 0.45)
+        texture = SURFACES + int(rng.integers(PRINTS))
+        self.item = _primitive(SPHERE, centre, (0.11, 0, 0), texture, gloss=0.5)
+        """At rest."""
+        self._rates = 2 * np.pi / rng.uniform(4, 6, 3)  # radians a second
+        self._phases = rng.uniform(0, 2 * np.pi, 3)
+
+    def centres(self, times: NDArray[np.float64]) -> NDArray[np.float64]:  # [...] seconds
+        """Metres [..., 3]."""
+        waves = np.sin(self._rates * times[..., None] + self._phases)
+        return np.asarray(self.item["centre"] + SWAY * waves, np.float64)

@@ -23,7 +23,7 @@ from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.image_motion import FrameMotion, follow
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, disc, still
-from cleargs.synth.path import FPS, Setting, frame_times, make_path
+from cleargs.synth.path import FPS, HandheldPath, Setting, frame_times
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
 from cleargs.synth.raycast import room_setting
@@ -97,7 +97,7 @@ def make_capture(
     }
     if not rules.phone:
         setting = replace(setting, film=None)
-    path, times = make_path(setting.course, frames, seed, stretched=rules.stretched), frame_times(frames)
+    path, times = HandheldPath(setting.course, frames, seed, stretched=rules.stretched), frame_times(frames)
     poses = path.poses(times)
     rng, count = np.random.default_rng([seed, Stream.NOVEL_POSES]), max(4, frames // 4)
     novel = np.stack([setting.course.novel((number + 0.5) / count, rng) for number in range(count)])

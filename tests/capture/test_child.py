@@ -118,6 +118,22 @@ while True:
         parent.kill()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_what_a_killed_child_started_ends_too(module: Path) -> None:
+    module.write_text(
+        PREAMBLE
+        + """
+import signal, subprocess
+started = subprocess.Popen(["sleep", "600"])
+Path(sys.argv[1]).write_text(str(started.pid))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    )
+    with pytest.raises(StageError, match="Killed"):
+        run(module)
+    assert gone(int(module.with_suffix(".json").read_text()))
+
+
 def test_interrupted_when_the_child_has_just_ended(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is nobody left to kill: the interrupt must arrive, and no complaint about that."""
 

@@ -13,7 +13,7 @@ from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.synth.image_motion import INSTANTS, ROW_STEP, FrameMotion, duration_for, follow
 from cleargs.synth.optics import MIN_SAMPLES, Aperture, Lens, Shutter, World, disc, phone_lens, still
-from cleargs.synth.path import frame_times, make_path
+from cleargs.synth.path import HandheldPath, frame_times
 from cleargs.synth.raycast import room_setting
 
 WIDTH, HEIGHT = 96, 54
@@ -24,7 +24,7 @@ EXPOSURE, READOUT = 0.06, 0.05
 def motion() -> FrameMotion:
     """A fast frame of a walk."""
     setting = room_setting(16, WIDTH, HEIGHT, 0)
-    path = make_path(setting.course, 16, 0)
+    path = HandheldPath(setting.course, 16, 0)
     frames = [
         follow(path, time, setting.world.depth(path.poses(np.array([time]))[0], setting.lens), setting.lens)
         for time in frame_times(16)

@@ -15,11 +15,11 @@ from cleargs.rva.geometry import cumulative_motion, cut_into_bins
 from cleargs.stages.rva import RvaConfig
 from cleargs.synth.image_motion import follow
 from cleargs.synth.optics import Shutter
-from cleargs.synth.path import FPS, frame_times, make_path
+from cleargs.synth.path import FPS, HandheldPath, frame_times
 from cleargs.synth.phone import LAG, METERED, Look, auto_exposure, coded, phone_look
 from cleargs.synth.protocols import PROTOCOLS, REFERENCE_WIDTH, plan
 from cleargs.synth.raycast import RoomWorld, room_setting
-from cleargs.synth.room import make_balloon, make_room
+from cleargs.synth.room import Balloon, make_room
 from cleargs.synth.synthetic_capture import make_capture
 
 WIDTH, HEIGHT, SEED = 96, 54, 3
@@ -132,8 +132,8 @@ def test_what_moves_is_in_the_frames_and_not_in_the_truth(phone: Path) -> None:
 
 def test_the_balloon_moves_within_an_exposure_and_the_rest_stays() -> None:
     setting, room = room_setting(6, WIDTH, HEIGHT, SEED), make_room(SEED)
-    world, balloon = RoomWorld(room), make_balloon(room, SEED)
-    path = make_path(setting.course, 6, SEED)
+    world, balloon = RoomWorld(room), Balloon(room, SEED)
+    path = HandheldPath(setting.course, 6, SEED)
     pose = path.poses(np.array([0.5]))
     index = np.zeros((8, HEIGHT), np.intp) + np.arange(8)[:, None]
     poses = np.repeat(pose, 8, 0)
@@ -165,7 +165,7 @@ def test_a_trained_scene_and_other_protocols_have_nothing_that_moves(tmp_path: P
 
 def test_a_stretch_leaves_bins_without_a_frame_that_is_worth_its_pixels() -> None:
     setting = room_setting(96, WIDTH, HEIGHT, SEED)
-    path = make_path(setting.course, 96, SEED, stretched=True)
+    path = HandheldPath(setting.course, 96, SEED, stretched=True)
     times = frame_times(96)
     poses = path.poses(times)
     motions = [
