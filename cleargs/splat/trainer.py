@@ -22,7 +22,7 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.backend import backend_for, step_gaussians
+from cleargs.splat.backend import Meter, backend_for, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.effort import decided, seconds_by_step
@@ -104,7 +104,7 @@ class Trainer:
         self._errors: Tensor | None = None  # [N] since the last refinement
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._meter = self._backend.meter(config.ssim_lambda)
+        self._meter = Meter(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [

@@ -23,15 +23,6 @@ Rate = float | Tensor
 """One learning rate, or one per column of a parameter."""
 
 
-class PhotometricLoss(NamedTuple):
-    """weight * ((1 - lambda) l1 + lambda (1 - ssim)) and its gradient; l1 and ssim are unweighted means."""
-
-    loss: float
-    grad_image: Tensor  # [H, W, 3]
-    l1: float
-    ssim: float
-
-
 class Reading(NamedTuple):
     """What a step measured."""
 

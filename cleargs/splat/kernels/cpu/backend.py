@@ -18,7 +18,7 @@ from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
 from cleargs.splat.kernels.cpu.jit import Array, Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
-from cleargs.splat.types import Moments, Rate, Reading
+from cleargs.splat.types import Moments, Rate
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -31,68 +31,41 @@ def rasteriser(device: torch.device) -> CpuRasteriser:
 # -- loss --------------------------------------------------------------------------------------------------
 
 
-class Meter:
-    """The losses of some steps, known at once."""
-
-    def __init__(self, ssim_lambda: float) -> None:
-        self._lambda = ssim_lambda
-        self._readings: list[tuple[int, Reading]] = []
-
-    def __len__(self) -> int:
-        return len(self._readings)
-
-    def add(
-        self,
-        step: int,
-        image: Tensor,
-        target: Tensor,
-        mask: Tensor | None,
-        *,
-        weight: float,
-        gradient: Tensor,
-    ) -> None:
-        shape = (image.shape[0], loss.padded_length(image.shape[1]))
-        padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
-        # The kernels read maps between the padding only, so what is there need not be set.
-        maps = np.empty((3, *shape), np.float32)
-        row_sums = np.empty((shape[0], 3), np.float64)
-        window = loss.ssim_window()
-        with launch.exclusive():
-            loss.pad_images(*_compared(image, target, mask), padded, padded_target, counted)
-            loss.measure(padded, padded_target, counted, window, maps, row_sums)
-            l1, similarity, count = (math.fsum(column) for column in row_sums.T)
-            l1, similarity = (l1 / count, similarity / count) if count else (0.0, 1.0)
-            if weight == 0.0 or count == 0:
-                gradient.zero_()
-            else:
-                loss.differentiate(
-                    padded,
-                    padded_target,
-                    counted,
-                    window,
-                    maps,
-                    np.float32(weight * (1.0 - self._lambda) / count),
-                    np.float32(-weight * self._lambda / count),
-                    gradient.numpy(),
-                )
-        value = weight * ((1.0 - self._lambda) * l1 + self._lambda * (1.0 - similarity)) if count else 0.0
-        self._readings.append((step, Reading(value, l1, similarity, psnr(image, target, mask))))
-
-    def take(self) -> list[tuple[int, Reading]]:
-        taken, self._readings = self._readings, []
-        return taken
+def loss_sums(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    *,
+    l1_weight: float,
+    ssim_weight: float,
+    gradient: Tensor,
+) -> Tensor:
+    shape = (image.shape[0], loss.padded_length(image.shape[1]))
+    padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
+    # The kernels read maps between the padding only, so what is there need not be set.
+    maps = np.empty((3, *shape), np.float32)
+    row_sums = np.empty((shape[0], 3), np.float64)
+    window = loss.ssim_window()
+    with launch.exclusive():
+        loss.pad_images(*_compared(image, target, mask), padded, padded_target, counted)
+        loss.measure(padded, padded_target, counted, window, maps, row_sums)
+        l1, similarity, count = (math.fsum(column) for column in row_sums.T)
+        if count == 0 or l1_weight == ssim_weight == 0.0:
+            gradient.zero_()
+        else:
+            l1_scale, ssim_scale = np.float32(l1_weight / count), np.float32(ssim_weight / count)
+            loss.differentiate(
+                padded, padded_target, counted, window, maps, l1_scale, ssim_scale, gradient.numpy()
+            )
+    squared, _ = squared_errors(image, target, mask)
+    return torch.tensor([l1, similarity, squared, count], dtype=torch.float64)
 
 
-def meter(ssim_lambda: float) -> Meter:
-    return Meter(ssim_lambda)
-
-
-def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[float, float]:
     row_sums = np.empty((image.shape[0], 2), np.float64)
     with launch.exclusive():
         loss.squared_errors(*_compared(image, target, mask), row_sums)
-    total, count = math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
-    return 10.0 * math.log10(count / total) if total > 0.0 else math.inf
+    return math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
 
 
 def _read(tensor: Tensor) -> Floats:
@@ -335,7 +308,7 @@ def warm_up() -> None:
     pipeline.backward(image, plane)
     pipeline.backward(image, plane, plane)
     for counted in (None, mask):
-        Meter(0.2).add(0, image, image, counted, weight=1.0, gradient=image.clone())
+        loss_sums(image, image, counted, l1_weight=0.8, ssim_weight=-0.2, gradient=image.clone())
     adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)
