@@ -108,6 +108,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
+    from cleargs.formation.frames import real_views
     from cleargs.formation.photograph import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
@@ -120,7 +121,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import Trainer
-    from cleargs.splat.views import real_views, require_views
+    from cleargs.splat.views import require_views
 
     config, ingest = context.config, context.inputs["ingest"]
     set_threads(context.threads)
