@@ -74,7 +74,7 @@ def project(gaussians, camera, antialias=False):
     )
     arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
     view = projection.View(*view_numbers(camera))
-    projection.project(*arrays, 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
+    projection.project(tuple(arrays), 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
     return splats, tiles, radii
 
 

@@ -177,7 +177,7 @@ class Rasteriser(ABC):
             )
 
     @abstractmethod
-    def _launching(self) -> AbstractContextManager[None]:
+    def _launching(self) -> AbstractContextManager[Any]:
         """What surrounds the kernels of a pass."""
 
     @abstractmethod
