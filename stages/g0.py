@@ -12,8 +12,7 @@ from pydantic import Field
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
 from cleargs.record import Unit
-from cleargs.splat.budget import INIT_OPACITY, INIT_SCALE
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
 
 from .config import G0_END, TRAINED
 
