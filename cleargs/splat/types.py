@@ -32,6 +32,11 @@ class Reading(NamedTuple):
     psnr: float
 
 
+def group(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors of ``state`` whose names begin with ``prefix``, by the rest of their names."""
+    return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
+
+
 @dataclass
 class Moments:
     """Adam's running means of the gradients and of their squares, by parameter name."""
@@ -51,11 +56,7 @@ class Moments:
     @classmethod
     def of_state(cls, state: dict[str, Tensor]) -> Moments:
         """Those that `state` gave, among whatever else is in ``state``."""
-
-        def group(prefix: str) -> dict[str, Tensor]:
-            return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
-
-        return cls(group("first."), group("second."))
+        return cls(group(state, "first."), group(state, "second."))
 
     def state(self) -> dict[str, Tensor]:
         """Them for a ``state.safetensors``, by ``first.NAME`` and ``second.NAME``."""
