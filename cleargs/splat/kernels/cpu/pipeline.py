@@ -39,10 +39,7 @@ class Frame(rasteriser.Frame):
 
 def read_parameters(gaussians: Gaussians) -> projection.Parameters:
     """Views of the five parameters in the order in which the kernels take them."""
-    means, log_scales, rotations, logits, sh = (
-        tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values()
-    )
-    return means, log_scales, rotations, logits, sh
+    return tuple(tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values())
 
 
 class CpuRasteriser(rasteriser.Rasteriser):

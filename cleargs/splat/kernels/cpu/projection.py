@@ -47,7 +47,7 @@ BLOCK = 128
 
 ZERO = np.float32(0)
 
-Parameters = tuple[Floats, Floats, Floats, Floats, Floats]
+Parameters = tuple[Floats, ...]
 """Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
 
 
