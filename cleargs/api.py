@@ -17,7 +17,7 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
-from cleargs.splat.budget import Quality
+from cleargs.splat.config import Quality
 from cleargs.splat.effort import decided
 
 if TYPE_CHECKING:
@@ -238,8 +238,8 @@ def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | 
     has ``image`` [H, W, 3] float32, and ``formation``, what was undone; None where nothing explains the frame
     better than the render as it is. Raises InputError for a frame without a pose.
     """
+    from cleargs.formation.frames import view_of
     from cleargs.rivr.distillation import Snapshot
-    from cleargs.splat.views import view_of
 
     capture = open_prepared(run["ingest"])
     frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)

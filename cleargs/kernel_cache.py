@@ -30,7 +30,7 @@ def configure_numba(name: str) -> None:
     is defined.
 
     OpenMP is preferred (any Python thread may start a kernel); where it is missing Numba falls back to
-    its own work queue, for which ``launch.exclusive`` keeps launches apart.
+    its own work queue, for which ``jit.LAUNCHING`` keeps launches apart.
     """
     from numba import config
 

@@ -127,14 +127,14 @@ class Prepared:
     def views(self, weights: Mapping[int, float] | None = None) -> list[View]:
         """What a training looks at: the frames with a pose, not held out, whose weight (default: 1) is
         above 0. Images are read when they are needed."""
-        from cleargs.splat.views import real_views
+        from cleargs.formation.frames import real_views
 
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights
         return real_views(self.frames, given, self.folder)
 
     def cameras(self) -> dict[int, Camera]:
         """Frame -> camera, of every frame with a pose, held-out ones too."""
-        from cleargs.splat.views import view_of
+        from cleargs.formation.frames import view_of
 
         posed = (frame for frame in self.frames if frame.registered)
         return {frame.frame_id: view_of(frame, self.folder, 1.0).camera for frame in posed}

@@ -10,8 +10,7 @@ from pydantic import Field
 from cleargs.pipeline.stage import Device
 from cleargs.plugins import installed_version
 from cleargs.record import Inherited, Settings
-from cleargs.splat.budget import steps_from_frames
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import TrainConfig, steps_from_frames
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19
 """Where in the schedule of the whole method the first scene is done, and where RIVR's rounds are."""

@@ -12,8 +12,7 @@ from pydantic import Field
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
 from cleargs.record import Unit
-from cleargs.splat.budget import INIT_OPACITY, INIT_SCALE
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
 
 from .config import G0_END, TRAINED
 
@@ -108,6 +107,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
+    from cleargs.formation.frames import real_views
     from cleargs.formation.photograph import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
@@ -120,7 +120,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.splat.state import save_state
     from cleargs.splat.tables import TRAIN
     from cleargs.splat.trainer import Trainer
-    from cleargs.splat.views import real_views, require_views
+    from cleargs.splat.views import require_views
 
     config, ingest = context.config, context.inputs["ingest"]
     set_threads(context.threads)

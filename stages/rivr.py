@@ -16,8 +16,7 @@ from cleargs.random_streams import Stream
 from cleargs.record import Settings
 from cleargs.rivr.gates import GateConfig
 from cleargs.rivr.harm import HarmConfig
-from cleargs.splat.budget import Quality
-from cleargs.splat.config import TrainConfig
+from cleargs.splat.config import Quality, TrainConfig
 
 from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries

@@ -65,7 +65,7 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
     leaves open are decided as they would be with every registered training frame active.
     """
     from cleargs.capture.tables import load_frames
-    from cleargs.splat.budget import budget_from_pixels
+    from cleargs.splat.config import budget_from_pixels
     from cleargs.splat.initialise import sh_degree_from_views
 
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "train"]

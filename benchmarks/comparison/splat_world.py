@@ -13,13 +13,13 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from cleargs.capture.layouts.transforms import read_transforms
 from cleargs.capture.tables import load_frames
 from cleargs.errors import InputError, StoreError
+from cleargs.formation.frames import view_of
 from cleargs.media.colour import linear_from_srgb
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
-from cleargs.splat.views import view_of
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
 from cleargs.synth.path import Setting
 

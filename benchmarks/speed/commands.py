@@ -11,7 +11,7 @@ import click
 from cleargs.cli.common import json_option, output_option, print_json, quiet_option, threads_or_all
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.pipeline.session import resolve_device
-from cleargs.splat.budget import Quality
+from cleargs.splat.config import Quality
 
 
 @click.command(

@@ -16,13 +16,12 @@ import cleargs
 from benchmarks.speed.benchmark_plan import Case, DevicePlan
 from benchmarks.speed.benchmark_results import Times, named
 from benchmarks.speed.gsplat_cuda import GsplatRasteriser, load_gsplat
-from benchmarks.speed.iteration import SSIM_LAMBDA, Iteration
+from benchmarks.speed.iteration import Iteration
 from benchmarks.speed.oracle import Accuracy, accuracy, choose_pixels, oracle
 from benchmarks.speed.timing import Clock, EventClock, Quartiles, ratio, take_turns
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cuda.loss import Meter
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.pace import random_scene
 
@@ -68,13 +67,9 @@ class DeviceBenchmark:
 class DeviceIteration(Iteration):
     """A training iteration as the trainer runs it on a GPU, where nobody waits for the value of the loss."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, device: torch.device) -> None:
-        super().__init__(gaussians, camera, device)
-        self._meter = Meter(SSIM_LAMBDA)
-
     def differentiate(self, image: Tensor) -> Tensor:
         """See `Iteration`; the loss itself stays on the device."""
-        self._meter.add(len(self._meter), image, self._target, None, weight=1.0, gradient=self._slope)
+        self._meter.add(len(self._meter), image, self._target, gradient=self._slope)
         return self._slope
 
     def run_several(self, repetitions: int, clock: Clock) -> None:

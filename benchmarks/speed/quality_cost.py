@@ -16,7 +16,7 @@ from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.dag import installed
 from cleargs.progress import Reporter
-from cleargs.splat.budget import Quality
+from cleargs.splat.config import Quality
 
 HOLDOUT = "every:8"
 """As in the literature."""

@@ -12,7 +12,7 @@ import click
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.session import usable_cores
-from cleargs.splat.budget import Quality
+from cleargs.splat.config import Quality
 
 F = TypeVar("F", bound=Callable[..., Any])
 

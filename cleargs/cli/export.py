@@ -105,10 +105,10 @@ def export(
     from cleargs.capture.model import moved, read_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
+    from cleargs.formation.frames import view_of
     from cleargs.splat.camera import cameras_json
     from cleargs.splat.ply import read_ply
     from cleargs.splat.transforms import transform_scene
-    from cleargs.splat.views import view_of
 
     ingest = run / dag.names[0]
     posed = [frame for frame in load_frames(ingest) if frame.registered]

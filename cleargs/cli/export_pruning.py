@@ -15,6 +15,7 @@ from cleargs.capture.tables import load_frames
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frames import real_views
 from cleargs.formation.photograph import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
@@ -22,7 +23,7 @@ from cleargs.rva.tables import FRAMES
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.pruning import central_box, contributions, inside
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import View, real_views
+from cleargs.splat.views import View
 
 PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P pixels"
 CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"

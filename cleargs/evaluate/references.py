@@ -27,12 +27,12 @@ from cleargs.evaluate.eval_report import Alignment, PosesFrom
 from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
-from cleargs.splat.views import view_of
 
 T = TypeVar("T")
 

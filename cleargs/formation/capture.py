@@ -24,6 +24,7 @@ from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
 from cleargs.formation.photograph import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
+from cleargs.splat.types import group
 from cleargs.splat.views import View
 
 SEARCH_EVERY = 4
@@ -195,10 +196,8 @@ class CaptureFormation:
         """Resume from what `state` gave."""
         self._frames = {frame.frame_id: frame for frame in unpacked(state["frames"].numpy())}
         if self._affines is not None:
-            prefix = "exposure."
-            self._affines.restore(
-                {name.removeprefix(prefix): t.numpy() for name, t in state.items() if name.startswith(prefix)}
-            )
+            affines = group(state, "exposure.")
+            self._affines.restore({name: tensor.numpy() for name, tensor in affines.items()})
 
     def fault(self) -> str | None:
         """What in it is not finite; None where all is."""

@@ -147,13 +147,7 @@ def photograph(
     affine = None if exposure is None else torch.from_numpy(exposure.of(view.frame_id).astype(np.float32))
     moved = formation if formation is not None and formation.model != "none" else None
     formed = FormedView(view.camera, view.weight, affine=affine, formation=moved)
-    render = engine.forward(
-        scene.gaussians,
-        formed.camera,
-        background=scene.background,
-        antialias=scene.antialias,
-        depth=formed.needs_depth,
-    )
+    render = engine.view(scene, formed.camera, depth=formed.needs_depth)
     return formed.forward(render).clamp(0.0, 1.0)
 
 

@@ -16,12 +16,12 @@ import numpy as np
 from cleargs.capture.cameras import Pose, Similarity, rigid_pose
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.errors import InputError
+from cleargs.formation.frames import view_of
 from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.render.output import Shot
 from cleargs.render.paths import framed, smooth_path, turntable
 from cleargs.splat.camera import Camera
-from cleargs.splat.views import view_of
 from cleargs.untrusted import FAULTS, cause, read_json
 
 World = Literal["normalised", "input"]

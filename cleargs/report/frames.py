@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
+from cleargs.formation.frames import view_of
 from cleargs.formation.table import FORMATION
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import read_rgb, to_uint8
@@ -26,7 +27,6 @@ from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.camera import Camera
 from cleargs.splat.viewer import Viewer
-from cleargs.splat.views import view_of
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles of frames on which RVA has nothing to say."""

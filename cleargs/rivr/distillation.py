@@ -138,13 +138,7 @@ class Snapshot:
         return Deblurred(image, found)
 
     def _with_depth(self, camera: Camera) -> Render:
-        return self._engine.forward(
-            self.scene.gaussians,
-            camera,
-            background=self.scene.background,
-            antialias=self.scene.antialias,
-            depth=True,
-        )
+        return self._engine.view(self.scene, camera, depth=True)
 
     def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity | None:
         """How well the scene explains the held-back frames; None without any.

@@ -50,30 +50,6 @@ class Camera:
                 hint="give focal lengths in pixels",
             )
 
-    @classmethod
-    def from_quaternion(
-        cls,
-        quaternion: Sequence[float],
-        translation: Sequence[float],
-        *,
-        width: int,
-        height: int,
-        fx: float,
-        fy: float,
-        cx: float,
-        cy: float,
-    ) -> Camera:
-        """Camera from COLMAP's world-to-camera quaternion w x y z (normalised here) and translation."""
-        w, x, y, z = np.array(quaternion, np.float64) / np.linalg.norm(quaternion)
-        pose = np.eye(4)
-        pose[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        pose[:3, 3] = translation
-        return cls(width, height, fx, fy, cx, cy, pose)
-
     @property
     def centre(self) -> npt.NDArray[np.float64]:
         """Position of the camera in the world, [3]."""

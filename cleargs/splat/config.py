@@ -3,12 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from cleargs.record import Inherited, Settings
-from cleargs.splat.budget import Quality, steps_from_frames
+
+# Steps and Gaussians where the settings leave them open. Neither is one number for all captures. Steps follow
+# the frames, since each is to be seen often enough; Gaussians follow the pixels, since they have that much to
+# say. `quality` scales both. docs/speed.md has what each step up costs and brings.
+Quality = Literal["draft", "standard", "high"]
+
+STEPS_A_FRAME = 50
+MIN_STEPS, MAX_STEPS = 3200, 7200
+STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
+
+PIXELS_A_GAUSSIAN = 160
+MIN_BUDGET = 40_000
+BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
+
+INIT_SCALE = 0.5
+"""Starting scale of a Gaussian per distance to its neighbours (docs/experiments/training.md)."""
+INIT_OPACITY = 0.5
+"""Starting opacity of a Gaussian (3DGS-MCMC)."""
+
+
+def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
+    """Steps of the first scene of a capture with so many active frames."""
+    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
+
+
+def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
+    """Most Gaussians of a capture whose active frames hold ``pixels`` pixels in all.
+
+    One Gaussian (59 numbers at SH degree 3) for 160 pixels (480 numbers, most seen by several frames),
+    40,000 at least, since fewer cost a small capture a dB, and ``max_budget`` at most: all times the
+    quality's factor.
+    """
+    standard = min(max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET), max_budget)
+    return max(1, int(BUDGET_FACTOR[quality] * standard))
 
 
 class FormationConfig(Settings):
@@ -166,6 +199,10 @@ class TrainConfig(Settings):
     def steps_for(self, frames: int) -> int:
         """Steps of a training of so many active frames."""
         return self.steps or steps_from_frames(frames, self.quality)
+
+    def budget_for(self, pixels: int) -> int:
+        """Most Gaussians of a training whose active frames hold so many pixels in all."""
+        return self.budget or budget_from_pixels(pixels, self.max_budget, self.quality)
 
     @property
     def length(self) -> int:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.splat.budget import budget_from_pixels
 from cleargs.splat.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def training_cost(
     """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames from
     ``start`` Gaussians (None: from as many as it may have)."""
     pixels = round(frames * megapixels * 1e6)
-    budget = config.budget or budget_from_pixels(pixels, config.max_budget, config.quality)
+    budget = config.budget_for(pixels)
     whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})
     seconds = seconds_by_step(whole, frames, megapixels, budget if start is None else min(start, budget))
     return float(seconds.sum()), 1.5e-6 * budget
@@ -66,9 +65,5 @@ def training_cost(
 def decided(config: Settings, views: Sequence[View]) -> Settings:
     """``config`` with the steps and the budget that it leaves open, for these views."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
-    return config.model_copy(
-        update={
-            "steps": config.steps_for(len(views)),
-            "budget": config.budget or budget_from_pixels(pixels, config.max_budget, config.quality),
-        }
-    )
+    update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}
+    return config.model_copy(update=update)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cleargs.random_streams import Stream
-from cleargs.splat.budget import INIT_OPACITY, INIT_SCALE
+from cleargs.splat.config import INIT_OPACITY, INIT_SCALE
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.views import View

@@ -136,7 +136,7 @@ def _measure() -> float:
     """
     import torch
 
-    from cleargs.splat.backend import photometric_loss, rasteriser_for, set_threads, step_gaussians
+    from cleargs.splat.backend import Meter, rasteriser_for, set_threads, step_gaussians
     from cleargs.splat.types import Moments
 
     set_threads(1)
@@ -144,13 +144,13 @@ def _measure() -> float:
     gaussians, camera = random_scene(SPLATS, WIDTH, HEIGHT)
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     slope = torch.empty_like(target)
-    engine, moments = rasteriser_for(), Moments.zeros(gaussians)
+    engine, meter, moments = rasteriser_for(), Meter("cpu", 0.2), Moments.zeros(gaussians)
     rates: dict[str, float | torch.Tensor] = dict.fromkeys(gaussians.tensors(), 0.0)
     times = []
     for step in range(1, REPEATS + 1):
         start = time.process_time()
         image = engine.forward(gaussians, camera).image
-        photometric_loss(image, target, ssim_lambda=0.2, gradient=slope)
+        meter.add(step, image, target, gradient=slope)
         step_gaussians(gaussians, engine.backward(slope), moments, rates, step=step)
         times.append(time.process_time() - start)
     return round(1e3 * min(times), 2)

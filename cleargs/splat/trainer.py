@@ -22,7 +22,7 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.backend import backend_for, step_gaussians
+from cleargs.splat.backend import Meter, backend_for, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.effort import decided, seconds_by_step
@@ -33,7 +33,7 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
-from cleargs.splat.types import Moments, Render
+from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, View, require_views
 from cleargs.termination import deferred_sigterm
 
@@ -104,7 +104,7 @@ class Trainer:
         self._errors: Tensor | None = None  # [N] since the last refinement
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._meter = self._backend.meter(config.ssim_lambda)
+        self._meter = Meter(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
@@ -260,19 +260,14 @@ class Trainer:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Resume from what `state` returned, in a training with the same arguments."""
-
-        def group(name: str) -> dict[str, Tensor]:
-            prefix = f"{name}."
-            return {key.removeprefix(prefix): t for key, t in state.items() if key.startswith(prefix)}
-
         self.done = int(state["step"])
         self._log.restore(state["log"])
-        self._gaussians = Gaussians(**group("parameter")).to(self._device)
+        self._gaussians = Gaussians(**group(state, "parameter.")).to(self._device)
         self._moments = Moments.of_state(state).to(self._device)
         errors = state.get("strategy.errors")
         self._errors = None if errors is None else errors.to(self._device)
         if self._formation is not None:
-            self._formation.restore(group("formation"))
+            self._formation.restore(group(state, "formation."))
 
     def rows(self, round: int) -> pa.Table:
         """The log so far, one row a step."""
@@ -297,14 +292,7 @@ class Trainer:
         return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
 
     def _render(self, camera: Camera, *, depth: bool) -> Render:
-        return self._rasteriser.forward(
-            self._gaussians,
-            camera,
-            sh_degree=self._sh_degree(),
-            background=self._scene.background,
-            antialias=self._scene.antialias,
-            depth=depth,
-        )
+        return self._rasteriser.view(self.scene, camera, depth=depth, sh_degree=self._sh_degree())
 
     def _sh_degree(self) -> int:
         return self._schedule.sh_degree(self._at, self._gaussians.sh_degree)

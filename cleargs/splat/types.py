@@ -23,15 +23,6 @@ Rate = float | Tensor
 """One learning rate, or one per column of a parameter."""
 
 
-class PhotometricLoss(NamedTuple):
-    """weight * ((1 - lambda) l1 + lambda (1 - ssim)) and its gradient; l1 and ssim are unweighted means."""
-
-    loss: float
-    grad_image: Tensor  # [H, W, 3]
-    l1: float
-    ssim: float
-
-
 class Reading(NamedTuple):
     """What a step measured."""
 
@@ -39,6 +30,11 @@ class Reading(NamedTuple):
     l1: float
     ssim: float
     psnr: float
+
+
+def group(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors of ``state`` whose names begin with ``prefix``, by the rest of their names."""
+    return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
 
 
 @dataclass
@@ -60,11 +56,7 @@ class Moments:
     @classmethod
     def of_state(cls, state: dict[str, Tensor]) -> Moments:
         """Those that `state` gave, among whatever else is in ``state``."""
-
-        def group(prefix: str) -> dict[str, Tensor]:
-            return {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
-
-        return cls(group("first."), group("second."))
+        return cls(group(state, "first."), group(state, "second."))
 
     def state(self) -> dict[str, Tensor]:
         """Them for a ``state.safetensors``, by ``first.NAME`` and ``second.NAME``."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -26,47 +24,6 @@ UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 """Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
 
 
-class Frame(Protocol):
-    """What a view needs to know of a frame of ingest; see `cleargs.capture.tables.Frame`."""
-
-    @property
-    def frame_id(self) -> int: ...
-    @property
-    def image(self) -> str: ...
-    @property
-    def mask(self) -> str | None: ...
-    @property
-    def registered(self) -> bool: ...
-    @property
-    def split(self) -> str: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def fx(self) -> float: ...
-    @property
-    def fy(self) -> float: ...
-    @property
-    def cx(self) -> float: ...
-    @property
-    def cy(self) -> float: ...
-    @property
-    def qw(self) -> float | None: ...
-    @property
-    def qx(self) -> float | None: ...
-    @property
-    def qy(self) -> float | None: ...
-    @property
-    def qz(self) -> float | None: ...
-    @property
-    def tx(self) -> float | None: ...
-    @property
-    def ty(self) -> float | None: ...
-    @property
-    def tz(self) -> float | None: ...
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """One image that a scene should explain."""
@@ -80,38 +37,6 @@ class View:
     load: Callable[[], tuple[Pixels, Mask | None]]
     """Gives image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and mask [H, W] (True counts; None: all do).
     Called when first needed, and again when the cache could not keep the image."""
-
-
-def view_of(frame: Frame, folder: Path, weight: float) -> View:
-    """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
-    numbers = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
-    pose = [float(value) for value in numbers if value is not None]
-    if not frame.registered or len(pose) < len(numbers):
-        raise ValueError(f"frame {frame.frame_id} has no pose")
-    camera = Camera.from_quaternion(
-        pose[:4],
-        pose[4:],
-        width=frame.width,
-        height=frame.height,
-        fx=frame.fx,
-        fy=frame.fy,
-        cx=frame.cx,
-        cy=frame.cy,
-    )
-    image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
-    return View(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
-
-
-def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[View]:
-    """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
-    active = [
-        frame
-        for frame in frames
-        if frame.registered and frame.split == "train" and weights.get(frame.frame_id, 0.0) > 0.0
-    ]
-    return [
-        view_of(frame, folder, weights[frame.frame_id]) for frame in sorted(active, key=lambda f: f.frame_id)
-    ]
 
 
 def require_views(views: Sequence[View]) -> None:
@@ -216,13 +141,3 @@ def _prepare(view: View, factor: float, training: bool) -> tuple[NDArray[np.gene
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return (image if image.dtype == np.uint8 else image.astype(np.float16)), mask
-
-
-def _load(image: Path, mask: Path | None) -> tuple[Pixels, Mask | None]:
-    """Decode a PNG and its mask (0 = ignore)."""
-    pixels = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
-    ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask is not None else None
-    if pixels is None or (mask is not None and ignored is None):
-        missing = image if pixels is None else mask
-        raise StageError(f"cannot read {missing}", hint="run ingest again with --force ingest")
-    return pixels, None if ignored is None else ignored > 0

@@ -28,7 +28,7 @@ from cleargs.pipeline.run_file import RUN_FILE
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import STORE_FOLDER
 from cleargs.progress import SilentReporter
-from cleargs.splat.budget import budget_from_pixels
+from cleargs.splat.config import budget_from_pixels
 from cleargs.splat.initialise import sh_degree_from_views
 from cleargs.synth.synthetic_capture import make_capture
 

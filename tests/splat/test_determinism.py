@@ -13,7 +13,8 @@ PROGRAM = """
 import hashlib, sys
 import torch
 from helpers.splat_scenes import make_camera, make_gaussians
-from cleargs.splat.backend import adam_step, photometric_loss, psnr, rasteriser_for
+from cleargs.splat.backend import psnr, rasteriser_for
+from helpers.losses import adam_step, photometric_loss
 from cleargs.formation.exposure import affine_backward
 from cleargs.splat.backend import set_threads
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from helpers.losses import adam_step, photometric_loss
 from helpers.splat_scenes import (
     BACKGROUND,
     assert_close,
@@ -18,7 +19,7 @@ from helpers.splat_scenes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cleargs.splat.backend import adam_step, photometric_loss, rasteriser_for
+from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference

@@ -7,10 +7,11 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812  # torch's own name for it
+from helpers.losses import adam_step, photometric_loss
 
 from cleargs.errors import InputError
 from cleargs.formation.exposure import affine_backward, apply_affine
-from cleargs.splat.backend import adam_step, photometric_loss, psnr
+from cleargs.splat.backend import psnr
 
 
 def images(height: int, width: int, device: torch.device | str = "cpu"):
@@ -114,14 +115,6 @@ def test_masks():
     assert psnr(image, target, mask) == psnr(image, changed, mask)
 
 
-def test_gradient_is_written_in_place():
-    image, target, _ = images(20, 30)
-    gradient = torch.full((20, 30, 3), 7.0)
-    result = photometric_loss(image, target, ssim_lambda=0.2, gradient=gradient)
-    assert result.grad_image is gradient
-    assert torch.equal(gradient, photometric_loss(image, target, ssim_lambda=0.2).grad_image)
-
-
 def test_equal_images():
     image, _, _ = images(20, 30)
     result = photometric_loss(image, image, ssim_lambda=0.2)
@@ -138,10 +131,10 @@ def test_psnr():
     assert psnr(image, target, mask) == pytest.approx(-10 * math.log10(error[mask].mean().item()), abs=1e-9)
 
 
-def test_loss_refuses_what_does_not_fit():
+def test_psnr_refuses_what_does_not_fit():
     image, target, _ = images(8, 9)
     with pytest.raises(InputError, match="compared"):
-        photometric_loss(image, target[:5], ssim_lambda=0.2)
+        psnr(image, target[:5])
     with pytest.raises(InputError, match="float64"):
         psnr(image.double(), target)
     with pytest.raises(InputError, match="mask"):
@@ -174,8 +167,6 @@ def test_adam_takes_a_rate_per_column(device):
     adam_step(mine, gradient, first, second, 1, rates)
     expected = gradient.sign() * rates.to(device).reshape(4, 3)
     torch.testing.assert_close(start - mine, expected, rtol=1e-4, atol=1e-6)
-    with pytest.raises(InputError, match="Adam got"):
-        adam_step(mine, gradient[:5], first, second, 1, 0.1)
 
 
 def test_exposure_equals_autograd(device):

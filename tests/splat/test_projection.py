@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from helpers.splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians, make_needles
 
+from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
+from cleargs.formation.frames import view_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
@@ -70,7 +74,7 @@ def project(gaussians, camera, antialias=False):
     )
     arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
     view = projection.View(*view_numbers(camera))
-    projection.project(*arrays, 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
+    projection.project(tuple(arrays), 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
     return splats, tiles, radii
 
 
@@ -124,9 +128,19 @@ def test_order_is_by_depth_then_index():
 
 
 def test_camera():
-    camera = Camera.from_quaternion(
-        [2 * np.cos(0.3), 0, 2 * np.sin(0.3), 0], [1, 2, 3], width=100, height=50, fx=80, fy=70, cx=51, cy=24
-    )
+    pose = {
+        "qw": 2 * np.cos(0.3),
+        "qx": 0.0,
+        "qy": 2 * np.sin(0.3),
+        "qz": 0.0,
+        "tx": 1.0,
+        "ty": 2.0,
+        "tz": 3.0,
+    }
+    lens = {"width": 100, "height": 50, "fx": 80.0, "fy": 70.0, "cx": 51.0, "cy": 24.0}
+    rest = {"name": "a", "time_s": None, "n_points": 0, "split": "train", "placed": None, "mask": None}
+    frame = Frame(frame_id=0, image="images/000000.png", registered=True, **pose, **lens, **rest)
+    camera = view_of(frame, Path(), 1.0).camera
     # A turn by 0.6 about y takes z to x = sin 0.6.
     np.testing.assert_allclose(camera.world_to_camera[:3, 2], [np.sin(0.6), 0, np.cos(0.6)], atol=1e-15)
     np.testing.assert_allclose(camera.world_to_camera @ [*camera.centre, 1], [0, 0, 0, 1], atol=1e-15)

@@ -22,10 +22,9 @@ from cleargs.formation.exposure import Exposure, centred
 from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
-from cleargs.splat.backend import set_threads
+from cleargs.splat.backend import Meter, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu.backend import Meter
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
 from cleargs.splat.state import load_state, read_moments, save_state

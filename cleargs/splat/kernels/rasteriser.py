@@ -17,6 +17,7 @@ from cleargs.splat.constants import SH_DEGREES, VIEW_CLAMP
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.support import available_memory
 from cleargs.splat.kernels.splat_layout import MAX_PAIRS, TILE
+from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 
 UNASKED = 2**28
@@ -152,6 +153,19 @@ class Rasteriser(ABC):
             self._frame = self._bin(asked, background, depth)
             return self._blend(self._frame, depth)
 
+    def view(
+        self, scene: Scene, camera: Camera, *, depth: bool = False, sh_degree: int | None = None
+    ) -> Render:
+        """Render a view as the scene is meant to be rendered; see `forward`."""
+        return self.forward(
+            scene.gaussians,
+            camera,
+            sh_degree=sh_degree,
+            background=scene.background,
+            antialias=scene.antialias,
+            depth=depth,
+        )
+
     def backward(
         self,
         grad_image: Tensor,  # [H, W, 3]
@@ -177,7 +191,7 @@ class Rasteriser(ABC):
             )
 
     @abstractmethod
-    def _launching(self) -> AbstractContextManager[None]:
+    def _launching(self) -> AbstractContextManager[Any]:
         """What surrounds the kernels of a pass."""
 
     @abstractmethod

@@ -14,11 +14,11 @@ from cleargs.splat import densification
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu import elementwise, frame_warp, launch, loss
-from cleargs.splat.kernels.cpu.jit import Array, Floats
+from cleargs.splat.kernels.cpu import elementwise, frame_warp, loss
+from cleargs.splat.kernels.cpu.jit import LAUNCHING, Array, Floats
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
-from cleargs.splat.types import Moments, Rate, Reading
+from cleargs.splat.types import Moments, Rate
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -31,68 +31,41 @@ def rasteriser(device: torch.device) -> CpuRasteriser:
 # -- loss --------------------------------------------------------------------------------------------------
 
 
-class Meter:
-    """The losses of some steps, known at once."""
-
-    def __init__(self, ssim_lambda: float) -> None:
-        self._lambda = ssim_lambda
-        self._readings: list[tuple[int, Reading]] = []
-
-    def __len__(self) -> int:
-        return len(self._readings)
-
-    def add(
-        self,
-        step: int,
-        image: Tensor,
-        target: Tensor,
-        mask: Tensor | None,
-        *,
-        weight: float,
-        gradient: Tensor,
-    ) -> None:
-        shape = (image.shape[0], loss.padded_length(image.shape[1]))
-        padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
-        # The kernels read maps between the padding only, so what is there need not be set.
-        maps = np.empty((3, *shape), np.float32)
-        row_sums = np.empty((shape[0], 3), np.float64)
-        window = loss.ssim_window()
-        with launch.exclusive():
-            loss.pad_images(*_compared(image, target, mask), padded, padded_target, counted)
-            loss.measure(padded, padded_target, counted, window, maps, row_sums)
-            l1, similarity, count = (math.fsum(column) for column in row_sums.T)
-            l1, similarity = (l1 / count, similarity / count) if count else (0.0, 1.0)
-            if weight == 0.0 or count == 0:
-                gradient.zero_()
-            else:
-                loss.differentiate(
-                    padded,
-                    padded_target,
-                    counted,
-                    window,
-                    maps,
-                    np.float32(weight * (1.0 - self._lambda) / count),
-                    np.float32(-weight * self._lambda / count),
-                    gradient.numpy(),
-                )
-        value = weight * ((1.0 - self._lambda) * l1 + self._lambda * (1.0 - similarity)) if count else 0.0
-        self._readings.append((step, Reading(value, l1, similarity, psnr(image, target, mask))))
-
-    def take(self) -> list[tuple[int, Reading]]:
-        taken, self._readings = self._readings, []
-        return taken
+def loss_sums(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    *,
+    l1_weight: float,
+    ssim_weight: float,
+    gradient: Tensor,
+) -> Tensor:
+    shape = (image.shape[0], loss.padded_length(image.shape[1]))
+    padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
+    # The kernels read maps between the padding only, so what is there need not be set.
+    maps = np.empty((3, *shape), np.float32)
+    row_sums = np.empty((shape[0], 3), np.float64)
+    window = loss.ssim_window()
+    with LAUNCHING:
+        loss.pad_images(*_compared(image, target, mask), padded, padded_target, counted)
+        loss.measure(padded, padded_target, counted, window, maps, row_sums)
+        l1, similarity, count = (math.fsum(column) for column in row_sums.T)
+        if count == 0 or l1_weight == ssim_weight == 0.0:
+            gradient.zero_()
+        else:
+            l1_scale, ssim_scale = np.float32(l1_weight / count), np.float32(ssim_weight / count)
+            loss.differentiate(
+                padded, padded_target, counted, window, maps, l1_scale, ssim_scale, gradient.numpy()
+            )
+    squared, _ = squared_errors(image, target, mask)
+    return torch.tensor([l1, similarity, squared, count], dtype=torch.float64)
 
 
-def meter(ssim_lambda: float) -> Meter:
-    return Meter(ssim_lambda)
-
-
-def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[float, float]:
     row_sums = np.empty((image.shape[0], 2), np.float64)
-    with launch.exclusive():
+    with LAUNCHING:
         loss.squared_errors(*_compared(image, target, mask), row_sums)
-    total, count = math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
-    return 10.0 * math.log10(count / total) if total > 0.0 else math.inf
+    return math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
 
 
 def _read(tensor: Tensor) -> Floats:
@@ -115,7 +88,7 @@ def adam_step(
     beta1, beta2 = ADAM_BETAS
     corrected = np.broadcast_to(rates / (1.0 - beta1**step), (columns,)).astype(np.float32)
     value, slope, m, v = (tensor.detach().view(-1).numpy() for tensor in (parameter, gradient, first, second))
-    with launch.exclusive():
+    with LAUNCHING:
         elementwise.adam(
             value,
             slope,
@@ -176,7 +149,7 @@ def add_position_noise(
     gaussians: Gaussians, *, amount: float, min_opacity: float, seed: Sequence[int]
 ) -> None:
     key = np.random.SeedSequence([*seed]).generate_state(1, np.uint64)[0]
-    with launch.exclusive():
+    with LAUNCHING:
         elementwise.add_noise(
             gaussians.means.numpy(),
             gaussians.log_scales.numpy(),
@@ -194,7 +167,7 @@ def add_position_noise(
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
     output = torch.empty(image.shape)
-    with launch.exclusive():
+    with LAUNCHING:
         elementwise.apply_affine(_read(image), _read(affine.float()), output.numpy())
     return output
 
@@ -202,7 +175,7 @@ def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
 def affine_backward(image: Tensor, affine: Tensor, grad_output: Tensor) -> tuple[Tensor, Tensor]:
     grad_image = torch.empty(image.shape)
     row_sums = np.empty((image.shape[0], 3, 4), np.float64)
-    with launch.exclusive():
+    with LAUNCHING:
         elementwise.affine_backward(
             _read(image), _read(affine.float()), _read(grad_output), grad_image.numpy(), row_sums
         )
@@ -217,7 +190,7 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
     height, width = (side - 2 * margin for side in depth.shape)
     offset, sweep = torch.empty(2, height, width), torch.empty(2, height, width)
     radius, reach = torch.empty(height, width), np.empty(height)
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.displacements(
             _read(depth),
             _read(alpha),
@@ -234,7 +207,7 @@ def displacements(depth: Tensor, alpha: Tensor, motion: Tensor, *, margin: int) 
 def expose(image: Tensor, fields: DisplacementFields, samples: Tensor, *, margin: int) -> Tensor:
     offset, sweep, radius = map(_read, fields[:3])
     light = torch.empty(*radius.shape, CHANNELS)
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.expose(_read(image), margin, offset, sweep, radius, _read(samples), light.numpy())
     return light
 
@@ -247,7 +220,7 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
     reach = rows if fields.reach is None else min(math.ceil(fields.reach) + 3, rows)
     count = -(-height // frame_warp.BAND)
     bands = np.empty((count, frame_warp.BAND + 2 * reach, columns, CHANNELS), np.float32)
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.spread(_read(light), margin, reach, offset, sweep, radius, _read(samples), bands, rows)
         frame_warp.gather(bands, margin, reach, image.numpy())
     return image
@@ -255,14 +228,14 @@ def expose_backward(light: Tensor, fields: DisplacementFields, samples: Tensor, 
 
 def through_curve(image: Tensor, curve: Tensor, channels: int) -> tuple[Tensor, Tensor]:
     out, slope = torch.empty(*image.shape[:2], channels), torch.empty(*image.shape[:2], 3)
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.apply_curve(_read(image), _read(curve), out.numpy(), slope.numpy())
     return out, slope
 
 
 def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
     out = torch.empty(*slope.shape[:2], channels)
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.multiply(_read(light), _read(slope), out.numpy())
     return out
 
@@ -279,7 +252,7 @@ def misfit(
     limit: float,
 ) -> float:
     rows = np.empty(len(image))
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.misfits(image, observed, weight, *fields, samples, limit, rows)
     return math.fsum(rows)
 
@@ -298,7 +271,7 @@ def normal_equations(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     height, count = len(observed), len(active)
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
-    with launch.exclusive():
+    with LAUNCHING:
         frame_warp.normal_equations(
             stack, observed, weight, basis, down, offset, sweep, times, outlier, active, matrices, sides
         )
@@ -335,7 +308,7 @@ def warm_up() -> None:
     pipeline.backward(image, plane)
     pipeline.backward(image, plane, plane)
     for counted in (None, mask):
-        Meter(0.2).add(0, image, image, counted, weight=1.0, gradient=image.clone())
+        loss_sums(image, image, counted, l1_weight=0.8, ssim_weight=-0.2, gradient=image.clone())
     adam_step(row, row.clone(), row.clone(), row.clone(), 1, 0.0)
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)

@@ -18,6 +18,7 @@ from cleargs.splat.kernels.cpu.projection import (
     DILATION,
     QUATERNION_EPSILON,
     ZERO,
+    Parameters,
     View,
     camera_position,
     cross,
@@ -82,25 +83,19 @@ def colour_gradient(
 @device
 def backpropagate_one(
     g: int,
-    means: Floats,
-    log_scales: Floats,
-    rotations: Floats,
-    logits: Floats,
-    sh: Floats,
+    parameters: Parameters,
     sh_count: int,
     view: View,
     antialias: bool,
     splats: Floats,
     sums: Array,
-    grad_means: Floats,
-    grad_log_scales: Floats,
-    grad_rotations: Floats,
-    grad_logits: Floats,
-    grad_sh: Floats,
+    outputs: Parameters,
     basis: Floats,
     weights: Floats,
 ) -> None:
     """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see splat_layout.SUM_*)."""
+    means, log_scales, rotations, logits, sh = parameters
+    grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     x, y, z = camera_position(means[g], view)
     qw, qx, qy, qz, norm = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
@@ -227,50 +222,33 @@ def backpropagate_one(
 
 
 @device
-def clear_gradients(
-    g: int,
-    grad_means: Floats,
-    grad_log_scales: Floats,
-    grad_rotations: Floats,
-    grad_logits: Floats,
-    grad_sh: Floats,
-) -> None:
+def clear_gradients(g: int, outputs: Parameters) -> None:
     """Zero gradient for a Gaussian that touches no tile."""
+    grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     grad_means[g, :] = ZERO
     grad_log_scales[g, :] = ZERO
     grad_rotations[g, :] = ZERO
     grad_logits[g] = ZERO
-    for k in range(grad_sh.shape[1]):
-        grad_sh[g, k, 0] = ZERO
-        grad_sh[g, k, 1] = ZERO
-        grad_sh[g, k, 2] = ZERO
+    grad_sh[g, :, :] = ZERO
 
 
 @kernel
 def backpropagate(
-    means: Floats,
-    log_scales: Floats,
-    rotations: Floats,
-    logits: Floats,
-    sh: Floats,
+    parameters: Parameters,
     sh_count: int,
     view: View,
     antialias: bool,
     splats: Floats,
     pair_offsets: Array,
     pair_sums: Floats,
-    grad_means: Floats,
-    grad_log_scales: Floats,
-    grad_rotations: Floats,
-    grad_logits: Floats,
-    grad_sh: Floats,
+    outputs: Parameters,
 ) -> None:
     """Gradients of the five parameters from the (tile, splat) sums of the rasteriser's backward pass.
 
     The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``;
     they are added in their order in float64, so nothing races and nothing depends on the threads.
     """
-    n = means.shape[0]
+    n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis = np.empty(16, np.float32)
         weights = np.empty(16, np.float32)
@@ -278,29 +256,10 @@ def backpropagate(
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             begin, end = pair_offsets[g], pair_offsets[g + 1]
             if begin == end:
-                clear_gradients(g, grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh)
+                clear_gradients(g, outputs)
                 continue
             sums[:] = 0.0
             for pair in range(begin, end):
                 for column in range(pair_sums.shape[1]):
                     sums[column] += pair_sums[pair, column]
-            backpropagate_one(
-                g,
-                means,
-                log_scales,
-                rotations,
-                logits,
-                sh,
-                sh_count,
-                view,
-                antialias,
-                splats,
-                sums,
-                grad_means,
-                grad_log_scales,
-                grad_rotations,
-                grad_logits,
-                grad_sh,
-                basis,
-                weights,
-            )
+            backpropagate_one(g, parameters, sh_count, view, antialias, splats, sums, outputs, basis, weights)

@@ -11,6 +11,7 @@ its neighbours in the loop, which makes results bitwise independent of the numbe
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -27,6 +28,10 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
 FAST = frozenset({"contract", "nsz", "arcp"})
+
+LAUNCHING = threading.RLock()
+"""Held around a group of kernels. The threads are one resource of the process: Numba's work queue, the layer
+where OpenMP is missing, aborts when two Python threads launch kernels at once."""
 
 
 def kernel_digest() -> str:

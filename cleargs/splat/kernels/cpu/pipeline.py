@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
-from cleargs.splat.kernels.cpu import binning, gradients, launch, projection, rasterise
-from cleargs.splat.kernels.cpu.jit import Array, Floats
+from cleargs.splat.kernels.cpu import binning, gradients, projection, rasterise
+from cleargs.splat.kernels.cpu.jit import LAUNCHING, Array, Floats
 from cleargs.splat.kernels.splat_layout import PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH
 from cleargs.splat.types import Render
+
+TILES_PER_CHUNK = 8
+"""Tiles handed to a thread at a time: real scenes are uneven, so the queue must be finer than the threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +37,9 @@ class Frame(rasteriser.Frame):
     last: Floats  # [H, W]
 
 
-def read_parameters(gaussians: Gaussians) -> tuple[Array, Array, Array, Array, Array]:
+def read_parameters(gaussians: Gaussians) -> projection.Parameters:
     """Views of the five parameters in the order in which the kernels take them."""
-    means, log_scales, rotations, logits, sh = (
-        tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values()
-    )
-    return means, log_scales, rotations, logits, sh
+    return tuple(tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values())
 
 
 class CpuRasteriser(rasteriser.Rasteriser):
@@ -49,8 +51,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
     def __init__(self) -> None:
         super().__init__(torch.device("cpu"))
 
-    def _launching(self) -> AbstractContextManager[None]:
-        return launch.exclusive()
+    def _launching(self) -> AbstractContextManager[Any]:
+        return LAUNCHING
 
     def _floats(self, name: str, *shape: int) -> Floats:
         return self._buffers.take(name, *shape).numpy()
@@ -69,7 +71,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)
         projection.project(
-            *read_parameters(gaussians),
+            read_parameters(gaussians),
             asked.sh_count,
             view,
             asked.antialias,
@@ -90,7 +92,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         pair_tiles = self._numbers("pair_tiles", pairs)
         binning.list_pairs(splats, pair_offsets, width, height, pair_tiles)
         tiles = rasteriser.tiles_of(camera)
-        counts = self._integers("counts", launch.threads(), tiles)
+        counts = self._integers("counts", numba.get_num_threads(), tiles)
         tile_offsets = self._integers("tile_offsets", tiles + 1)
         pair_ids, pair_slots = self._numbers("pair_ids", pairs), self._numbers("pair_slots", pairs)
         binning.sort_pairs_by_tile(
@@ -113,7 +115,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         width, height = frame.camera.width, frame.camera.height
         image = self._floats("image", height, width, 3)
         depths = self._floats("depth", height, width) if depth else None
-        with launch.uneven_work():
+        with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.forward(
                 width,
                 height,
@@ -138,7 +140,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
     ) -> Gaussians:
         columns = SUM_DEPTH if grad_depth is None else PAIR_COLUMNS
         pair_sums = self._floats("pair_sums", len(frame.pair_ids), columns)
-        with launch.uneven_work():
+        with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.backward(
                 frame.camera.width,
                 frame.camera.height,
@@ -157,13 +159,13 @@ class CpuRasteriser(rasteriser.Rasteriser):
         parameters = frame.gaussians.tensors()
         outputs = {name: self._floats(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         gradients.backpropagate(
-            *read_parameters(frame.gaussians),
+            read_parameters(frame.gaussians),
             frame.sh_count,
             frame.view,
             frame.antialias,
             frame.splats,
             frame.pair_offsets,
             pair_sums,
-            *outputs.values(),
+            tuple(outputs.values()),
         )
         return Gaussians(**{name: torch.from_numpy(output) for name, output in outputs.items()})

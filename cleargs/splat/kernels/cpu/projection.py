@@ -47,6 +47,9 @@ BLOCK = 128
 
 ZERO = np.float32(0)
 
+Parameters = tuple[Floats, ...]
+"""Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
+
 
 class View(NamedTuple):
     """A camera as the kernels read it: world-to-camera rotation rows, translation, intrinsics, bounds."""
@@ -150,11 +153,7 @@ def projection_rows(
 @device
 def project_one(
     g: int,
-    means: Floats,
-    log_scales: Floats,
-    rotations: Floats,
-    logits: Floats,
-    sh: Floats,
+    parameters: Parameters,
     sh_count: int,
     view: View,
     antialias: bool,
@@ -162,6 +161,7 @@ def project_one(
     basis: Floats,
 ) -> bool:
     """Write the packed splat of Gaussian ``g``; False when it is culled (behind, too faint, not finite)."""
+    means, log_scales, rotations, logits, sh = parameters
     x, y, z = camera_position(means[g], view)
     if not NEAR <= z <= FLOAT32_MAX:  # also when z is NaN
         return False
@@ -218,11 +218,7 @@ def project_one(
 
 @kernel
 def project(
-    means: Floats,
-    log_scales: Floats,
-    rotations: Floats,
-    logits: Floats,
-    sh: Floats,
+    parameters: Parameters,
     sh_count: int,
     view: View,
     antialias: bool,
@@ -236,14 +232,12 @@ def project(
 
     Culled Gaussians have no tile and radius 0; their rows of ``splats`` are left as they were.
     """
-    n = means.shape[0]
+    n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis = np.empty(16, np.float32)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             tiles = 0
-            if project_one(
-                g, means, log_scales, rotations, logits, sh, sh_count, view, antialias, splats, basis
-            ):
+            if project_one(g, parameters, sh_count, view, antialias, splats, basis):
                 tiles = count_tiles(splats[g], width, height)
             tile_counts[g] = tiles
             radii[g] = max(splats[g, layout.EXTENT_X], splats[g, layout.EXTENT_Y]) if tiles > 0 else ZERO

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -19,7 +17,7 @@ from cleargs.splat.kernels.cuda.frame_warp import expose as expose
 from cleargs.splat.kernels.cuda.frame_warp import expose_backward as expose_backward
 from cleargs.splat.kernels.cuda.frame_warp import through_curve as through_curve
 from cleargs.splat.kernels.cuda.frame_warp import times_slope as times_slope
-from cleargs.splat.kernels.cuda.loss import Meter
+from cleargs.splat.kernels.cuda.loss import loss_sums as loss_sums
 from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 
 
@@ -33,15 +31,10 @@ def warm_up() -> None:
     """Nothing: Triton compiles a kernel for the types and sizes of its first call."""
 
 
-def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[float, float]:
     errors = (image.detach().double() - target.double()).square()
     errors = errors if mask is None else errors[mask]
-    mean = float(errors.mean()) if errors.numel() else 0.0
-    return -10.0 * math.log10(mean) if mean > 0.0 else math.inf
-
-
-def meter(ssim_lambda: float) -> Meter:
-    return Meter(ssim_lambda)
+    return float(errors.sum()), float(errors.numel())
 
 
 def regularise(gaussians: Gaussians, gradients: Gaussians, *, opacity: float, scale: float) -> None:

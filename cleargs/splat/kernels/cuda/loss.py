@@ -12,9 +12,6 @@ Each program leaves its sums in float64 at a place of its own, and torch adds th
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 import torch
 import triton
 import triton.language as tl
@@ -23,7 +20,6 @@ from torch import Tensor
 from cleargs.splat import constants
 from cleargs.splat.kernels.cuda import device_layout
 from cleargs.splat.kernels.cuda.support import memory_errors
-from cleargs.splat.types import Reading
 
 ROWS = 4
 COLUMNS = 128
@@ -208,81 +204,41 @@ def differentiate(
     tl.store(gradient + y * length + i, value, mask=here)
 
 
-class Meter:
-    """The losses of some steps, kept on the device until they are read together: one wait for all of them."""
-
-    def __init__(self, ssim_lambda: float) -> None:
-        self._lambda = ssim_lambda
-        self._pending: list[tuple[int, float, Tensor]] = []
-        self._memory: Tensor | None = None
-
-    def __len__(self) -> int:
-        """Number of steps that wait to be read."""
-        return len(self._pending)
-
-    @memory_errors()
-    def add(
-        self,
-        step: int,
-        image: Tensor,  # [H, W, 3]
-        target: Tensor,  # [H, W, 3]
-        mask: Tensor | None,  # [H, W] bool, True = counts
-        *,
-        weight: float,
-        gradient: Tensor,  # [H, W, 3] to write into
-    ) -> None:
-        """Write the gradient of a step's loss (see ``backend.photometric_loss``) and keep its sums: those of
-        |x - y|, SSIM and (x - y)² over the values that count, and their number, [4] float64."""
-        height, length = image.shape[0], 3 * image.shape[1]
-        size = height * length
-        if self._memory is None or len(self._memory) < 8 * size or self._memory.device != image.device:
-            self._memory = None
-            self._memory = torch.empty(8 * size, device=image.device)
-        sums, maps = self._memory[: 5 * size], self._memory[5 * size : 8 * size]
-        grid = (-(-length // COLUMNS), -(-height // ROWS))
-        partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
-        image, target = image.detach().contiguous(), target.contiguous()
-        bits = image if mask is None else mask.contiguous().view(torch.uint8)
-        block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "num_warps": 4}
-        has_mask = mask is not None
-        window_rows[grid](image, target, bits, sums, height, length, HAS_MASK=has_mask, **block)
-        measure[grid](image, target, bits, sums, maps, partials, height, length, HAS_MASK=has_mask, **block)
-        totals = partials.sum(0)
-        window_maps[grid](maps, sums, height, length, **block)
-        differentiate[grid](
-            image,
-            target,
-            bits,
-            sums,
-            totals,
-            gradient,
-            weight * (1.0 - self._lambda),
-            -weight * self._lambda,
-            height,
-            length,
-            HAS_MASK=has_mask,
-            **block,
-        )
-        self._pending.append((step, weight, totals))
-
-    def take(self) -> list[tuple[int, Reading]]:
-        """What waits, by step, and forget it."""
-        if not self._pending:
-            return []
-        rows = torch.stack([totals for _, _, totals in self._pending]).tolist()
-        readings = [
-            (step, self._reading(row, weight))
-            for (step, weight, _), row in zip(self._pending, rows, strict=True)
-        ]
-        self._pending.clear()
-        return readings
-
-    def _reading(self, totals: Sequence[float], weight: float) -> Reading:
-        """The loss and its parts from the sums of a step."""
-        l1, similarity, squared, count = totals
-        if not count > 0:
-            return Reading(0.0, 0.0, 1.0, math.inf) if count == 0 else Reading(*(math.nan,) * 4)
-        l1, similarity = l1 / count, similarity / count
-        loss = weight * ((1.0 - self._lambda) * l1 + self._lambda * (1.0 - similarity))
-        psnr = math.inf if squared == 0.0 else 10.0 * math.log10(count / squared)
-        return Reading(loss, l1, similarity, psnr)
+@memory_errors()
+def loss_sums(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    *,
+    l1_weight: float,
+    ssim_weight: float,
+    gradient: Tensor,
+) -> Tensor:
+    """See ``cleargs.splat.backend.Backend``; the sums stay on the device."""
+    height, length = image.shape[0], 3 * image.shape[1]
+    sums, maps = (torch.empty(planes * height * length, device=image.device) for planes in (5, 3))
+    grid = (-(-length // COLUMNS), -(-height // ROWS))
+    partials = torch.empty(grid[0] * grid[1], 4, dtype=torch.float64, device=image.device)
+    image, target = image.detach().contiguous(), target.contiguous()
+    bits = image if mask is None else mask.contiguous().view(torch.uint8)
+    block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "num_warps": 4}
+    has_mask = mask is not None
+    window_rows[grid](image, target, bits, sums, height, length, HAS_MASK=has_mask, **block)
+    measure[grid](image, target, bits, sums, maps, partials, height, length, HAS_MASK=has_mask, **block)
+    totals = partials.sum(0)
+    window_maps[grid](maps, sums, height, length, **block)
+    differentiate[grid](
+        image,
+        target,
+        bits,
+        sums,
+        totals,
+        gradient,
+        l1_weight,
+        ssim_weight,
+        height,
+        length,
+        HAS_MASK=has_mask,
+        **block,
+    )
+    return totals

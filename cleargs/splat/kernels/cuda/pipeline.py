@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -67,7 +68,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
     )
     pair_bytes = PAIR_BYTES + SORT_BYTES
 
-    def _launching(self) -> AbstractContextManager[None]:
+    def _launching(self) -> AbstractContextManager[Any]:
         return memory_errors()
 
     def _blend(self, frame: Frame, depth: bool) -> Render:

@@ -1,0 +1,56 @@
+"""The frames of a capture as views: what a scene is trained on and compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cleargs.capture.tables import Frame
+from cleargs.errors import StageError
+from cleargs.splat.camera import Camera
+from cleargs.splat.views import Mask, Pixels, View
+
+
+def view_of(frame: Frame, folder: Path, weight: float) -> View:
+    """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
+    quaternion = np.array([frame.qw, frame.qx, frame.qy, frame.qz], np.float64)
+    translation = np.array([frame.tx, frame.ty, frame.tz], np.float64)
+    if not frame.registered or np.isnan([*quaternion, *translation]).any():
+        raise ValueError(f"frame {frame.frame_id} has no pose")
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    camera = Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
+    image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
+    return View(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
+
+
+def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[View]:
+    """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
+    active = [
+        frame
+        for frame in frames
+        if frame.registered and frame.split == "train" and weights.get(frame.frame_id, 0.0) > 0.0
+    ]
+    return [
+        view_of(frame, folder, weights[frame.frame_id]) for frame in sorted(active, key=lambda f: f.frame_id)
+    ]
+
+
+def _load(image: Path, mask: Path | None) -> tuple[Pixels, Mask | None]:
+    """Decode a PNG and its mask (0 = ignore)."""
+    pixels = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
+    ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask is not None else None
+    if pixels is None or (mask is not None and ignored is None):
+        missing = image if pixels is None else mask
+        raise StageError(f"cannot read {missing}", hint="run ingest again with --force ingest")
+    return pixels, None if ignored is None else ignored > 0
