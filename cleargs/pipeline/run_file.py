@@ -86,32 +86,40 @@ def _toml_line(name: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class Noted:
-    """What the ``run.toml`` of an earlier call says; None for what it does not say."""
+    """Content of the ``run.toml`` of an earlier call; None for what it does not say or says wrongly."""
 
     settings: Document = field(default_factory=dict)
     """Unchecked."""
     source: Path | None = None
     store: Path | None = None
     device: Device | None = None
+    damaged: bool = False
+    """True when it says one of the three wrongly."""
 
 
 def noted_run(folder: Path) -> Noted:
-    """What `write_run_file` noted in ``folder``; nothing when there is no run.
+    """Return what `write_run_file` noted in ``folder``; nothing when there is no run.
 
-    Raises ConfigError when the file is damaged.
+    Each of input, store and device is read on its own: a damaged one hides no other. Raises ConfigError when
+    the file is no TOML.
     """
     if not (folder / RUN_FILE).is_file():
         return Noted()
     document = read_toml(folder / RUN_FILE)
-    source, store, device = (document.pop(name, None) for name in ("input", "store", "device"))
-    sound = all(path is None or (isinstance(path, str) and "\0" not in path) for path in (source, store))
-    if not sound or device not in (None, "cpu", "cuda"):
-        raise _damaged(folder)
-    return Noted(document, Path(source) if source else None, Path(store) if store else None, device)
+    given = {name: document.pop(name, None) for name in ("input", "store", "device")}
+    paths = {
+        name: Path(value)
+        for name, value in given.items()
+        if name != "device" and isinstance(value, str) and value and "\0" not in value
+    }
+    device = given["device"] if given["device"] in ("cpu", "cuda") else None
+    read = {*paths, *(["device"] if device else [])}
+    damaged = any(value not in (None, "") and name not in read for name, value in given.items())
+    return Noted(document, paths.get("input"), paths.get("store"), device, damaged)
 
 
 def noted_source(folder: Path) -> Path | None:
-    """The capture that the run in ``folder`` was made from; None when there is no run, or it is damaged."""
+    """Return the capture that the run in ``folder`` was made from; None where none can be read."""
     try:
         return noted_run(folder).source
     except ConfigError:
@@ -129,12 +137,13 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
             f"{folder} is no run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"
         )
     noted = noted_run(folder)
-    if noted.source is None:
-        raise _damaged(folder)
+    if noted.source is None or noted.damaged:
+        raise damaged_run_file(folder)
     config = check_document(dag, noted.settings)
     place = store or noted.store or folder / STORE_FOLDER
     return Run(folder, noted.source, config, place, device or noted.device or "cpu")
 
 
-def _damaged(folder: Path) -> ConfigError:
+def damaged_run_file(folder: Path) -> ConfigError:
+    """Return the error for a ``run.toml`` whose input, store or device cannot be used."""
     return ConfigError(f"{folder / RUN_FILE} is damaged", hint="call `cleargs run` with its input again")

@@ -14,7 +14,15 @@ from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
 from cleargs.pipeline.config import Config, check_document, load_config
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RUN_FILE, Device, Noted, Run, noted_run, noted_source
+from cleargs.pipeline.run_file import (
+    RUN_FILE,
+    Device,
+    Noted,
+    Run,
+    damaged_run_file,
+    noted_run,
+    noted_source,
+)
 from cleargs.pipeline.store import STORE_FOLDER, Store
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
@@ -95,6 +103,8 @@ def asked_run(
     noted, kept = Noted(), None
     try:
         noted = noted_run(folder)
+        if noted.damaged:
+            raise damaged_run_file(folder)
         # Checked, they hold no names that are gone: those would contradict what is set now.
         kept = check_document(dag, noted.settings) if noted.settings and not forgets else None
     except ConfigError as error:
