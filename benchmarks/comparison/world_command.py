@@ -26,7 +26,7 @@ Example:
     type=click.Path(path_type=Path),
     metavar="DIR|FILE",
     help="Whose cameras the walk through the scene follows: a transforms.json, its folder, or a run. "
-    "Without it, those of the run that the scene lies in.",
+    "Without it, the cameras of the run that holds the scene.",
 )
 @click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
 @click.option(

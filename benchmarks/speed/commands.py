@@ -19,7 +19,7 @@ from cleargs.splat.config import Quality
 Examples:
   python -m benchmarks splat -o bench            all sizes; tables, JSON and pictures
   python -m benchmarks splat --quick             the same kinds of rows, small
-  python -m benchmarks splat -o bench --device cuda   the GPU, beside gsplat where it imports
+  python -m benchmarks splat -o bench --device cuda   the GPU, next to gsplat where it imports
 
 How to read the tables: docs/speed.md.
 """
@@ -50,7 +50,7 @@ def splat(
     float64 oracle; a rasteriser in pure torch; each kernel under the machine's roof; how cost grows. With -o
     the folder gets splat.md, splat.json, speed-error.png and scaling.png; without it the tables are printed.
 
-    On a GPU: 100,000 to 3,000,000 splats at 1280x720 and 1920x1080, beside gsplat; splat-cuda.md and
+    On a GPU: 100,000 to 3,000,000 splats at 1280x720 and 1920x1080, next to gsplat; splat-cuda.md and
     splat-cuda.json.
     """
     if device == "cuda":

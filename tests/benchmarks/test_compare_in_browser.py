@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from compared_runs import HOSTILE, compare_runs
-from helpers.chromium import CHROMIUM, NO_CHROMIUM, Opened
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, SIZES, Opened, check_page
 
 from benchmarks.comparison.page import write_comparison
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
-
-SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
 
 
 @pytest.fixture(scope="module")
@@ -23,26 +20,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_comparison(out, compared, [HOSTILE], [HOSTILE], [HOSTILE])
 
 
-@pytest.fixture(params=SIZES)
-def size(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def opened(made: Path, browser: Any, size: str) -> Iterator[Opened]:
-    scheme = "light" if size == "wide" else "dark"
-    page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
-    yield Opened(page, made.as_uri())
-    page.close()
-
-
-def test_a_page_fits_its_screen_and_asks_for_nothing_else(opened: Opened, size: str) -> None:
-    page = opened.page
-    page.evaluate("for (const image of document.images) image.loading = 'eager'")
-    page.wait_for_function("[...document.images].every((image) => !image.src || image.naturalWidth > 50)")
-    assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size]["width"]
-    assert opened.complaints == [] and opened.strangers() == []
-    assert page.evaluate("window.hacked") is None
+@pytest.mark.parametrize("size", SIZES)
+def test_page_fits_its_screen(browser: Any, made: Path, size: str) -> None:
+    check_page(browser, made.as_uri(), size)
 
 
 def test_a_pose_opens_under_a_slider_by_keyboard(browser: Any, made: Path) -> None:

@@ -15,6 +15,7 @@ NO_CHROMIUM = "there is no chromium (apt-get install chromium)"
 
 PATIENCE_MS = 240_000  # software WebGL on a busy machine
 ALLOWED = ("file:", "data:", "blob:")
+SIZES: dict[str, Any] = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
 
 
@@ -47,3 +48,16 @@ class Opened:
     def strangers(self) -> list[str]:
         """What the page asked for that does not lie beside it."""
         return [url for url in self.requests if not url.startswith(ALLOWED)]
+
+
+def check_page(browser: Any, address: str, size: str) -> None:
+    """Assert that a page fits its screen, shows its images, and asks for nothing that is not next to it."""
+    scheme = "light" if size == "wide" else "dark"
+    page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
+    opened = Opened(page, address)
+    page.evaluate("for (const image of document.images) image.loading = 'eager'")
+    page.wait_for_function("[...document.images].every((image) => !image.src || image.naturalWidth > 50)")
+    assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size]["width"]
+    assert opened.complaints == [] and opened.strangers() == []
+    assert page.evaluate("window.hacked") is None
+    page.close()

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.chromium import CHROMIUM, NO_CHROMIUM, Opened
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, SIZES, Opened, check_page
 from made_pages import batch_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
-
-SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
 
 
 @pytest.fixture(scope="module")
@@ -20,26 +17,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return batch_page(tmp_path_factory.mktemp("batch"))
 
 
-@pytest.fixture(params=SIZES)
-def size(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def opened(made: Path, browser: Any, size: str) -> Iterator[Opened]:
-    scheme = "light" if size == "wide" else "dark"
-    page = browser.new_page(viewport=SIZES[size], color_scheme=scheme)
-    yield Opened(page, made.as_uri())
-    page.close()
-
-
-def test_a_page_fits_its_screen_and_asks_for_nothing_else(opened: Opened, size: str) -> None:
-    page = opened.page
-    page.evaluate("for (const image of document.images) image.loading = 'eager'")
-    page.wait_for_function("[...document.images].every((image) => !image.src || image.naturalWidth > 50)")
-    assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size]["width"]
-    assert opened.complaints == [] and opened.strangers() == []
-    assert page.evaluate("window.hacked") is None
+@pytest.mark.parametrize("size", SIZES)
+def test_page_fits_its_screen(browser: Any, made: Path, size: str) -> None:
+    check_page(browser, made.as_uri(), size)
 
 
 def test_scenes_are_told_apart_by_their_state(browser: Any, made: Path) -> None:
