@@ -40,7 +40,7 @@ State = Literal["failed", "waiting", "partial", "done"]
 
 @dataclass(frozen=True)
 class Result:
-    """What is there of one scene: a row of ``summary.csv``."""
+    """State and figures of one scene: a row of ``summary.csv``."""
 
     scene: str
     state: State

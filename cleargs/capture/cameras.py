@@ -145,7 +145,7 @@ class Pose:
 
 
 def within_reach(numbers: NDArray[np.float64]) -> bool:
-    """Whether all are finite and no larger than `MAX_COORDINATE`."""
+    """Return True if all are finite and no larger than `MAX_COORDINATE`."""
     return bool(np.isfinite(numbers).all() and np.abs(numbers).max(initial=0.0) <= MAX_COORDINATE)
 
 
@@ -196,7 +196,7 @@ class Similarity:
 
     @staticmethod
     def from_json(noted: Any, ingest: Path) -> Similarity:
-        """What `to_json` noted, as the manifest of the finished folder ``ingest`` holds it.
+        """Return what `to_json` wrote into the manifest of the finished folder ``ingest``.
 
         Raises InputError when it does not.
         """

@@ -56,8 +56,10 @@ class Layout(Protocol):
     """
 
     def detect(self, source: Path, *, poses: bool) -> bool:
-        """Whether the input at ``source`` has this layout. Looks at names only; without ``poses``, files of
-        poses count for nothing."""
+        """Return True if the input at ``source`` has this layout.
+
+        Looks at names only; without ``poses``, files of poses count for nothing.
+        """
         ...
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:

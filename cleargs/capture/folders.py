@@ -40,8 +40,10 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
 
 
 def lies_below(name: str) -> bool:
-    """Whether a listed ``name`` stays in its folder and is not hidden: only such files are part of a folder's
-    digest."""
+    """Return True if a listed ``name`` stays in its folder and is not hidden.
+
+    Only such files are part of a folder's digest.
+    """
     path = PurePosixPath(name)
     return not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
 
@@ -52,10 +54,10 @@ def name_below_images(name: str) -> str:
 
 
 def mask_folder(source: Path) -> Path | None:
-    """The folder of masks beside (or in) the folder of images, or None."""
-    beside = source.parent / "masks"
-    if source.name == "images" and beside.is_dir():
-        return beside
+    """Return the folder of masks next to (or in) the folder of images, or None."""
+    neighbour = source.parent / "masks"
+    if source.name == "images" and neighbour.is_dir():
+        return neighbour
     return source / "masks" if (source / "masks").is_dir() else None
 
 
