@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import io
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Literal
 from rich.filesize import decimal
 
 from cleargs.batch.sheet import Scene, SheetError
+from cleargs.children import module_command
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
@@ -203,8 +203,8 @@ class Batch:
 
 
 def program() -> list[str]:
-    """Return how ``cleargs`` is started as a child."""
-    return [str(Path(sys.executable).with_name("cleargs"))]
+    """Return how ``cleargs`` is started as a child: its script need not be next to the interpreter."""
+    return module_command("cleargs.cli.entry")
 
 
 def last_error(log: Path) -> str:

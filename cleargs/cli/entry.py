@@ -1,4 +1,4 @@
-"""The console script."""
+"""The console script, also ``python -m cleargs.cli.entry``."""
 
 from __future__ import annotations
 
@@ -25,3 +25,7 @@ def main() -> None:
     finally:  # the work is done: there is nothing left to interrupt
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+if __name__ == "__main__":
+    main()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from toy_batch import ToyBatch
 
+from cleargs.batch.loop import program
 from cleargs.batch.sheet import Scene, SheetError, read_scenes
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
@@ -219,3 +220,16 @@ def test_a_child_that_is_killed_is_a_failure_that_says_so(
     toys.write_sheet({"attic": ""})
     assert toys.run() == 1
     assert toys.summary()["attic"]["cause"] == "ended by signal 9"
+
+
+def test_child_starts_where_no_script_is_next_to_the_interpreter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An installation may keep its scripts elsewhere, and a user's folder may hold a file ``json.py``."""
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    (tmp_path / "json.py").write_text("raise SystemExit(7)")
+    monkeypatch.setattr(sys, "executable", str(python))
+    done = subprocess.run([*program(), "--version"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith("cleargs, version "), done.stderr
