@@ -64,9 +64,10 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
     _draw_along(panels["scores"], panels["weights"], rows, frames, covered)
     for name, shown in pictured.items():
         tiles = [_tile(ingest / frames[row["frame_id"]].image, row) for row in shown]
-        tiles += [Tile(None, "")] * (SHOWN - len(tiles))
-        panels[name].imshow(contact_sheet([tiles], tile_width=_TILE))
-        panels[name].set(title=name)
+        sheet = contact_sheet([tiles], tile_width=_TILE)
+        panels[name].imshow(sheet)
+        # The same scale in every row, also in one of few frames.
+        panels[name].set(title=name, xlim=(0, sheet.shape[1] * SHOWN / len(tiles)))
         panels[name].axis("off")
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
