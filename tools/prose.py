@@ -1,7 +1,7 @@
 """Find phrases that slow readers down, and name the plain form of each.
 
 The patterns are in ``prose.toml``. The program searches docstrings, comments, messages, help and templates.
-It searches pages only if they are named. It skips code in backquotes and the first words of questions. ::
+It searches pages only in paths that are given. It skips code in backquotes and heads of questions. ::
 
     python -m tools.prose                    all code
     python -m tools.prose cleargs/splat      one package
@@ -222,7 +222,7 @@ READERS: dict[str, Callable[[str], Iterator[Passage]]] = {
 """Suffix or name of a file -> its reader; `passages` reads Python."""
 
 
-def files(paths: Iterable[str]) -> Iterator[Path]:
+def files(paths: Iterable[str | Path]) -> Iterator[Path]:
     """Yield the files at ``paths`` and in folders below them, in order; no hidden and no vendored ones."""
     for name in paths:
         path = Path(name)
@@ -250,11 +250,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the finds or their numbers. Return 1 if there are any, else 0."""
     parser = argparse.ArgumentParser(prog="python -m tools.prose", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("paths", nargs="*", default=CODE, help="files and folders (default: all code)")
+    parser.add_argument("paths", nargs="*", help="files and folders (default: all code, without its pages)")
     parser.add_argument("--count", action="store_true", help="print numbers of finds, not the finds")
     options = parser.parse_args(arguments)
     patterns = load_patterns()
-    finds = [find for path in files(options.paths) for find in search(path, passages(path), patterns)]
+    paths = options.paths or [path for path in files(CODE) if path.suffix != ".md"]
+    finds = [find for path in files(paths) for find in search(path, passages(path), patterns)]
     if options.count:
         print(table(finds, patterns))
     else:
