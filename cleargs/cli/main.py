@@ -56,7 +56,7 @@ Examples:
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
 130 interrupted (the same command resumes).
 
-docs/glossary.md explains the terms.
+Terms: docs/glossary.md
 """
 
 
