@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from cleargs.splat.scene import Scene
     from cleargs.splat.trainer import Trained
     from cleargs.splat.types import Render
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
     Image = NDArray[np.uint8] | NDArray[np.float32]
 
@@ -93,7 +93,7 @@ def run(
 
 def initialise(
     capture: Prepared,
-    views: Sequence[View] | None = None,
+    views: Sequence[TrainingView] | None = None,
     config: G0Config | None = None,
     *,
     seed: int = 0,
@@ -126,7 +126,7 @@ def initialise(
 
 def train(
     scene: Scene,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     config: TrainConfig | None = None,
     *,
     formation: Formation | None = None,
@@ -195,13 +195,13 @@ def score_frames(
     import pyarrow as pa
 
     from cleargs.rva.allocation import appearance_scores
-    from cleargs.rva.evaluator import View
+    from cleargs.rva.evaluator import EvaluatedFrame
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import CUE_COLUMNS
 
     config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     with tempfile.TemporaryDirectory() as cache:
-        views = [View(number, Path(path)) for number, path in enumerate(paths)]
+        views = [EvaluatedFrame(number, Path(path)) for number, path in enumerate(paths)]
         cues = make_evaluator(config, cache=Path(cache)).evaluate(
             views, threads=threads or usable_cores(), reporter=_reporter(progress)
         )

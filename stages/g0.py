@@ -19,7 +19,7 @@ from .config import G0_END, TRAINED
 if TYPE_CHECKING:
     from cleargs.formation.exposure import Exposure
     from cleargs.splat.initialise import SparsePoints
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 
 class G0Config(TrainConfig):
@@ -181,7 +181,9 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
 
 
-def _exposure(config: G0Config, views: list[View], sparse: SparsePoints) -> tuple[Exposure | None, float]:
+def _exposure(
+    config: G0Config, views: list[TrainingView], sparse: SparsePoints
+) -> tuple[Exposure | None, float]:
     """Affines to learn, or None; and the measured spread of the frames' gains."""
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
 

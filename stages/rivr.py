@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cleargs.rivr.rounds import Rules
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 
 class RoundsConfig(DistilConfig):
@@ -260,7 +260,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
 def _repair_and_distil(
     context: StageContext[RivrConfig],
     supervision: Supervision,
-    targets: Sequence[View],
+    targets: Sequence[TrainingView],
     rules: Rules,
     g0: Snapshot,
 ) -> tuple[list[Selection], list[Path], Snapshot]:

@@ -69,7 +69,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
-    from cleargs.rva.evaluator import View, label
+    from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import BINS, FRAMES
 
@@ -79,7 +79,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
 
     evaluator = make_evaluator(config, seed=context.seed, device=context.device, cache=context.kept)
     views = [
-        View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
+        EvaluatedFrame(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)

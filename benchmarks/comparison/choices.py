@@ -28,7 +28,7 @@ _MIN_ERROR = 1e-10
 """Equal images have a PSNR of 100 dB, not an infinite one."""
 
 
-class Choice(Record):
+class ChoiceRow(Record):
     """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
 
     round: int
@@ -59,10 +59,10 @@ class Choices(Record):
     column: str
     sample: str
     variant: str
-    rows: tuple[Choice, ...]
+    rows: tuple[ChoiceRow, ...]
 
 
-class Agreement(Record):
+class ChoiceAgreement(Record):
     """How well choices agree with the truth.
 
     Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept
@@ -81,14 +81,14 @@ class Agreement(Record):
     """Mean over the repaired rows, dB."""
 
 
-def agreement(rows: Sequence[Choice]) -> Agreement:
+def agreement(rows: Sequence[ChoiceRow]) -> ChoiceAgreement:
     """The figures of some rows."""
     repaired = [row for row in rows if row.chosen != RAW]
 
     def mean(values: Iterable[float]) -> float | None:
         return math.fsum(values) / len(repaired) if repaired else None
 
-    return Agreement(
+    return ChoiceAgreement(
         kept=len(rows) - len(repaired),
         repaired=len(repaired),
         by_psnr=mean(row.best_by_psnr for row in repaired),
@@ -98,7 +98,7 @@ def agreement(rows: Sequence[Choice]) -> Agreement:
     )
 
 
-def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choice]:
+def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[ChoiceRow]:
     """Every row of a finished RIVR against ``capture/truth/observed``; none where ``capture`` has no truth.
 
     A candidate has the exposure of its frame, so the truth is given the frame's true exposure error first:
@@ -121,7 +121,7 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
         if any(image.shape != truth.shape for image in candidates.values()):
             continue
         found.append(
-            Choice(
+            ChoiceRow(
                 round=row.round,
                 frame_id=row.frame_id,
                 chosen=row.chosen,

@@ -20,12 +20,12 @@ from pydantic import Field, ValidationError, model_validator
 
 from benchmarks.comparison.equal_work import steps_of, variant_config
 from benchmarks.comparison.findings import Compared, compare_scenes
-from benchmarks.comparison.scenes import Recipe, Sample, make_scenes
+from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes
 from benchmarks.comparison.splat_world import scene_setting
 from benchmarks.comparison.variants import find_variants
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
@@ -111,7 +111,7 @@ class Evidence(Record):
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureEntry:
     """A capture of a section, or why it cannot be made."""
 
     name: str
@@ -121,7 +121,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SectionOutcome:
     """What became of a section."""
 
     section: Section
@@ -138,7 +138,7 @@ class Workshop:
     out: Path
     captures: Path | None
     """Folder of the real captures."""
-    recipe: Recipe
+    recipe: SceneRecipe
     store: Store
     reporter: Reporter
 
@@ -157,7 +157,7 @@ def read_evidence(path: Path | None = None) -> Evidence:
         raise ConfigError(f"cannot read the list of evidence: {cause(error)}", hint=hint) from error
 
 
-def make_section(section: Section, shop: Workshop) -> Outcome:
+def make_section(section: Section, shop: Workshop) -> SectionOutcome:
     """Make the captures of a section, all of its scenes, and judge them."""
     missing: list[str] = []
     samples: list[Sample] = []
@@ -183,7 +183,7 @@ def make_section(section: Section, shop: Workshop) -> Outcome:
             missing.append(str(error))
             continue
         found.add(one if len(section.factors) == 1 else one.in_columns(f"{factor}x"))
-    return Outcome(section, found if found.cells else None, (*missing, *found.failures))
+    return SectionOutcome(section, found if found.cells else None, (*missing, *found.failures))
 
 
 def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
@@ -244,16 +244,16 @@ def _settings(section: Section) -> tuple[str, ...]:
     return (*(limits if section.kind == "video" else ()), *section.settings)
 
 
-def _captures(section: Section, shop: Workshop) -> Iterator[Capture]:
+def _captures(section: Section, shop: Workshop) -> Iterator[CaptureEntry]:
     """The captures of a section as soon as they are there."""
     if section.kind == "video":
         for name in section.captures:
             try:
                 place = _real(name, shop)
             except CleargsError as error:
-                yield Capture(name, missing=str(error))
+                yield CaptureEntry(name, missing=str(error))
             else:
-                yield Capture(name, tuple(Sample(place, seed, None) for seed in section.seeds))
+                yield CaptureEntry(name, tuple(Sample(place, seed, None) for seed in section.seeds))
         return
     for world in section.captures if section.kind == "world" else (None,):
         for protocol in section.protocols:
@@ -262,10 +262,10 @@ def _captures(section: Section, shop: Workshop) -> Iterator[Capture]:
                 scene = None if world is None else _world(world, shop)
                 places = [_synthetic(section, protocol, seed, world, scene, shop) for seed in section.seeds]
             except CleargsError as error:
-                yield Capture(label, missing=str(error))
+                yield CaptureEntry(label, missing=str(error))
             else:
                 pairs = zip(places, section.seeds, strict=True)
-                yield Capture(label, tuple(Sample(place, seed, None) for place, seed in pairs))
+                yield CaptureEntry(label, tuple(Sample(place, seed, None) for place, seed in pairs))
 
 
 def _real(name: str, shop: Workshop) -> Path:
@@ -306,7 +306,7 @@ def _world(name: str, shop: Workshop) -> Path:
     """The scene of a real capture, trained on every frame where it is not there yet."""
     recipe, folder = shop.recipe, shop.out / "worlds" / name
     config = load_config(recipe.dag, recipe.workflow, WORLD_SETTINGS)
-    run = Run(folder, _real(name, shop).absolute(), config, shop.store.root, recipe.device)
+    run = RunSpec(folder, _real(name, shop).absolute(), config, shop.store.root, recipe.device)
     Runner(recipe.dag, run, shop.store, recipe.threads, shop.reporter).run_until("g0")
     return folder / "g0" / "scene.ply"
 

@@ -16,7 +16,7 @@ from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from benchmarks.comparison.evidence import Outcome, Workshop
+    from benchmarks.comparison.evidence import SectionOutcome, Workshop
 
 RECIPE = "default"
 
@@ -75,7 +75,7 @@ def evidence(
     from benchmarks.comparison.kept_sections import keep_section, kept_sections
     from benchmarks.comparison.origin import version_of_source
     from benchmarks.comparison.results_page import Origin, results_page
-    from benchmarks.comparison.scenes import Recipe
+    from benchmarks.comparison.scenes import SceneRecipe
     from cleargs.files import write_bytes
 
     lists = read_evidence(listed)
@@ -85,7 +85,9 @@ def evidence(
     beside = page.parent / "results"
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
-    recipe = Recipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options)
+    recipe = SceneRecipe(
+        dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options
+    )
     command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
     origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
     version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"
@@ -122,7 +124,7 @@ def _command(*, quick: bool, captures: bool, listed: bool) -> str:
     return " ".join(word for word in words if word)
 
 
-def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
+def _write_pictures(found: SectionOutcome, shop: Workshop, folder: Path) -> None:
     from benchmarks.comparison.pictures import comparison_sheet, plot_comparison
     from benchmarks.comparison.variants import WHOLE
 

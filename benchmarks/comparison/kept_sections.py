@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells
 from benchmarks.comparison.choices import Choices
-from benchmarks.comparison.evidence import Outcome, Section
+from benchmarks.comparison.evidence import Section, SectionOutcome
 from benchmarks.comparison.roles import Roles
 from benchmarks.comparison.tables import Results
 from cleargs.evaluate.eval_report import Figures
@@ -40,7 +40,7 @@ class KeptSection(Figures):
         return Results(Cells(self.cells), self.roles, self.choices)
 
 
-def keep_section(folder: Path, found: Outcome, version: str, machine: str) -> None:
+def keep_section(folder: Path, found: SectionOutcome, version: str, machine: str) -> None:
     """Write what was found in a section to ``folder``, in place of what an earlier call found there."""
     compared = found.compared
     kept = KeptSection(

@@ -21,7 +21,7 @@ from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
-from cleargs.synth.path import Setting
+from cleargs.synth.path import SceneSetup
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
@@ -137,7 +137,7 @@ def camera_course(cameras: Sequence[Array], frames: int) -> CameraCourse:
     return CameraCourse(spline, float(frames - 1), spacing)
 
 
-def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
+def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> SceneSetup:
     """The scene in ``path``, in its own units, and a walk along ``frames`` of its real cameras.
 
     The cameras are those that ``cameras`` names (`_read_cameras`), else those of the run that ``path`` lies
@@ -157,7 +157,7 @@ def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, hei
     real = _read_cameras(run if cameras is None else cameras)
     course = camera_course([pose for _, pose in real], frames)
     name = path.stem if cameras is not None else run.name
-    return Setting(name, world, course, _fitted(real[0][0], width, height))
+    return SceneSetup(name, world, course, _fitted(real[0][0], width, height))
 
 
 def _fitted(lens: Lens, width: int, height: int) -> Lens:

@@ -38,7 +38,7 @@ class Disagreement:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class RankAgreement:
     """Two evaluators side by side, over the frames that both scored."""
 
     evaluators: tuple[str, str]
@@ -71,7 +71,9 @@ class Agreement:
         }
 
 
-def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int) -> Agreement:
+def compare(
+    first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int
+) -> RankAgreement:
     """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.
@@ -85,7 +87,7 @@ def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfi
     a, b = sides
     columns = ("R", "B", "R-B", *CUE_COLUMNS)
     in_a, in_b = (is_reliable(side[:, 0], side[:, 1], config) for side in sides)
-    return Agreement(
+    return RankAgreement(
         evaluators=(first.evaluator, second.evaluator),
         frames=len(rows),
         spearman={name: spearman(a[:, k], b[:, k]) for k, name in enumerate(columns)},

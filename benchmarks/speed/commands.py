@@ -135,11 +135,11 @@ def train(
 ) -> None:
     """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error."""
     from benchmarks.speed.benchmark import measure
-    from benchmarks.speed.benchmark_plan import Case, Plan
+    from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
     from benchmarks.speed.iteration import PARTS, WHOLE
 
     count = threads_or_all(threads)
-    case = Case(gaussians, width, height)
+    case = BenchmarkCase(gaussians, width, height)
     plan = Plan(cases=(case,), threads=(count,), rounds=repeats, repetitions=5)
     found = measure(case, plan)
     row: dict[str, float | None] = {part: found.times[count][part].median for part in (*PARTS, WHOLE)}

@@ -11,7 +11,7 @@ from benchmarks.speed.timing import Clock
 from cleargs.splat.backend import Meter, rasteriser_for, set_threads, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
+from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass, CpuRasteriser
 from cleargs.splat.types import Moments
 
 PARTS = ("forward", "loss", "backward", "adam")
@@ -89,17 +89,17 @@ class Iteration:
         return image.cpu(), gradients.to("cpu")
 
 
-class _OpenRasteriser(CpuRasteriser):
+class _InspectableRasteriser(CpuRasteriser):
     """The CPU rasteriser with a view of what lies between its passes."""
 
     @property
-    def frame(self) -> Frame:
-        frame: Frame = self._frame
+    def frame(self) -> CpuForwardPass:
+        frame: CpuForwardPass = self._frame
         return frame
 
 
-def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
+def projected_frame(gaussians: Gaussians, camera: Camera) -> CpuForwardPass:
     """Packed splats, (tile, splat) pairs and each pixel's last contributor of a view (SH degree 3)."""
-    rasteriser = _OpenRasteriser()
+    rasteriser = _InspectableRasteriser()
     rasteriser.forward(gaussians, camera)
     return rasteriser.frame

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, Pose, within_reach
+from cleargs.capture.cameras import Intrinsics, Pose, within_reach
 from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
@@ -45,7 +45,7 @@ class ModelImage:
 class SparseModel:
     """Registered images, their cameras, and sparse points (sorted by id)."""
 
-    cameras: dict[int, Camera]
+    cameras: dict[int, Intrinsics]
     images: dict[int, ModelImage]
     point_ids: NDArray[np.int64]  # [P]
     xyz: NDArray[np.float64]  # [P, 3]
@@ -184,7 +184,7 @@ def _converted(model: pycolmap.Reconstruction) -> SparseModel:
     errors = np.array([point.error for _, point in points], np.float64)
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(errors)
     cameras = {
-        key: Camera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
+        key: Intrinsics(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
         for key, camera in sorted(model.cameras.items())
     }
     images = {

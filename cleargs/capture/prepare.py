@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera
+from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
@@ -32,7 +32,7 @@ class WorkFrame:
     width: int
     height: int
     masked: bool
-    camera: Camera | None
+    camera: Intrinsics | None
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:

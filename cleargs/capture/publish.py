@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, guessed_camera
+from cleargs.capture.cameras import Intrinsics, guessed_camera
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame, resumable
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
@@ -47,8 +47,8 @@ def publish(
     for file in (out / "images").iterdir():
         if file.name not in ours:
             remove(file)
-    flat: list[Camera] = []
-    numbers: dict[Camera, int] = {}
+    flat: list[Intrinsics] = []
+    numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
@@ -98,7 +98,7 @@ def publish(
     return published
 
 
-def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
+def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics]:
     """The camera of each frame; an unregistered one takes its own, else the commonest of its size."""
     by_name = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [by_name.get(frame.image, frame.camera) for frame in frames]
@@ -154,7 +154,7 @@ def _write_points(
 
 
 def _frame_row(
-    index: int, frame: WorkFrame, camera: Camera, image: ModelImage | None, split: str, placed: str
+    index: int, frame: WorkFrame, camera: Intrinsics, image: ModelImage | None, split: str, placed: str
 ) -> dict[str, object]:
     (fx, fy), (cx, cy) = camera.focal, camera.centre
     row: dict[str, object] = {

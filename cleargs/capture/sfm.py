@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.cameras import Camera, Pose, Similarity, guessed_camera, normalise
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_worker import OUTCOME, Job, Outcome
+from cleargs.capture.sfm_worker import OUTCOME, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
@@ -42,7 +42,7 @@ class Reconstruction:
 
     model: SparseModel
     similarity: Similarity
-    outcome: Outcome
+    outcome: SfmOutcome
 
 
 def reconstruct(
@@ -78,7 +78,7 @@ def reconstruct(
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
-            return Reconstruction(adopted, similarity, Outcome(placed=placed, missed_px=missed))
+            return Reconstruction(adopted, similarity, SfmOutcome(placed=placed, missed_px=missed))
     moved = [similarity.pose(pose) for pose in poses]
     model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
@@ -101,7 +101,7 @@ def reconstruct(
     if adopted is not None and len(adopted.error) and not refined:
         model = adopted
     placed = _placed_by_input(frames, refined)
-    return Reconstruction(model, similarity, Outcome(placed=placed, missed_px=missed, refined=refined))
+    return Reconstruction(model, similarity, SfmOutcome(placed=placed, missed_px=missed, refined=refined))
 
 
 def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
@@ -111,7 +111,7 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 
 
-def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, Outcome]:
+def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
     """Let COLMAP do its work, unless a killed run got as far as the model."""
     if (found := _resumed(job.folder, reporter)) is not None:
         return found
@@ -142,7 +142,7 @@ def job_of(
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
-    cameras: list[Camera] = []
+    cameras: list[Intrinsics] = []
     exif_images: list[Path | None] = []
     for frame in (frames[owners.index(owner)] for owner in numbers):
         known = frame.camera if poses is not None else None
@@ -165,7 +165,7 @@ def job_of(
     )
 
 
-def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | None:
+def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
     """The model that a killed run left in ``folder``, or None.
 
     What is damaged, COLMAP's database too, is thrown away with a warning.
@@ -183,10 +183,10 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | 
     return None
 
 
-def _read(folder: Path) -> tuple[SparseModel, Outcome]:
+def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """The model and the outcome that COLMAP's process wrote. Raises InputError where one is damaged."""
     try:
-        return read_model(folder), Outcome.model_validate(read_json(folder / OUTCOME))
+        return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
         raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
 
@@ -210,7 +210,7 @@ def _within_reach(model: SparseModel) -> SparseModel:
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:
     """The input's own model, restricted to ``frames``: working image names, cameras and pixels."""
     by_name = {image.name: image for image in given.images.values()}
-    cameras: dict[int, Camera] = {}
+    cameras: dict[int, Intrinsics] = {}
     images: dict[int, ModelImage] = {}
     scale = 1.0
     for index, frame in enumerate(frames):

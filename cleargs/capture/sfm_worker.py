@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.capture.cameras import Camera
+from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
@@ -53,7 +53,7 @@ _HELD_BY = 15
 
 
 OUTCOME = "outcome.json"
-"""In the folder of the model: its `Outcome`."""
+"""In the folder of the model: its `SfmOutcome`."""
 
 
 class Job(Record):
@@ -63,7 +63,7 @@ class Job(Record):
     images: Path
     masks: Path | None
     names: list[str]
-    cameras: list[Camera]
+    cameras: list[Intrinsics]
     camera_of: list[int]
     """For each image the number of its camera."""
     poses: list[list[list[float]]] | None
@@ -75,7 +75,7 @@ class Job(Record):
     threads: int
 
 
-class Outcome(Record):
+class SfmOutcome(Record):
     """Origin of a model."""
 
     placed: Mapping[str, str] = Field(default_factory=dict)
@@ -133,7 +133,7 @@ class _Sfm:
         self._options.triangulation.random_seed = job.seed
 
     def run(self) -> None:
-        """Make the model and its `Outcome`. Raises StageError when the frames give none."""
+        """Make the model and its `SfmOutcome`. Raises StageError when the frames give none."""
         job = self._job
         pycolmap.set_random_seed(job.seed)
         self._import()
@@ -156,15 +156,15 @@ class _Sfm:
         if job.poses is None:
             model = self._map()
             model, placed = self._place_the_rest(model, pairs)
-            outcome = Outcome(placed=placed)
+            outcome = SfmOutcome(placed=placed)
         else:
             model = self._triangulate()
             missed = _median_error(model)
-            outcome = Outcome(missed_px=missed)
+            outcome = SfmOutcome(missed_px=missed)
             if missed > job.config.refine_above:
                 adjusted = self._refine(copy.deepcopy(model))
                 if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
-                    model, outcome = adjusted, Outcome(missed_px=missed, refined=True)
+                    model, outcome = adjusted, SfmOutcome(missed_px=missed, refined=True)
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())

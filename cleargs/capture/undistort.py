@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, pinhole
+from cleargs.capture.cameras import Intrinsics, pinhole
 from cleargs.capture.prepare import reduced, reduced_size
 from cleargs.errors import InputError
 
@@ -22,9 +22,9 @@ _EDGE_SAMPLES = 256
 class Undistorter:
     """The way of one camera's images to a pinhole."""
 
-    pinhole: Camera
+    pinhole: Intrinsics
     """Camera of the published image."""
-    _lens: Camera
+    _lens: Intrinsics
     _map: tuple[NDArray[np.float32], NDArray[np.float32]] | None
     """Where each pixel of the flat image, which is not reduced yet, lies in the lens's; None without
     distortion."""
@@ -54,7 +54,7 @@ class Undistorter:
         return np.asarray(((xy >= 0) & (xy < size)).all(axis=1))
 
 
-def undistorter(lens: Camera, max_size: int) -> Undistorter:
+def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
 
     The pinhole keeps the lens's focal lengths, so that the image's centre keeps its scale, and shows the
@@ -82,7 +82,7 @@ def undistorter(lens: Camera, max_size: int) -> Undistorter:
     return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, maps)
 
 
-def _covered(lens: Camera) -> tuple[float, float, float, float]:
+def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
     """Left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
     t = np.linspace(0, 1, _EDGE_SAMPLES)
     zero, one = np.zeros_like(t), np.ones_like(t)

@@ -21,7 +21,7 @@ from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import at_work, preview_of
-from cleargs.pipeline.run_file import Run, read_run_file
+from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16
@@ -161,7 +161,7 @@ def show(
         _show_stage(run, done, stage, rows, columns, as_json)
 
 
-def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
+def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
     """Print a line per stage, and the present work with its preview."""
     rows = []
     for name, manifest in manifests.items():

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera as Lens
+from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.folders import chosen, name_below_images, natural_key

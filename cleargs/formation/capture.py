@@ -25,7 +25,7 @@ from cleargs.formation.photograph import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import group
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 SEARCH_EVERY = 4
 """One in so many fits of a frame begins from scratch."""
@@ -56,7 +56,7 @@ class CaptureFormation:
 
     def __init__(
         self,
-        views: Sequence[View],
+        views: Sequence[TrainingView],
         config: FormationConfig,
         *,
         exposure: Exposure | None = None,
@@ -112,7 +112,7 @@ class CaptureFormation:
 
     def form(
         self,
-        view: View,
+        view: TrainingView,
         factor: float,
         progress: float,
         target: Tensor,
@@ -215,7 +215,7 @@ def _tested_frames(count: int) -> list[int]:
     return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
-def _affines(exposure: Exposure, views: Sequence[View], rate: float) -> AffineOptimiser:
+def _affines(exposure: Exposure, views: Sequence[TrainingView], rate: float) -> AffineOptimiser:
     """Affines for every frame given or seen; the median counts the weights of the real views."""
     frame_ids = np.union1d(exposure.frame_ids, [view.frame_id for view in views]).astype(np.int32)
     weights: NDArray[np.float64] = np.zeros(len(frame_ids))

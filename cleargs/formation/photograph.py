@@ -29,7 +29,7 @@ from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
-from cleargs.splat.views import ImageCache, View, unseen_pixels
+from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
 CELLS = 24
 """Cells along the longer side of a frame. Over a cell, detail that is missing or lies a little beside its
@@ -132,7 +132,7 @@ class FormedView:
 
 def photograph(
     scene: Scene,
-    view: View,
+    view: TrainingView,
     exposure: Exposure | None = None,
     formation: FrameFormation | None = None,
     *,
@@ -171,7 +171,7 @@ def pooled_unseen(fits: Iterable[Fit]) -> float | None:
 
 def evaluate_views(
     scene: Scene,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     exposure: Exposure | None = None,
     formations: Mapping[int, FrameFormation] | None = None,
     *,

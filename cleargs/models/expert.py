@@ -13,7 +13,7 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import Model, load_network
+from cleargs.models.registry import RegistryEntry, load_network
 from cleargs.models.tiling import Image, map_tiled
 
 
@@ -89,7 +89,7 @@ def load_expert(spec: str, device: Device = "cpu") -> Expert:
     """The expert named by ``spec`` (see `load_network`), on what `network_device` found. Raises InputError,
     also as `OnnxExpert` does."""
 
-    def own(path: Path, model: Model | None) -> Expert:
+    def own(path: Path, model: RegistryEntry | None) -> Expert:
         return OnnxExpert(path, None if model is None else spec, device)
 
     return load_network(spec, "expert", device, own)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError
 from cleargs.models.naturalness import StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import Model, find_model, load_network
+from cleargs.models.registry import RegistryEntry, find_model, load_network
 from cleargs.models.tiling import Image, mean_over_tiles, require_scorable
 
 CLARITY = "clarity-net"
@@ -223,7 +223,7 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
 
-    def own(path: Path, model: Model | None) -> Scorer:
+    def own(path: Path, model: RegistryEntry | None) -> Scorer:
         if model is None:
             return LearnedScorer(path, device=device)
         if spec == NATURALNESS:

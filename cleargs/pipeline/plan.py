@@ -16,9 +16,9 @@ from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
-from cleargs.pipeline.store import Entry, Store, Work
+from cleargs.pipeline.store import Entry, Store, WorkFolder
 from cleargs.progress import Reporter
 from cleargs.untrusted import require_utf8
 
@@ -38,7 +38,7 @@ State = Literal["done", "partial", "missing"]
 
 
 @dataclass(frozen=True)
-class Recipe:
+class StageKey:
     """What one stage would be made from, all of it known."""
 
     parts: KeyParts
@@ -64,7 +64,7 @@ class StagePlan:
     """Why it is no hit, or what a partial one lacks."""
     estimate: Estimate | None = None
     """Cost of the work to do; None where there is none."""
-    recipe: Recipe | None = None
+    recipe: StageKey | None = None
     """None while a stage before it must run first. As keys are made of content, it may be done after all."""
     manifest: Manifest | None = None
     """That of a stage that is done."""
@@ -80,13 +80,13 @@ class Planner:
     """Makes recipes and compares them with what the store and the run folder hold. Writes nothing."""
 
     dag: Dag
-    run: Run
+    run: RunSpec
     store: Store
     threads: int
     reporter: Reporter
     _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
-    def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
+    def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> StageKey:
         """What ``name`` is made from, given the manifests of the stages before it.
 
         With ``afresh`` every external is read, whatever the memo says of it. Raises InputError when one (the
@@ -111,7 +111,7 @@ class Planner:
         for upstream in stage.INPUTS:
             inherited |= dict.fromkeys(done[upstream].inherited)
             inherited |= dict.fromkeys(f"{upstream}: {missing}" for missing in done[upstream].missing)
-        return Recipe(parts, origins, folders, tuple(inherited))
+        return StageKey(parts, origins, folders, tuple(inherited))
 
     def inputs(
         self, name: str, done: Mapping[str, Manifest]
@@ -146,7 +146,7 @@ class Planner:
                 raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
         return {role: self.store.memo.digests_of(place, afresh=afresh) for role, place in places.items()}
 
-    def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
+    def reasons(self, recipe: StageKey, entry: Entry | None) -> tuple[str, ...]:
         """Why the results of ``recipe`` are not there, in lines for a reader."""
         if entry is not None and entry.damage is not None:
             return (f"damaged: {entry.damage}",)
@@ -193,11 +193,11 @@ class Planner:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
             else:
                 expected[upstream] = self._estimate(upstream, done)
-        context = self.context(name, inputs, Work(self.store.root / "work" / "estimate"))
+        context = self.context(name, inputs, WorkFolder(self.store.root / "work" / "estimate"))
         self._estimates[known] = stage.estimate(replace(context, expected=expected))
         return self._estimates[known]
 
-    def context(self, name: str, inputs: Mapping[str, Path], work: Work) -> StageContext[Any]:
+    def context(self, name: str, inputs: Mapping[str, Path], work: WorkFolder) -> StageContext[Any]:
         """All that the stage ``name`` is told."""
         return StageContext(
             config=self.run.config.sections[name],

@@ -32,7 +32,7 @@ WIDTH = 110
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSpec:
     """A run folder and all that decides its results."""
 
     folder: Path
@@ -45,7 +45,7 @@ class Run:
     device: Device
 
 
-def write_run_file(run: Run) -> None:
+def write_run_file(run: RunSpec) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
     path, text = run.folder / RUN_FILE, _text(run).encode()
     with disk_errors(path):
@@ -54,7 +54,7 @@ def write_run_file(run: Run) -> None:
             write_bytes(path, text)
 
 
-def _text(run: Run) -> str:
+def _text(run: RunSpec) -> str:
     document: Document = {"input": str(run.source), "device": run.device}
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
@@ -126,7 +126,9 @@ def noted_source(folder: Path) -> Path | None:
         return None
 
 
-def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:
+def read_run_file(
+    folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
+) -> RunSpec:
     """The run that `write_run_file` noted in ``folder``; ``store`` and ``device`` override what it says.
 
     Raises InputError when there is no run, ConfigError when its file is damaged.
@@ -141,7 +143,7 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
         raise damaged_run_file(folder)
     config = check_document(dag, noted.settings)
     place = store or noted.store or folder / STORE_FOLDER
-    return Run(folder, noted.source, config, place, device or noted.device or "cpu")
+    return RunSpec(folder, noted.source, config, place, device or noted.device or "cpu")
 
 
 def damaged_run_file(folder: Path) -> ConfigError:

@@ -27,21 +27,21 @@ from cleargs.pipeline.live import noted
 from cleargs.pipeline.lock import only_one
 from cleargs.pipeline.plan import (
     Planner,
-    Recipe,
+    StageKey,
     StagePlan,
     check_address_space,
     check_disk,
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, noted_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StageOutcome:
     """What became of one stage."""
 
     stage: str
@@ -53,7 +53,7 @@ class Outcome:
 class Runner:
     """Runs stages of one run folder. ``store.in_use()`` is held by each public method while it works."""
 
-    def __init__(self, dag: Dag, run: Run, store: Store, threads: int, reporter: Reporter) -> None:
+    def __init__(self, dag: Dag, run: RunSpec, store: Store, threads: int, reporter: Reporter) -> None:
         self.dag = dag
         self.run = run
         self.store = store
@@ -62,7 +62,7 @@ class Runner:
 
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
-    ) -> list[Outcome]:
+    ) -> list[StageOutcome]:
         """Bring every stage up to ``until`` to a finished folder; link each into the run.
 
         Stops after a stage that is done only in part unless ``allow_partial``: the last outcome then says
@@ -80,7 +80,7 @@ class Runner:
         for line in (*redo_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
-        outcomes: list[Outcome] = []
+        outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
         with self._alone(), self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
@@ -118,7 +118,7 @@ class Runner:
         if line := cost_line(costs):
             self.reporter.info(f"now {line}")
 
-    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> Outcome:
+    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> StageOutcome:
         """Bring one stage to a finished folder, from finished stages before it.
 
         Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
@@ -150,7 +150,7 @@ class Runner:
             )
         return entry.manifest
 
-    def _find(self, name: str, recipe: Recipe) -> Entry | None:
+    def _find(self, name: str, recipe: StageKey) -> Entry | None:
         """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
         entry = self.store.find(name, recipe.key)
         if entry is not None and entry.damage is not None:
@@ -160,7 +160,7 @@ class Runner:
             return None
         return entry
 
-    def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> Outcome:
+    def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and let the run folder show them."""
         recipe = self.planner.recipe(name, done)
         entry = self.store.find(name, recipe.key)
@@ -178,9 +178,9 @@ class Runner:
                     manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
         manifest = self._with_inherited(manifest, recipe.inherited)
         self.store.link(self.run.folder, name, recipe.key)
-        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
+        return StageOutcome(name, how, manifest, self.store.folder(name, recipe.key))
 
-    def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+    def _read_again(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
 
         Raises StoreError when an upstream result is damaged.
@@ -197,7 +197,7 @@ class Runner:
                 )
         return self.planner.recipe(name, done, afresh=True)
 
-    def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
+    def _make(self, recipe: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""
         name = recipe.parts.stage
         stage = self.dag.load(name)
@@ -275,7 +275,7 @@ class Runner:
         return changed
 
 
-def check_same_input(run: Run, dag: Dag, store: Store) -> None:
+def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
     """Raise InputError when ``run.folder`` was made for another capture than ``run.source``.
 
     A capture that moved is the same when its content is.

@@ -18,7 +18,7 @@ from cleargs.pipeline.run_file import (
     RUN_FILE,
     Device,
     Noted,
-    Run,
+    RunSpec,
     damaged_run_file,
     noted_run,
     noted_source,
@@ -84,7 +84,7 @@ def asked_run(
     store: Path | None = None,
     device: DeviceChoice = "auto",
     say: Callable[[str], None],
-) -> Run:
+) -> RunSpec:
     """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
 
     An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
@@ -117,7 +117,7 @@ def asked_run(
     chosen = resolve_device(noted.device or device if device == "auto" else device, say)
     if kept is not None and (line := _own_settings(kept)):
         say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    return Run(folder, source.absolute(), config, root, chosen)
+    return RunSpec(folder, source.absolute(), config, root, chosen)
 
 
 def _own_settings(config: Config, most: int = 3) -> str:

@@ -74,7 +74,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Work:
+class WorkFolder:
     """Where one key is being worked on."""
 
     folder: Path
@@ -181,7 +181,7 @@ class Store:
         entry: Entry | None,
         leftovers: Sequence[str] = (),
         alone: bool = True,
-    ) -> Work:
+    ) -> WorkFolder:
         """The work folder of ``key``, ready to resume: of the outputs that dead writers left, only those stay
         that match one of the patterns ``leftovers``. Where this process is not ``alone``, the folder is its
         own.
@@ -189,10 +189,10 @@ class Store:
         A forced rebuild (``fresh``) has a folder of its own, which resumes only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
         """
-        work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
+        work = WorkFolder(self.root / "work" / (f"{key}.forced" if fresh else key))
         with disk_errors(work.folder):
             if not alone:
-                left, work = work, Work(work.folder.with_name(work.folder.name + self._own()))
+                left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._own()))
                 with suppress(OSError):  # nothing is there, or another process took it
                     left.folder.rename(work.folder)
             _keep_only(work.out, leftovers)
@@ -206,7 +206,7 @@ class Store:
                     file.unlink()
         return work
 
-    def publish(self, work: Work, manifest: Manifest) -> Manifest:
+    def publish(self, work: WorkFolder, manifest: Manifest) -> Manifest:
         """Move the outputs of ``work`` to their final place: all or nothing, and durable.
 
         Where a whole result with the same content is already there, ours is dropped and that one's manifest

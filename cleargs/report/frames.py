@@ -177,7 +177,7 @@ RENDERED = 40
 Image = NDArray[np.uint8]
 
 
-class Picture(NamedTuple):
+class ImageFile(NamedTuple):
     """A picture of the report, with the size it has."""
 
     path: str
@@ -186,7 +186,7 @@ class Picture(NamedTuple):
     height: int
 
 
-FramePictures = tuple[Picture, dict[str, Picture]]
+FramePictures = tuple[ImageFile, dict[str, ImageFile]]
 """Thumbnail of a frame, and its layers by their names in `LAYERS`."""
 
 
@@ -240,7 +240,7 @@ def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, si
     return write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers
 
 
-def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
+def write_jpeg(report: Path, name: str, image: Image, side: int) -> ImageFile:
     """Write ``image`` reduced to at most ``side`` pixels."""
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
@@ -250,4 +250,4 @@ def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
     (report / name).write_bytes(data.tobytes())
-    return Picture(name, width, height)
+    return ImageFile(name, width, height)

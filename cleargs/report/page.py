@@ -23,7 +23,7 @@ from cleargs.manifest import Manifest, plain_json
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
 from cleargs.report import charts
 from cleargs.report.frames import (
@@ -32,7 +32,7 @@ from cleargs.report.frames import (
     MEANINGS,
     SCENES,
     FrameRow,
-    Picture,
+    ImageFile,
     camera_of,
     load_rows,
     scores_of,
@@ -40,7 +40,7 @@ from cleargs.report.frames import (
     write_pictures,
 )
 from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
-from cleargs.report.verdict import Verdict
+from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
 from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
@@ -109,7 +109,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             name=run.name,
             source=planner.run.source.name,
             pictures=pictures,
-            verdict=Verdict(manifests, rows, planner.run.config),
+            verdict=ReportVerdict(manifests, rows, planner.run.config),
             scenes=scenes,
             viewer=write_viewer(folder) if scenes else "",
             plan=charts.plan_of(rows),
@@ -191,7 +191,7 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def command(run: Run, dag: Dag) -> str:
+def command(run: RunSpec, dag: Dag) -> str:
     """The ``cleargs run`` that makes this run, called next to its folder: a recipe, then settings."""
     wanted = dict(flattened(run.config.document()))
     candidates = []
@@ -224,7 +224,7 @@ def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return found
 
 
-def _frame_data(row: FrameRow, layers: Mapping[str, Picture], time: float | None) -> dict[str, Any]:
+def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
     """All that the page says of a frame."""
     lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
     cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}

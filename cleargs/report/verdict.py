@@ -37,7 +37,7 @@ class Caution(NamedTuple):
     """As ``--set`` takes them; empty where no setting helps."""
 
 
-class Verdict:
+class ReportVerdict:
     """The first screen of a report of a run that shows these ``manifests``."""
 
     def __init__(self, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> None:

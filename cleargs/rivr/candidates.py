@@ -52,7 +52,7 @@ def gaussian_blur(image: Image, sigma: float) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class Choice:
+class CandidateChoice:
     """The chosen candidate and why."""
 
     chosen: CandidateName
@@ -61,7 +61,7 @@ class Choice:
 
 def choose(
     primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
-) -> Choice:
+) -> CandidateChoice:
     """The candidate with the highest primary score, or the tie-break's favourite within ``margin`` of it.
 
     primary, tiebreak: score of each candidate, higher is better, on a scale of 0-100; both have the same
@@ -74,9 +74,9 @@ def choose(
     best = max(primary.values())
     close = [name for name in names if best - primary[name] <= margin]
     if len(close) == 1:
-        return Choice(close[0], "primary score")
+        return CandidateChoice(close[0], "primary score")
     chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
-    return Choice(chosen, "tie-break among " + ", ".join(close))
+    return CandidateChoice(chosen, "tie-break among " + ", ".join(close))
 
 
 def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:

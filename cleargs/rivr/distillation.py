@@ -34,7 +34,7 @@ from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Render
-from cleargs.splat.views import Mask, View
+from cleargs.splat.views import Mask, TrainingView
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
 EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"
@@ -63,7 +63,7 @@ class Explained:
     """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
 
 
-def observation(view: View) -> tuple[Image, Mask | None]:
+def observation(view: TrainingView) -> tuple[Image, Mask | None]:
     """O_t as float32 sRGB, and its mask."""
     pixels, mask = view.load()
     if pixels.dtype == np.uint8:
@@ -85,30 +85,30 @@ class Snapshot:
         self.formations, self._weights = read_formation(folder / FORMATION)
         self._engine = rasteriser_for(device)
 
-    def render(self, view: View) -> Image:
+    def render(self, view: TrainingView) -> Image:
         """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
         image: Image = photograph(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
-    def _photographed(self, view: View) -> Tensor:
+    def _photographed(self, view: TrainingView) -> Tensor:
         """The scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
         return photograph(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
-    def psnr_unseen(self, views: Sequence[View]) -> float | None:
+    def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
         """PSNR in dB of the pixels of ``views`` that no training saw; None where there are none."""
         return pooled_unseen(
             evaluate_views(self.scene, views, self.exposure, self.formations, engine=self._engine)
         )
 
-    def explained(self, view: View) -> Explained | None:
+    def explained(self, view: TrainingView) -> Explained | None:
         """What the training found of a raw frame's camera; None where that is nothing."""
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
         return Explained(self._photographed(view).numpy(), formation, self._weights[view.frame_id])
 
-    def deblur(self, view: View) -> Deblurred | None:
+    def deblur(self, view: TrainingView) -> Deblurred | None:
         """The raw frame without what the camera did to it, found by comparing it with the scene; None where
         nothing explains the frame better than the render as it is."""
         observed, mask = observation(view)
@@ -140,7 +140,7 @@ class Snapshot:
     def _with_depth(self, camera: Camera) -> Render:
         return self._engine.view(self.scene, camera, depth=True)
 
-    def fidelity(self, judges: Sequence[View], scorer: Scorer, threads: int) -> Fidelity | None:
+    def fidelity(self, judges: Sequence[TrainingView], scorer: Scorer, threads: int) -> Fidelity | None:
         """How well the scene explains the held-back frames; None without any.
 
         Raw frames may be blurred and skewed by the camera's motion. A sharp scene is not to be blamed for
@@ -156,7 +156,7 @@ class Snapshot:
 
     def trained(
         self,
-        views: Sequence[View],
+        views: Sequence[TrainingView],
         config: TrainConfig,
         folder: Path,
         *,

@@ -24,7 +24,7 @@ from cleargs.progress import Reporter
 from cleargs.rivr.candidates import (
     CANDIDATES,
     KEPT,
-    Choice,
+    CandidateChoice,
     Image,
     Source,
     choose,
@@ -36,7 +36,7 @@ from cleargs.rivr.candidates import (
 from cleargs.rivr.distillation import Deblurred, Snapshot, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
-from cleargs.splat.views import Mask, View
+from cleargs.splat.views import Mask, TrainingView
 
 PREFIX = "cleargs:"
 """How the names of the attributes in the EXR begin."""
@@ -70,7 +70,9 @@ class Rules:
     margin: float
     gate: GateConfig
 
-    def restored(self, view: View, render: Image, scene: Snapshot) -> tuple[Image, Source, Deblurred | None]:
+    def restored(
+        self, view: TrainingView, render: Image, scene: Snapshot
+    ) -> tuple[Image, Source, Deblurred | None]:
         """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
 
         What ``scene`` says of the frame's camera is undone.
@@ -85,7 +87,7 @@ class Rules:
     def _restored(self, image: Image) -> Image:
         return self.expert.restore(image, threads=self.threads)
 
-    def _restored_observation(self, view: View) -> Image:
+    def _restored_observation(self, view: TrainingView) -> Image:
         """As the cache gives it back, so that every round and every resumed run has the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
@@ -99,7 +101,7 @@ class Rules:
 
 def run_round(
     number: int,
-    targets: Sequence[View],
+    targets: Sequence[TrainingView],
     scene: Snapshot,
     rules: Rules,
     out: Path,
@@ -130,7 +132,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: View, exr: str, scene: Snapshot, rules: Rules
+    number: int, view: TrainingView, exr: str, scene: Snapshot, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -169,7 +171,7 @@ def repair(
     choice = (
         choose(primary, tiebreak, rules.margin)
         if refused is None
-        else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
+        else CandidateChoice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
     )
     masked = all_masked(mask)
     row = Selection(
@@ -201,7 +203,7 @@ def repair(
     return row, LayeredImage(layers, _attributes(row))
 
 
-def forget_others(out: Path, rounds: int, targets: Sequence[View]) -> None:
+def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
     """Remove what would be published beside the EXRs of ``targets`` in rounds 1 to ``rounds``."""
     ours = {
         f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets
@@ -232,7 +234,7 @@ def _attributes(row: Selection) -> dict[str, int | float | str]:
     return {f"{PREFIX}{name}": value for name, value in values.items()}
 
 
-def pseudo_view(target: View, row: Selection, out: Path) -> View:
+def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:
     """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
     @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once

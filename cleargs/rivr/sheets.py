@@ -11,7 +11,7 @@ from cleargs.media.image import write_rgb
 from cleargs.rivr.candidates import CANDIDATES
 from cleargs.rivr.distillation import Snapshot, observation
 from cleargs.rivr.tables import Selection
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 SHEET_FRAMES = 6
 """Frames on a sheet."""
@@ -25,7 +25,7 @@ def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) ->
 
 def write_before_after_sheet(
     path: Path,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     before: Snapshot,
     after: Snapshot,
     repairs: Mapping[int, Selection],

@@ -16,7 +16,7 @@ from cleargs.errors import StageError
 from cleargs.formation.frames import view_of
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 Targets: TypeAlias = Literal["all", "degraded"]
 
@@ -66,15 +66,15 @@ def _best(frames: Sequence[Appraisal]) -> Appraisal:
 
 
 @dataclass(frozen=True)
-class Group:
+class FrameGroup:
     """Target frames that are rendered from one scene."""
 
-    targets: Sequence[View]
+    targets: Sequence[TrainingView]
     steps: int
     """Steps of the distillation of what was accepted so far, after its frames."""
 
 
-def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> list[Group]:
+def trajectory_groups(targets: Sequence[TrainingView], size: int | None, steps: int) -> list[FrameGroup]:
     """``targets`` in their order, in as few groups of at most ``size`` frames as hold them, all in one for
     None; sizes differ by one at most. ``steps`` is shared in proportion to the frames and adds up exactly.
 
@@ -86,7 +86,7 @@ def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> 
     frames = len(targets)
     count = 1 if size is None else max(1, -(-frames // size))
     return [
-        Group(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
+        FrameGroup(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
         for start, end in _parts(frames, count)
     ]
 
@@ -95,23 +95,23 @@ def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> 
 class Supervision:
     """Views of the registered training frames, by frame_id, each with its RVA weight (which may be 0)."""
 
-    views: dict[int, View]
+    views: dict[int, TrainingView]
     appraisals: list[Appraisal]
     held_back: list[int]
     """Frames that get no repairs, to measure whether those of the others do harm; none where the settings
     hold none back."""
 
     @property
-    def real(self) -> list[View]:
+    def real(self) -> list[TrainingView]:
         """The active raw frames: D_real, the held-back ones among them, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
-    def judges(self) -> list[View]:
+    def judges(self) -> list[TrainingView]:
         """The held-back frames."""
         return [self.views[frame_id] for frame_id in self.held_back]
 
-    def targets(self, which: Targets) -> list[View]:
+    def targets(self, which: Targets) -> list[TrainingView]:
         """The frames that every round repairs: ``all``, or those whose role is not ``strong``, but never the
         held-back ones."""
         return [
@@ -120,7 +120,7 @@ class Supervision:
             if frame.frame_id not in self.held_back and (which == "all" or frame.role != "strong")
         ]
 
-    def worst(self, frame_ids: Sequence[int], count: int) -> list[View]:
+    def worst(self, frame_ids: Sequence[int], count: int) -> list[TrainingView]:
         """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""
         wanted = set(frame_ids)
         ranked = sorted(self.appraisals, key=lambda frame: (frame.R - frame.B, frame.frame_id))

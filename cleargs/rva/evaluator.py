@@ -25,7 +25,7 @@ from cleargs.untrusted import read_json
 
 
 @dataclass(frozen=True)
-class View:
+class EvaluatedFrame:
     """A frame as an evaluator gets it: files, so that nobody has to hold a video in memory."""
 
     frame_id: int
@@ -34,7 +34,7 @@ class View:
     """8-bit image of the same size; pixels that are 0 in it are ignored."""
 
 
-def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
+def load_view(view: EvaluatedFrame) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
     """The frame [H, W, 3] in sRGB and its mask [H, W]. Raises StoreError when one cannot be read."""
     hint = "run again with --force ingest"
     try:
@@ -67,7 +67,7 @@ class Evaluator(Protocol):
     def version(self) -> int:
         """Raised when equal images get other cues."""
 
-    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+    def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> Floats:
         """Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`, for frames given in trajectory order.
 
         A row of NaN is a frame that could not be scored; ``reporter`` was told why. Neighbours in ``views``
@@ -93,7 +93,7 @@ class ItemCache:
     bounds: tuple[float, float] = (-math.inf, math.inf)
     """Rows with a number outside are not taken from files."""
 
-    def row(self, view: View, make: Callable[[View], Floats]) -> Floats:
+    def row(self, view: EvaluatedFrame, make: Callable[[EvaluatedFrame], Floats]) -> Floats:
         """The kept row of ``view``, or else what ``make`` finds; a new file appears whole.
 
         Raises OSError when a file of the view cannot be read.

@@ -23,7 +23,7 @@ import numpy as np
 from cleargs.progress import Reporter
 from cleargs.rva import measures
 from cleargs.rva.arrays import Floats
-from cleargs.rva.evaluator import ItemCache, View, load_view
+from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view
 from cleargs.rva.measures import DIRECTIONS, Luminance, detail_ratios, extents_from_ratios, reduce_luminance
 
 # Extents are standard deviations of the blur in px at the reduced size.
@@ -116,7 +116,7 @@ class StatisticsEvaluator:
         """``cache`` is a folder in which the measures of single frames are kept."""
         self._cache = ItemCache(cache, MEASURE_COLUMNS, [self.name, self.version, cv2.__version__])
 
-    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+    def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> Floats:
         """See `Evaluator.evaluate`. Raises StoreError when an image cannot be read."""
         if not views:
             return np.zeros((0, 11))
@@ -127,7 +127,7 @@ class StatisticsEvaluator:
                 task.advance()
         return cues_from_measures(np.stack(rows))
 
-    def _measure(self, view: View) -> Floats:
+    def _measure(self, view: EvaluatedFrame) -> Floats:
         return self._cache.row(view, lambda view: measure(reduce_luminance(*load_view(view))))
 
 

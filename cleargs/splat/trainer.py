@@ -34,7 +34,7 @@ from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
 from cleargs.splat.types import Moments, Render, group
-from cleargs.splat.views import ImageCache, View, require_views
+from cleargs.splat.views import ImageCache, TrainingView, require_views
 from cleargs.termination import deferred_sigterm
 
 _NOTE_INTERVAL = 10
@@ -69,7 +69,7 @@ class Trainer:
     def __init__(
         self,
         scene: Scene,
-        views: Sequence[View],
+        views: Sequence[TrainingView],
         config: TrainConfig,
         *,
         seed: Sequence[int],
@@ -274,7 +274,7 @@ class Trainer:
         self._read_meter()
         return self._log.table(self.done, round)
 
-    def _view(self, step: int) -> View:
+    def _view(self, step: int) -> TrainingView:
         """The view of a step: pseudo ones spread evenly at their share, both in shuffled epochs."""
         before = math.floor(step * self._share)
         if math.floor((step + 1) * self._share) > before:
@@ -285,7 +285,9 @@ class Trainer:
         order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
-    def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
+    def _formed(
+        self, view: TrainingView, factor: float, target: Tensor, mask: Tensor | None
+    ) -> Formed | None:
         if self._formation is None:
             return None
         progress = self._at / self._config.planned
@@ -386,7 +388,7 @@ def _numbers(camera: Camera) -> list[float]:
 
 
 def _fingerprint(
-    scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
+    scene: Scene, views: Sequence[TrainingView], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})

@@ -25,7 +25,7 @@ UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TrainingView:
     """One image that a scene should explain."""
 
     frame_id: int
@@ -39,7 +39,7 @@ class View:
     Called when first needed, and again when the cache could not keep the image."""
 
 
-def require_views(views: Sequence[View]) -> None:
+def require_views(views: Sequence[TrainingView]) -> None:
     """Raise InputError when there is nothing to train on."""
     if not views:
         raise InputError(
@@ -90,10 +90,10 @@ class ImageCache:
         self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._held: dict[View, tuple[Tensor, Tensor | None]] = {}
+        self._held: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
-    def get(self, view: View, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
+    def get(self, view: TrainingView, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
         """Image [H, W, 3] float32 and mask [H, W] (or None) of a view, resampled by ``factor``.
 
         The image lies in a buffer of the cache, and is valid until the next call.
@@ -122,7 +122,7 @@ class ImageCache:
         return image, mask
 
 
-def _prepare(view: View, factor: float, training: bool) -> tuple[NDArray[np.generic], Mask | None]:
+def _prepare(view: TrainingView, factor: float, training: bool) -> tuple[NDArray[np.generic], Mask | None]:
     """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
     image, mask = view.load()
     camera = view.camera.scaled(factor)

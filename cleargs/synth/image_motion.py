@@ -26,7 +26,7 @@ of that size."""
 
 
 @dataclass(frozen=True)
-class FrameMotion:
+class SimulatedMotion:
     """One frame's surroundings in time: what an exposure about its middle would smear."""
 
     path: HandheldPath
@@ -80,7 +80,7 @@ class FrameMotion:
         return np.asarray(focal * local[..., :2] / np.maximum(local[..., 2:], 1e-6), np.float64)
 
 
-def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> FrameMotion:
+def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> SimulatedMotion:
     """The motion about a frame whose view at ``time`` has ``depth`` [H, W] (0 where there is nothing)."""
     columns = (np.arange(GRID[0]) + 0.5) / GRID[0] * lens.width
     rows = (np.arange(GRID[1]) + 0.5) / GRID[1] * lens.height
@@ -89,7 +89,7 @@ def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> FrameMo
     rays = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy, np.ones_like(x)], -1)
     seen = z > 0
     pose = path.poses(np.array([time]))[0]
-    return FrameMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
+    return SimulatedMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
 
 
 def duration_for(pixels: float, motion: Callable[[float], float]) -> float:

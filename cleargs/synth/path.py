@@ -34,7 +34,7 @@ class Course(Protocol):
 
 
 @dataclass(frozen=True)
-class Setting:
+class SceneSetup:
     """Where a capture is made."""
 
     name: str

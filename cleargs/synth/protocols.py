@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
-from cleargs.synth.image_motion import FrameMotion, duration_for
+from cleargs.synth.image_motion import SimulatedMotion, duration_for
 from cleargs.synth.path import FPS
 from cleargs.synth.phone import auto_exposure
 
@@ -92,7 +92,7 @@ class Fault:
 
 
 def plan(
-    protocol: Protocol, motions: Sequence[FrameMotion], luminances: Sequence[float], seed: int
+    protocol: Protocol, motions: Sequence[SimulatedMotion], luminances: Sequence[float], seed: int
 ) -> list[Fault]:
     """The fault of each frame of a walk; ``luminances`` is what each frame's meter sees, in linear light."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
@@ -110,7 +110,7 @@ def plan(
     return [Fault(exposure, readout, stops=float(stops), noise=phone.NOISE) for stops in gains]
 
 
-def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
+def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
     """What phones give: of any two neighbours one is sharp (blur under `SHARP_BLUR`) and one is not.
 
     Of the others the 60 % that move fastest are blurred by 7-22 px; of the rest every other one is defocused

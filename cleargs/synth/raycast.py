@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy, phone_lens
-from cleargs.synth.path import Orbit, Setting
+from cleargs.synth.path import Orbit, SceneSetup
 from cleargs.synth.room import (
     BOX,
     LEVEL_STARTS,
@@ -389,8 +389,8 @@ class RoomWorld:
         return image, depth, share
 
 
-def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
+def room_setting(frames: int, width: int, height: int, seed: int) -> SceneSetup:
     """The procedural room of ``seed``, in metres, and a walk around its table."""
     room = make_room(seed)
     world, course, lens = RoomWorld(room), Orbit(room.focus, frames, seed), phone_lens(width, height)
-    return Setting("room", world, course, lens, partial(world.film, Balloon(room, seed)))
+    return SceneSetup("room", world, course, lens, partial(world.film, Balloon(room, seed)))

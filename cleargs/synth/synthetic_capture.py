@@ -21,9 +21,9 @@ from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
-from cleargs.synth.image_motion import FrameMotion, follow
+from cleargs.synth.image_motion import SimulatedMotion, follow
 from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, disc, still
-from cleargs.synth.path import FPS, HandheldPath, Setting, frame_times
+from cleargs.synth.path import FPS, HandheldPath, SceneSetup, frame_times
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
 from cleargs.synth.raycast import room_setting
@@ -65,7 +65,7 @@ def make_capture(
     height: int,
     seed: int,
     reporter: Reporter,
-    setting: Setting | None = None,
+    setting: SceneSetup | None = None,
     video: bool = False,
 ) -> dict[str, Any]:
     """Write the capture ``protocol`` into the new folder ``out``; returns what ``truth/capture.json`` says.
@@ -170,8 +170,8 @@ def make_capture(
 
 
 def _expose(
-    setting: Setting,
-    motion: FrameMotion,
+    setting: SceneSetup,
+    motion: SimulatedMotion,
     fault: Fault,
     nearness: float,
     rng: np.random.Generator,
@@ -195,7 +195,7 @@ def _expose(
     return light, np.zeros(light.shape[:2])
 
 
-def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: Look) -> Array:
+def _write_sharp(folder: Path, stem: str, setting: SceneSetup, pose: Array, look: Look) -> Array:
     """Writes the sharp view and returns its light [H, W, 3]."""
     light = setting.world.render(still(pose, setting.lens.height), setting.lens)
     write_rgb(folder / "images" / f"{stem}.png", develop(light, look=look))
@@ -224,7 +224,7 @@ def develop(
     return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
 
 
-def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str, Any]:
+def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault) -> dict[str, Any]:
     return {
         "frame_id": number,
         "image": image,

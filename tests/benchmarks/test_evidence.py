@@ -16,7 +16,7 @@ from benchmarks.comparison.evidence import Workshop, minutes, read_evidence
 from benchmarks.comparison.kept_sections import KeptSection
 from benchmarks.comparison.origin import version_of_source
 from benchmarks.comparison.results_page import Origin, losses, results_page
-from benchmarks.comparison.scenes import Recipe, Sample
+from benchmarks.comparison.scenes import Sample, SceneRecipe
 from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
 from cleargs.errors import ConfigError
 from cleargs.evaluate.config import EvalOptions
@@ -117,7 +117,7 @@ def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: 
 def test_what_a_section_before_it_has_made_takes_no_time(tmp_path: Path) -> None:
     blur = read_evidence().quick[0]
     with opened_store(tmp_path / "store") as store:
-        recipe = Recipe(installed(), "default", (), "cpu", 2, EvalOptions())
+        recipe = SceneRecipe(installed(), "default", (), "cpu", 2, EvalOptions())
         shop = Workshop(tmp_path, None, recipe, store, SilentReporter())
         alone, again, more = minutes(
             [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], shop

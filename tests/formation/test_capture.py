@@ -27,7 +27,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trained, Trainer
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 5
 CONFIG = TrainConfig(
@@ -75,19 +75,19 @@ def scene() -> Scene:
     )
 
 
-def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[View]:
+def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[TrainingView]:
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
-        view = View(index, camera(angle), 1.0, "real", lambda: (None, None))
+        view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
         moved = FrameFormation(index, BLUR, "blur", reach_px=4.0) if index == blurred else None
         seen = photograph(scene(), view, formation=moved).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         weight = 1.0 if weights is None else weights[index]
-        made.append(View(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(TrainingView(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
     return made
 
 
-def run(folder: Path, seen: list[View], formation: CaptureFormation | None) -> Trained:
+def run(folder: Path, seen: list[TrainingView], formation: CaptureFormation | None) -> Trained:
     folder.mkdir(exist_ok=True)
     trainer = Trainer(scene(), seen, CONFIG, seed=(3,), formation=formation)
     return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
@@ -124,14 +124,16 @@ def test_sharp_frames_train_as_without_it_bit_for_bit(tmp_path: Path) -> None:
     assert with_it.rows.equals(without.rows)
 
 
-def crossed() -> list[View]:
+def crossed() -> list[TrainingView]:
     """The sharp views, with a red square that stands elsewhere in each."""
     made = []
     for view in views(blurred=None):
         pixels = view.load()[0].copy()
         left = 8 + 17 * view.frame_id
         pixels[24:40, left : left + 16] = (230, 20, 20)
-        made.append(View(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(
+            TrainingView(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None))
+        )
     return made
 
 
@@ -178,14 +180,16 @@ def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
 SKEW = FrameMotion(skew=np.array([0, 0, 0, 0, 9.0, 0]), median_depth=3.0)
 
 
-def skewed(frames: list[int]) -> list[View]:
+def skewed(frames: list[int]) -> list[TrainingView]:
     """The views, with a rolling shutter in these."""
     made = []
     for view in views(blurred=None):
         moved = FrameFormation(view.frame_id, SKEW, "skew", reach_px=5.0)
         seen = photograph(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
-        made.append(View(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(
+            TrainingView(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None))
+        )
     return made
 
 
@@ -196,7 +200,7 @@ def test_a_twist_is_the_motion_of_the_scene_past_the_camera() -> None:
     seen = photograph(scene(), view, formation=moved)[-4:, 8:-8]
     difference = {}
     for side in (-1, 1):
-        turned = View(2, camera(side * 0.5 * 9.0 / 90.0), 1.0, "real", view.load)
+        turned = TrainingView(2, camera(side * 0.5 * 9.0 / 90.0), 1.0, "real", view.load)
         difference[side] = float((photograph(scene(), turned)[-4:, 8:-8] - seen).abs().mean())
     # The four rows lie up to a 0.3 px short of it, where the squares have edges.
     assert difference[1] < 0.4 * difference[-1], difference

@@ -31,7 +31,7 @@ from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer
 from cleargs.splat.types import Moments
-from cleargs.splat.views import ImageCache, View, unseen_pixels
+from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
 CONFIG = TrainConfig(
     steps=40,
@@ -62,7 +62,7 @@ def pictures() -> list[np.ndarray]:
 
 
 def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **options: Any) -> Trained:
-    made = pictures_or_views if isinstance(pictures_or_views[0], View) else views(pictures_or_views)
+    made = pictures_or_views if isinstance(pictures_or_views[0], TrainingView) else views(pictures_or_views)
     folder.mkdir(exist_ok=True)
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
     scene, reporter, round = arguments.pop("scene"), arguments.pop("reporter"), arguments.pop("round", 0)

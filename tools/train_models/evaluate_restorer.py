@@ -52,7 +52,7 @@ _PURPOSE_MEAN_KERNEL = 4
 
 
 @dataclass(frozen=True)
-class Case:
+class RestorationCase:
     """A photograph (sRGB [H, W, 3] in [0, 1]), its blurred version and the kernel that made it."""
 
     source: str
@@ -61,7 +61,7 @@ class Case:
     kernel: Kernel
 
 
-Method = Callable[[Case], Image]
+Method = Callable[[RestorationCase], Image]
 
 
 def psnr(image: Image, reference: Image) -> float:
@@ -110,7 +110,7 @@ def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:
 
 def make_cases(
     photos: Sequence[Path], band: tuple[int, int] | None, *, crop: int | None, seed: int, purpose: int
-) -> list[Case]:
+) -> list[RestorationCase]:
     """One case a photograph: blurred by a motion of the band, with noise, or sharp without a band.
 
     crop: side of the central square to take; None for the whole photograph.
@@ -124,20 +124,20 @@ def make_cases(
             photo = photo[y : y + crop, x : x + crop]
         sharp = photo.astype(np.float32) / np.float32(255.0)
         if band is None:
-            cases.append(Case(source_of(path), sharp, sharp, IDENTITY))
+            cases.append(RestorationCase(source_of(path), sharp, sharp, IDENTITY))
             continue
         kernel = motion_kernel(rng, rng.uniform(*band))
         blurred = degrade(sharp, Degradation(kernel=kernel, noise=rng.uniform(0.0, 1.0) / 255.0), rng)
-        cases.append(Case(source_of(path), sharp, blurred, kernel))
+        cases.append(RestorationCase(source_of(path), sharp, blurred, kernel))
     return cases
 
 
-def score(method: Method, cases: Iterable[Case]) -> NDArray[np.float64]:
+def score(method: Method, cases: Iterable[RestorationCase]) -> NDArray[np.float64]:
     """PSNR in dB of the method's result on each case."""
     return np.array([psnr(method(case), case.sharp) for case in cases])
 
 
-def _best(candidates: Sequence[Method], cases: Sequence[Case]) -> Method:
+def _best(candidates: Sequence[Method], cases: Sequence[RestorationCase]) -> Method:
     return max(candidates, key=lambda method: float(score(method, cases).mean()))
 
 
@@ -186,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def expert_method(spec: str) -> Method:
         expert = load_expert(spec)
 
-        def restore(case: Case) -> Image:
+        def restore(case: RestorationCase) -> Image:
             started = time.perf_counter()
             restored = expert.restore(case.blurred, threads=options.threads)
             spent[spec] = spent.get(spec, 0.0) + time.perf_counter() - started
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return restore
 
     experts = {spec: expert_method(spec) for spec in options.expert or ["embedded"]}
-    columns: list[tuple[str, list[Case], dict[str, Method]]] = []
+    columns: list[tuple[str, list[RestorationCase], dict[str, Method]]] = []
     for band in BANDS:
         cases = make_cases(held_out, band, crop=options.crop, seed=options.seed, purpose=_PURPOSE_EVALUATION)
         columns.append((f"{band[0]}-{band[1]} px", cases, tuned_baselines(training, band, options.seed)))

@@ -19,7 +19,7 @@ import torch
 from cleargs.errors import InputError
 from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.vlm.evaluator import Picture, QwenEvaluator, UnscoredError
+from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
 
 _IMAGE = "<|image_pad|>"
@@ -92,7 +92,7 @@ class QwenFolder(QwenEvaluator):
         matcher = llguidance.LLMatcher(vocabulary, grammar)
         return model.to(self._device).eval(), tokenizer, images, matcher
 
-    def score(self, picture: Picture) -> Floats:
+    def score(self, picture: EncodedImage) -> Floats:
         """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._config.local_threads)
@@ -105,7 +105,7 @@ class QwenFolder(QwenEvaluator):
         except ReplyError as fault:  # a reply cut off at max_tokens
             raise UnscoredError(f"the reply cannot be used: {fault}") from None
 
-    def _reply(self, picture: Picture) -> str:
+    def _reply(self, picture: EncodedImage) -> str:
         """The reply to the prompt about ``picture``; a valid object unless the model runs out of tokens."""
         model, tokenizer, images, matcher = self._loaded
         seen = images(images=[picture.rgb], return_tensors="pt")

@@ -93,7 +93,7 @@ class Buffers:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ForwardPass:
     """What the backward pass needs of one forward pass; each back end adds its own."""
 
     gaussians: Gaussians
@@ -148,7 +148,7 @@ class Rasteriser(ABC):
                 f"the kernels take float32 parameters, not {gaussians.means.dtype}",
                 hint="convert them, or call render(), which sends float64 to the reference",
             )
-        asked = Frame(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
+        asked = ForwardPass(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
         with self._launching():
             self._frame = self._bin(asked, background, depth)
             return self._blend(self._frame, depth)
@@ -195,7 +195,7 @@ class Rasteriser(ABC):
         """What surrounds the kernels of a pass."""
 
     @abstractmethod
-    def _bin(self, asked: Frame, background: tuple[float, float, float], depth: bool) -> Frame:
+    def _bin(self, asked: ForwardPass, background: tuple[float, float, float], depth: bool) -> ForwardPass:
         """Project the Gaussians into splats, and list the splats of each tile from near to far."""
 
     @abstractmethod

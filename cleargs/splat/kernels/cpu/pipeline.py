@@ -23,10 +23,10 @@ TILES_PER_CHUNK = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(rasteriser.Frame):
+class CpuForwardPass(rasteriser.ForwardPass):
     """What the backward pass needs of one forward pass."""
 
-    view: projection.View
+    view: projection.ProjectionView
     background: Floats  # [3]
     splats: Floats  # [N, 16]
     pair_offsets: Array  # [N + 1]
@@ -63,10 +63,12 @@ class CpuRasteriser(rasteriser.Rasteriser):
     def _numbers(self, name: str, *shape: int) -> Array:  # uint32
         return self._buffers.take(name, *shape, dtype=torch.int32).numpy().view(np.uint32)
 
-    def _bin(self, asked: rasteriser.Frame, background: tuple[float, float, float], depth: bool) -> Frame:
+    def _bin(
+        self, asked: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
+    ) -> CpuForwardPass:
         gaussians, camera = asked.gaussians, asked.camera
         n, width, height = gaussians.num, camera.width, camera.height
-        view = projection.View(*rasteriser.view_numbers(camera))
+        view = projection.ProjectionView(*rasteriser.view_numbers(camera))
         splats = self._floats("splats", n, SPLAT_COLUMNS)
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)
@@ -98,7 +100,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         binning.sort_pairs_by_tile(
             order, pair_offsets, pair_tiles, counts, tile_offsets, pair_ids, pair_slots
         )
-        return Frame(
+        return CpuForwardPass(
             **vars(asked),
             view=view,
             background=np.asarray(background, np.float32),
@@ -111,7 +113,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
             last=self._floats("last", height, width),
         )
 
-    def _blend(self, frame: Frame, depth: bool) -> Render:
+    def _blend(self, frame: CpuForwardPass, depth: bool) -> Render:
         width, height = frame.camera.width, frame.camera.height
         image = self._floats("image", height, width, 3)
         depths = self._floats("depth", height, width) if depth else None
@@ -136,7 +138,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
         )
 
     def _differentiate(
-        self, frame: Frame, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, frame: CpuForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
         columns = SUM_DEPTH if grad_depth is None else PAIR_COLUMNS
         pair_sums = self._floats("pair_sums", len(frame.pair_ids), columns)

@@ -51,7 +51,7 @@ Parameters = tuple[Floats, ...]
 """Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
 
 
-class View(NamedTuple):
+class ProjectionView(NamedTuple):
     """A camera as the kernels read it: world-to-camera rotation rows, translation, intrinsics, bounds."""
 
     w00: float
@@ -105,7 +105,7 @@ def is_finite(x: Any) -> bool:
 
 
 @device
-def camera_position(mean: Array, view: View) -> tuple[float, float, float]:
+def camera_position(mean: Array, view: ProjectionView) -> tuple[float, float, float]:
     """The Gaussian's centre in camera coordinates."""
     x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -138,7 +138,7 @@ def scaled_axes(
 
 @device
 def projection_rows(
-    x: float, y: float, z: float, view: View
+    x: float, y: float, z: float, view: ProjectionView
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """The rows of J W. x/z and y/z are clamped, which keeps the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
@@ -155,7 +155,7 @@ def project_one(
     g: int,
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
     splats: Floats,
     basis: Floats,
@@ -220,7 +220,7 @@ def project_one(
 def project(
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
     width: int,
     height: int,

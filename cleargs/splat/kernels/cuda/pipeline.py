@@ -39,7 +39,7 @@ SORT_BYTES = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(rasteriser.Frame):
+class CudaForwardPass(rasteriser.ForwardPass):
     """What the backward pass needs of one forward pass."""
 
     view: Tensor  # float64 [23]
@@ -71,7 +71,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
     def _launching(self) -> AbstractContextManager[Any]:
         return memory_errors()
 
-    def _blend(self, frame: Frame, depth: bool) -> Render:
+    def _blend(self, frame: CudaForwardPass, depth: bool) -> Render:
         take, camera = self._buffers.take, frame.camera
         shape = (camera.height, camera.width)
         image, alpha = take("image", *shape, 3), take("alpha", *shape)
@@ -99,7 +99,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
         return Render(image, alpha, depths)
 
     def _differentiate(
-        self, frame: Frame, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, frame: CudaForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
         if grad_depth is not None and frame.planes == device_layout.CHUNK_PLANES:
             raise ValueError("a gradient of the depth needs a forward(depth=True) before it")
@@ -180,7 +180,9 @@ class CudaRasteriser(rasteriser.Rasteriser):
             )
         return Gaussians(**outputs)
 
-    def _bin(self, asked: rasteriser.Frame, background: tuple[float, float, float], depth: bool) -> Frame:
+    def _bin(
+        self, asked: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
+    ) -> CudaForwardPass:
         gaussians, camera = asked.gaussians, asked.camera
         take, device = self._buffers.take, self._buffers.device
         n, width, height, tiles = gaussians.num, camera.width, camera.height, tiles_of(camera)
@@ -241,7 +243,7 @@ class CudaRasteriser(rasteriser.Rasteriser):
         planes = device_layout.CHUNK_PLANES + depth
         # The number of chunks is known on the device alone; this many there can be at most.
         chunks = pairs // device_layout.CHUNK + min(tiles, pairs)
-        return Frame(
+        return CudaForwardPass(
             **vars(asked),
             view=view,
             background=torch.tensor(background, dtype=torch.float32).to(device, non_blocking=True),
