@@ -17,8 +17,8 @@ from cleargs.pipeline.dag import installed
 from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
+from cleargs.splat.budget import decided
 from cleargs.splat.config import Quality
-from cleargs.splat.effort import decided
 
 if TYPE_CHECKING:
     import numpy as np

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from cleargs.errors import InputError
 from cleargs.files import External
-from cleargs.untrusted import open_regular, require_utf8
+from cleargs.safe_io import open_regular, require_utf8
 
 RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""

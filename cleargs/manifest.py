@@ -10,10 +10,10 @@ from typing import Any, Literal
 from pydantic_core import to_jsonable_python
 
 import cleargs
+from cleargs.base_model import Record
 from cleargs.digest import DigestMemo, json_digest
 from cleargs.files import is_partial, write_json
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
 
 MANIFEST = "manifest.json"
 

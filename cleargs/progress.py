@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Protocol
 
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 Say = Callable[[str], object]
 """Is told a line."""

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
+from cleargs.base_model import Inherited, Settings
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.record import Inherited, Settings
 
 from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries
@@ -74,7 +74,7 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """The training, and two looks at the frames that are held back."""
-    from cleargs.splat.effort import training_cost
+    from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace
 

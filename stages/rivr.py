@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from cleargs.base_model import Settings
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.record import Settings
 from cleargs.rivr.gates import GateConfig
 from cleargs.rivr.harm import HarmConfig
 from cleargs.splat.config import Quality, TrainConfig
@@ -157,7 +157,7 @@ def preflight(config: RivrConfig) -> None:
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
     one), making and scoring candidates 2 s (two cores). Every group leaves a scene."""
-    from cleargs.splat.effort import training_cost
+    from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace
 

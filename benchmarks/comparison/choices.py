@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.images import read_rgb_float
+from cleargs.base_model import Record
 from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.parquet import read_table
-from cleargs.record import Record
 from cleargs.rivr.tables import read_selection
 from cleargs.synth.synthetic_capture import FRAMES
 

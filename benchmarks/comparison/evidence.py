@@ -23,16 +23,16 @@ from benchmarks.comparison.findings import Compared, compare_scenes
 from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes
 from benchmarks.comparison.splat_world import scene_setting
 from benchmarks.comparison.variants import find_variants
+from cleargs.base_model import Record
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.record import Record
-from cleargs.splat.effort import training_cost
+from cleargs.safe_io import FAULTS, cause, read_text
+from cleargs.splat.budget import training_cost
 from cleargs.synth.synthetic_capture import make_capture
-from cleargs.untrusted import FAULTS, cause, read_text
 
 WORLD_SETTINGS = (
     "rva.enabled=false",

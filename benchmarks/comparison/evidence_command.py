@@ -72,9 +72,9 @@ def evidence(
     the reason.
     """
     from benchmarks.comparison.evidence import Workshop, chosen_sections, make_section, minutes, read_evidence
-    from benchmarks.comparison.kept_sections import keep_section, kept_sections
     from benchmarks.comparison.origin import version_of_source
     from benchmarks.comparison.results_page import Origin, results_page
+    from benchmarks.comparison.saved_sections import keep_section, kept_sections
     from benchmarks.comparison.scenes import SceneRecipe
     from cleargs.files import write_bytes
 

@@ -21,7 +21,7 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.files import write_bytes
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 T = TypeVar("T", Cell, Roles, Choices)
 

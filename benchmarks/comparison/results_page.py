@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.comparison.cells import Cells, ViewSet
 from benchmarks.comparison.evidence import Section
 from benchmarks.comparison.gaps import VERDICTS, Gap, compared_with, is_behind, losses_table
-from benchmarks.comparison.kept_sections import KeptSection
+from benchmarks.comparison.saved_sections import KeptSection
 from benchmarks.comparison.tables import (
     COMPARED,
     NAMES,

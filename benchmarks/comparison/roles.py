@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+from cleargs.base_model import Record
 from cleargs.parquet import read_table
-from cleargs.record import Record
 from cleargs.rva.allocation import Role, Rule
 from cleargs.rva.tables import FRAMES
 

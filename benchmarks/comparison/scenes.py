@@ -31,8 +31,8 @@ from cleargs.pipeline.run_file import RUN_FILE, Device, RunSpec, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.safe_io import read_bytes, read_json
 from cleargs.splat.ply import read_ply
-from cleargs.untrusted import read_bytes, read_json
 
 EVALUATION_VERSION = 3
 """Raised when an evaluation of equal inputs would give other figures."""

@@ -24,7 +24,7 @@ from benchmarks.speed.random_scenes import surface_scene
 from benchmarks.speed.timing import Quartiles, ratio, take_turns
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
-from cleargs.formation.photograph import FormedView
+from cleargs.formation.observed import FormedView
 from cleargs.formation.warp import (
     displacement_fields,
     linear_curve,

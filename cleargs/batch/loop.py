@@ -22,7 +22,6 @@ from typing import Literal
 from rich.filesize import decimal
 
 from cleargs.batch.sheet import SceneJob, SheetError
-from cleargs.children import module_command
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
@@ -31,8 +30,9 @@ from cleargs.pipeline.run_file import Device, RunSpec
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import asked_run, opened_store, usable_cores
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
-from cleargs.report.words import duration
+from cleargs.subprocesses import module_command
 
 State = Literal["failed", "waiting", "partial", "done"]
 """`waiting`: there are stages to make, and no try has failed."""

@@ -17,10 +17,10 @@ from cleargs.errors import CleargsError
 from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
+from cleargs.report.formatting import count, duration
 from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
-from cleargs.report.words import count, duration
 
 BYTES = 15_000_000
 """About how much all thumbnails together may take."""

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
+from cleargs.base_model import Record
 from cleargs.errors import InputError
 from cleargs.pipeline.config import merge, parse_toml
 from cleargs.pipeline.settings import flattened
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, cause, read_text
+from cleargs.safe_io import FAULTS, cause, read_text
 
 NAMES = "letters, digits, and _ . - after the first, at most 100"
 PLAIN = ("name", "input", "recipe")

@@ -20,7 +20,7 @@ from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
 
 CHOICE = "chosen.json"
 """In the folder of the working images: numbers of the frames that were chosen from the video."""

@@ -18,7 +18,7 @@ from cleargs.capture.cameras import Intrinsics, Pose, within_reach
 from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
-from cleargs.untrusted import FAULTS, cause, open_regular, read_bytes
+from cleargs.safe_io import FAULTS, cause, open_regular, read_bytes
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, MemoryError, RuntimeError)
 """With those that pybind11 makes of C++ ones."""

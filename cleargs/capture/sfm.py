@@ -22,7 +22,7 @@ from cleargs.capture.sfm_worker import OUTCOME, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, cause, read_json
+from cleargs.safe_io import FAULTS, cause, read_json
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""

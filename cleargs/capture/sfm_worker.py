@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cleargs.base_model import Record
 from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
@@ -37,8 +38,7 @@ from cleargs.capture.matching import (
 )
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
-from cleargs.record import Record
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a

@@ -16,7 +16,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
-from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.observed import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES

@@ -14,7 +14,7 @@ import click
 import cleargs
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag, installed
-from cleargs.untrusted import printable, require_utf8
+from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cleargs.progress import CountedTask, Reporter, SilentReporter, Task
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress

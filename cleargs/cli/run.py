@@ -32,8 +32,8 @@ from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
 from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, resolve_device
-from cleargs.report.words import duration
-from cleargs.untrusted import printable
+from cleargs.report.formatting import duration
+from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
 """Stage -> the figures of its manifest."""

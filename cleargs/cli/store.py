@@ -16,7 +16,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import ROOTS, Store
-from cleargs.report.words import count
+from cleargs.report.formatting import count
 
 
 class StoreFault(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from cleargs.record import Record
+from cleargs.base_model import Record
 
 LpipsNet = Literal["alex", "vgg"]
 

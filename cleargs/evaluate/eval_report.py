@@ -12,12 +12,12 @@ from typing import Any, Literal
 import pyarrow as pa
 from pydantic import ConfigDict, Field, ValidationError
 
+from cleargs.base_model import Record
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import disk_errors, write_json
 from cleargs.parquet import column, write_table
-from cleargs.record import Record
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 PosesFrom = Literal["reference", "given"]
 World = Literal["scene", "ingest", "umeyama"]

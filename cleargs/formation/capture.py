@@ -21,7 +21,7 @@ from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
 from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
-from cleargs.formation.photograph import FormedView, pixel_weights
+from cleargs.formation.observed import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import group

@@ -21,7 +21,7 @@ from cleargs.errors import StoreError
 from cleargs.files import atomic_path
 from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.untrusted import FAULTS, cause, open_regular
+from cleargs.safe_io import FAULTS, cause, open_regular
 
 Image: TypeAlias = NDArray[np.float32]  # [H, W, 3] sRGB
 Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709

@@ -14,7 +14,7 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
-from cleargs.untrusted import cause, open_regular, read_bytes
+from cleargs.safe_io import cause, open_regular, read_bytes
 
 _FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp"})
 """Formats that are read, as OpenImageIO names them."""

@@ -24,7 +24,7 @@ from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import rgb_from_yuv, srgb_from_hdr
 from cleargs.media.image import to_uint8
-from cleargs.untrusted import open_regular
+from cleargs.safe_io import open_regular
 
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}

@@ -10,11 +10,11 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from cleargs.children import module_command
 from cleargs.errors import InputError, StageError
 from cleargs.models.lpips import convert_sdist
 from cleargs.models.registry import RegistryEntry, Source, verify
-from cleargs.untrusted import cause, read_bytes
+from cleargs.safe_io import cause, read_bytes
+from cleargs.subprocesses import module_command
 
 
 def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:

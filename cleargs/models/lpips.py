@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
-from cleargs.untrusted import FAULTS, cause
+from cleargs.safe_io import FAULTS, cause
 
 Net = Literal["alex", "vgg"]
 NETS: tuple[Net, ...] = get_args(Net)

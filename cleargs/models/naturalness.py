@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cleargs.base_model import Record
 from cleargs.models.tiling import Image, mean_over_tiles
-from cleargs.record import Record
 
 COEFFICIENTS = "naturalness.toml"
 

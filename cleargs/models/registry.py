@@ -13,11 +13,11 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
+from cleargs.base_model import Record
 from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
 from cleargs.plugins import load_part, plugins
-from cleargs.record import Record
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 T = TypeVar("T")
 

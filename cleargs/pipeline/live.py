@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from cleargs.base_model import Record
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.pipeline.store import writer_lives
 from cleargs.progress import PREVIEW, CountedTask, Reporter, Show, Task
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
 
 NOTE = ".at_work.json"
 

@@ -20,7 +20,7 @@ from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
 from cleargs.pipeline.store import Entry, Store, WorkFolder
 from cleargs.progress import Reporter
-from cleargs.untrusted import require_utf8
+from cleargs.safe_io import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
 """What the libraries reserve before any work is done."""

@@ -37,7 +37,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.lock import file_lock, is_locked, only_one
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, read_text
+from cleargs.safe_io import FAULTS, read_text
 
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""

@@ -26,6 +26,7 @@ from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
 from cleargs.report import charts
+from cleargs.report.formatting import duration
 from cleargs.report.frames import (
     CHOICES,
     LAYERS,
@@ -42,7 +43,6 @@ from cleargs.report.frames import (
 from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
 from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
-from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply

@@ -10,7 +10,7 @@ from typing import Any
 import cleargs
 from cleargs.files import write_json
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 FOLDER, PAGE, RECORD = "report", "index.html", "report.json"
 

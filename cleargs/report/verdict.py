@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
+from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
-from cleargs.report.words import count
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
 """Training PSNR from which a scene is said to follow its frames closely, and below which only loosely. What

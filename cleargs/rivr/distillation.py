@@ -16,11 +16,11 @@ from torch import Tensor
 
 from cleargs.files import atomic_path
 from cleargs.formation.capture import CaptureFormation, rolls
+from cleargs.formation.deblur import undo
 from cleargs.formation.exposure import apply_affine, read_exposure, write_exposure
 from cleargs.formation.frame import FrameFormation, explain
-from cleargs.formation.photograph import FormedView, evaluate_views, photograph, pooled_unseen
+from cleargs.formation.observed import FormedView, evaluate_views, photograph, pooled_unseen
 from cleargs.formation.table import read_formation, write_formation
-from cleargs.formation.undo import undo
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter

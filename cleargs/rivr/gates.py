@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cleargs.base_model import Settings
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.record import Settings
 from cleargs.rivr.candidates import Image
 
 BLOCK = 64

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cleargs.record import Settings
+from cleargs.base_model import Settings
 
 
 class HarmConfig(Settings):

@@ -21,7 +21,7 @@ from cleargs.files import write_json
 from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
 from cleargs.rva.arrays import Floats
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cleargs.record import Inherited, Settings
+from cleargs.base_model import Inherited, Settings
 
 # Steps and Gaussians where the settings leave them open. Neither is one number for all captures. Steps follow
 # the frames, since each is to be seen often enough; Gaussians follow the pixels, since they have that much to
@@ -206,7 +206,7 @@ class TrainConfig(Settings):
 
     @property
     def length(self) -> int:
-        """The steps; raises ValueError while they are not decided (`cleargs.splat.effort.decided`)."""
+        """The steps; raises ValueError while they are not decided (`cleargs.splat.budget.decided`)."""
         if self.steps is None:
             raise ValueError("the steps of this training are not decided yet")
         return self.steps

@@ -18,11 +18,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cleargs.children import module_command
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.kernel_cache import cache_folder
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
+from cleargs.subprocesses import module_command
 
 if TYPE_CHECKING:
     from cleargs.splat.camera import Camera

@@ -23,9 +23,9 @@ from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
 from cleargs.splat.backend import Meter, backend_for, step_gaussians
+from cleargs.splat.budget import decided, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.effort import decided, seconds_by_step
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support

@@ -13,9 +13,9 @@ from benchmarks.commands import invoke
 from benchmarks.comparison import results_page as results
 from benchmarks.comparison.cells import Cell
 from benchmarks.comparison.evidence import Workshop, minutes, read_evidence
-from benchmarks.comparison.kept_sections import KeptSection
 from benchmarks.comparison.origin import version_of_source
 from benchmarks.comparison.results_page import Origin, losses, results_page
+from benchmarks.comparison.saved_sections import KeptSection
 from benchmarks.comparison.scenes import Sample, SceneRecipe
 from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
 from cleargs.errors import ConfigError

@@ -19,7 +19,7 @@ from cleargs.formation.capture import (
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.photograph import photograph
+from cleargs.formation.observed import photograph
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera

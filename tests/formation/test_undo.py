@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.photographs import ALPHA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall_fields
 
-from cleargs.formation import undo as module
+from cleargs.formation import deblur as module
+from cleargs.formation.deblur import undo
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.undo import undo
 from cleargs.formation.warp import Warp
 
 MOTIONS = [

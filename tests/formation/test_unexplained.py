@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.photograph import pixel_weights
+from cleargs.formation.observed import pixel_weights
 
 HEIGHT, WIDTH = 108, 192
 TOLERANCE = 0.05

@@ -25,7 +25,7 @@ import torch
 from cleargs.capture.tables import load_frames
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
-from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.observed import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.splat.ply import read_ply

@@ -10,8 +10,8 @@ from helpers.splat_toy import gaussians, images, start, views
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
+from cleargs.splat.budget import decided, gaussians_by_step, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
-from cleargs.splat.effort import decided, gaussians_by_step, training_cost
 from cleargs.splat.trainer import Trainer
 from cleargs.stages.config import DistilConfig
 from cleargs.stages.g0 import G0Config

@@ -19,7 +19,7 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
+from cleargs.formation.observed import Fit, evaluate_views, photograph, pooled_unseen
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
 from cleargs.splat.backend import Meter, set_threads

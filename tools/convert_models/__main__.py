@@ -16,7 +16,7 @@ import click
 from cleargs.errors import CleargsError, InputError
 from cleargs.models.install import place, read_checked
 from cleargs.models.registry import RegistryEntry, file_digest, find_model, model_dir
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 from tools.convert_models import restorer, scorers
 from tools.convert_models.torch_export import require
 

@@ -12,7 +12,7 @@ from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import chosen, frame_key, mask_externals, name_below_images
 from cleargs.errors import InputError
 from cleargs.media import IMAGE_SUFFIXES
-from cleargs.untrusted import FAULTS, cause, read_json
+from cleargs.safe_io import FAULTS, cause, read_json
 
 if TYPE_CHECKING:
     from cleargs.capture.cameras import Intrinsics, Pose

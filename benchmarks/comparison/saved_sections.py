@@ -18,7 +18,7 @@ from benchmarks.comparison.tables import Results
 from cleargs.evaluate.eval_report import Figures
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 
 class KeptSection(Figures):
