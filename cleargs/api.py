@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_run, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
-from cleargs.splat.budget import decided
+from cleargs.splat.budget import resolve_config
 from cleargs.splat.config import Quality
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def run(
 
     dag, reporter = installed(), _reporter(progress)
     dag.until(until)
-    asked = asked_run(
+    spec = resolve_run(
         dag,
         Path(source),
         Path(folder),
@@ -85,10 +85,10 @@ def run(
         device=device,
         say=reporter.info,
     )
-    with opened_store(asked.store) as opened:
-        runner = Runner(dag, asked, opened, threads or usable_cores(), reporter)
+    with opened_store(spec.store) as opened:
+        runner = Runner(dag, spec, opened, threads or usable_cores(), reporter)
         runner.run_until(until, force=force, allow_partial=allow_partial)
-    return Run(asked.folder)
+    return Run(spec.folder)
 
 
 def initialise(
@@ -109,7 +109,7 @@ def initialise(
     from cleargs.splat.scene import Scene
 
     views = capture.views() if views is None else views
-    config = decided(config or G0Config(), views)
+    config = resolve_config(config or G0Config(), views)
     points, observations = capture.points, load_observations(capture.folder)
     frame_ids = [view.frame_id for view in views]
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
@@ -239,13 +239,13 @@ def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | 
     better than the render as it is. Raises InputError for a frame without a pose.
     """
     from cleargs.formation.frames import view_of
-    from cleargs.rivr.distillation import Snapshot
+    from cleargs.rivr.distillation import TrainedScene
 
     capture = open_prepared(run["ingest"])
     frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
     if frame is None or not frame.registered:
         raise InputError(f"frame {frame_id} has no pose", hint="see cleargs show RUN ingest")
-    return Snapshot(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
+    return TrainedScene(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
 
 
 def evaluate_scene(

@@ -92,7 +92,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Latest accepted repairs -> distillation from RIVR's scene -> the check for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import Snapshot, publish
+    from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
@@ -116,8 +116,8 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     repairs, kept = latest_accepted(rows), kept_raw(rows)
     write_repairs(context.out / "repairs.parquet", repairs)
 
-    g0 = Snapshot(context.inputs["g0"], context.device)
-    start = Snapshot(rivr, context.device) if repairs or kept else g0
+    g0 = TrainedScene(context.inputs["g0"], context.device)
+    start = TrainedScene(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
@@ -136,9 +136,9 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         trainings.append(consolidated.folder)
 
     verdict = judge_harm(
-        supervision.held_back,
-        g0.fidelity(supervision.judges, scorer, threads),
-        consolidated.fidelity(supervision.judges, scorer, threads),
+        supervision.holdout_ids,
+        g0.fidelity(supervision.holdout_views, scorer, threads),
+        consolidated.fidelity(supervision.holdout_views, scorer, threads),
         harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)

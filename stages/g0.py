@@ -113,7 +113,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.splat.backend import set_threads
-    from cleargs.splat.budget import decided
+    from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
@@ -131,7 +131,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     observations = load_observations(ingest)
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
 
-    config = decided(config, views)
+    config = resolve_config(config, views)
     gaussians = starting_gaussians(
         sparse,
         views,

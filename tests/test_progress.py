@@ -83,7 +83,7 @@ def test_a_run_of_the_library_logs(
         say("as in run.toml")
         raise InputError("stop", hint="here")
 
-    monkeypatch.setattr(api, "asked_run", asked)
+    monkeypatch.setattr(api, "resolve_run", asked)
     with pytest.raises(InputError):
         api.run(tmp_path / "photos", tmp_path / "run")
     assert caplog.messages == ["as in run.toml"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.images import read_rgb_float
-from cleargs.base_model import Record
+from cleargs.base_model import FrozenModel
 from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
@@ -28,7 +28,7 @@ _MIN_ERROR = 1e-10
 """Equal images have a PSNR of 100 dB, not an infinite one."""
 
 
-class ChoiceRow(Record):
+class ChoiceRow(FrozenModel):
     """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
 
     round: int
@@ -53,7 +53,7 @@ class ChoiceRow(Record):
         return max(self.psnr.values()) - self.psnr[self.chosen]
 
 
-class Choices(Record):
+class Choices(FrozenModel):
     """All rows of one scene."""
 
     column: str
@@ -62,7 +62,7 @@ class Choices(Record):
     rows: tuple[ChoiceRow, ...]
 
 
-class ChoiceAgreement(Record):
+class ChoiceAgreement(FrozenModel):
     """How well choices agree with the truth.
 
     Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept

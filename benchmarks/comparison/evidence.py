@@ -23,7 +23,7 @@ from benchmarks.comparison.findings import Compared, compare_scenes
 from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes
 from benchmarks.comparison.splat_world import scene_setting
 from benchmarks.comparison.variants import find_variants
-from cleargs.base_model import Record
+from cleargs.base_model import FrozenModel
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.run_file import RunSpec
@@ -46,7 +46,7 @@ WORLD_SETTINGS = (
 Seed = Annotated[int, Field(ge=0)]
 
 
-class TestSet(Record):
+class TestSet(FrozenModel):
     """What no default may be chosen on."""
 
     __test__ = False  # no test of pytest's
@@ -57,13 +57,13 @@ class TestSet(Record):
     videos: tuple[str, ...]
 
 
-class TuningSet(Record):
+class TuningSet(FrozenModel):
     """What defaults may be chosen on."""
 
     rooms_below: int = Field(ge=1)
 
 
-class Section(Record):
+class Section(FrozenModel):
     """One comparison of the page."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*$")
@@ -86,7 +86,7 @@ class Section(Record):
     judge as it is, so none of it counts again in the page's summary."""
 
 
-class Evidence(Record):
+class Evidence(FrozenModel):
     """``evidence.toml``."""
 
     test: TestSet
@@ -132,7 +132,7 @@ class SectionOutcome:
 
 
 @dataclass(frozen=True)
-class Workshop:
+class EvidenceContext:
     """Where evidence is made, and with what."""
 
     out: Path
@@ -157,28 +157,28 @@ def read_evidence(path: Path | None = None) -> Evidence:
         raise ConfigError(f"cannot read the list of evidence: {cause(error)}", hint=hint) from error
 
 
-def make_section(section: Section, shop: Workshop) -> SectionOutcome:
+def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
     """Make the captures of a section, all of its scenes, and judge them."""
     missing: list[str] = []
     samples: list[Sample] = []
-    for capture in _captures(section, shop):
+    for capture in _captures(section, context):
         if capture.missing:
-            shop.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
+            context.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
             missing.append(f"{capture.name}: {capture.missing}")
         samples += capture.samples
     found = Compared()
     for factor in section.factors if samples else ():
         recipe = replace(
-            shop.recipe,
-            overrides=(*shop.recipe.overrides, *_settings(section)),
+            context.recipe,
+            overrides=(*context.recipe.overrides, *_settings(section)),
             steps=section.steps * factor,
-            options=shop.recipe.options.model_copy(update={"align_colour": section.align_colour}),
+            options=context.recipe.options.model_copy(update={"align_colour": section.align_colour}),
         )
         made = make_scenes(
-            shop.out, samples, find_variants(section.variants), recipe, shop.store, shop.reporter
+            context.out, samples, find_variants(section.variants), recipe, context.store, context.reporter
         )
         try:
-            one = compare_scenes(shop.out, made, recipe, shop.store, shop.reporter)
+            one = compare_scenes(context.out, made, recipe, context.store, context.reporter)
         except InputError as error:
             missing.append(str(error))
             continue
@@ -186,7 +186,7 @@ def make_section(section: Section, shop: Workshop) -> SectionOutcome:
     return SectionOutcome(section, found if found.cells else None, (*missing, *found.failures))
 
 
-def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
+def minutes(sections: Iterable[Section], context: EvidenceContext) -> list[float]:
     """Rough time of each section on two quiet cores, everything still to be made; what a section before it
     has made takes no time."""
     made: set[object] = set()
@@ -196,15 +196,15 @@ def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
         made.add(what)
         return not known
 
-    return [_seconds(section, shop, first) / 60 for section in sections]
+    return [_seconds(section, context, first) / 60 for section in sections]
 
 
-def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> float:
+def _seconds(section: Section, context: EvidenceContext, first: Callable[..., bool]) -> float:
     megapixels = section.size[0] * section.size[1] / 1e6
     variants = []
     for variant in find_variants(section.variants):
         with suppress(ConfigError):  # its recipe is not there: it takes no time
-            config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, section.settings, 0)
+            config = variant_config(context.recipe.dag, variant, context.recipe.workflow, section.settings, 0)
             g0: Any = config.sections["g0"]
             variants.append((variant, steps_of(config, section.frames), g0))
     seconds = 0.0
@@ -244,12 +244,12 @@ def _settings(section: Section) -> tuple[str, ...]:
     return (*(limits if section.kind == "video" else ()), *section.settings)
 
 
-def _captures(section: Section, shop: Workshop) -> Iterator[CaptureEntry]:
+def _captures(section: Section, context: EvidenceContext) -> Iterator[CaptureEntry]:
     """The captures of a section as soon as they are there."""
     if section.kind == "video":
         for name in section.captures:
             try:
-                place = _real(name, shop)
+                place = _real(name, context)
             except CleargsError as error:
                 yield CaptureEntry(name, missing=str(error))
             else:
@@ -259,8 +259,10 @@ def _captures(section: Section, shop: Workshop) -> Iterator[CaptureEntry]:
         for protocol in section.protocols:
             label = protocol if world is None else f"{world}, {protocol}"
             try:
-                scene = None if world is None else _world(world, shop)
-                places = [_synthetic(section, protocol, seed, world, scene, shop) for seed in section.seeds]
+                scene = None if world is None else _world(world, context)
+                places = [
+                    _synthetic(section, protocol, seed, world, scene, context) for seed in section.seeds
+                ]
             except CleargsError as error:
                 yield CaptureEntry(label, missing=str(error))
             else:
@@ -268,21 +270,26 @@ def _captures(section: Section, shop: Workshop) -> Iterator[CaptureEntry]:
                 yield CaptureEntry(label, tuple(Sample(place, seed, None) for place, seed in pairs))
 
 
-def _real(name: str, shop: Workshop) -> Path:
-    if shop.captures is None:
+def _real(name: str, context: EvidenceContext) -> Path:
+    if context.captures is None:
         raise InputError("it is a real capture, and --captures was not given", hint="give --captures DIR")
-    if not (shop.captures / name).exists():
+    if not (context.captures / name).exists():
         raise InputError(f"the folder of --captures holds no {name}", hint="put it there")
-    return shop.captures / name
+    return context.captures / name
 
 
 def _synthetic(
-    section: Section, protocol: str, seed: int, world: str | None, scene: Path | None, shop: Workshop
+    section: Section,
+    protocol: str,
+    seed: int,
+    world: str | None,
+    scene: Path | None,
+    context: EvidenceContext,
 ) -> Path:
     """The folder of a synthetic capture, made where it is not there yet."""
     width, height = section.size
     parts = [protocol, *([] if world is None else [world]), f"{section.frames}x{width}x{height}", str(seed)]
-    place = shop.out / "captures" / "-".join(parts)
+    place = context.out / "captures" / "-".join(parts)
     if not place.is_dir():
         beside = place.with_name(
             f".{os.getpid()}-{place.name}"
@@ -295,19 +302,19 @@ def _synthetic(
             width=width,
             height=height,
             seed=seed,
-            reporter=shop.reporter,
+            reporter=context.reporter,
             setting=None if scene is None else scene_setting(scene, None, section.frames, width, height),
         )
         beside.rename(place)
     return place
 
 
-def _world(name: str, shop: Workshop) -> Path:
+def _world(name: str, context: EvidenceContext) -> Path:
     """The scene of a real capture, trained on every frame where it is not there yet."""
-    recipe, folder = shop.recipe, shop.out / "worlds" / name
+    recipe, folder = context.recipe, context.out / "worlds" / name
     config = load_config(recipe.dag, recipe.workflow, WORLD_SETTINGS)
-    run = RunSpec(folder, _real(name, shop).absolute(), config, shop.store.root, recipe.device)
-    Runner(recipe.dag, run, shop.store, recipe.threads, shop.reporter).run_until("g0")
+    run = RunSpec(folder, _real(name, context).absolute(), config, context.store.root, recipe.device)
+    Runner(recipe.dag, run, context.store, recipe.threads, context.reporter).run_until("g0")
     return folder / "g0" / "scene.ply"
 
 

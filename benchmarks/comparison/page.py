@@ -50,7 +50,7 @@ BYTES = 20_000_000
 
 REFERENCE, FILMED = "reference", "filmed"
 _FOLDER = "poses"
-_SAID = ("psnr", "lpips_vgg", "lpips_alex")
+_SHOWN_METRICS = ("psnr", "lpips_vgg", "lpips_alex")
 
 Image = NDArray[np.uint8]
 
@@ -270,8 +270,8 @@ def _pose(
 
 def _note(values: Mapping[str, float | None]) -> str:
     """PSNR and one LPIPS, as far as they were measured."""
-    said = [metric for metric in _SAID if values.get(metric) is not None][:2]
-    texts = {metric: number(values[metric] or 0.0, metric) for metric in said}
+    shown = [metric for metric in _SHOWN_METRICS if values.get(metric) is not None][:2]
+    texts = {metric: number(values[metric] or 0.0, metric) for metric in shown}
     return " · ".join(
         f"{text} dB" if metric == "psnr" else f"{NAMES[metric]} {text}" for metric, text in texts.items()
     )

@@ -122,7 +122,7 @@ def comparison_sheet(
             if (cell.views, cell.sample) == (views, first.sample) and cell.variant in variants
         }
         capture = captures[first.sample]
-        name = _telling(out, first, capture)
+        name = _typical_frame(out, first, capture)
         tiles = [
             Tile(_find(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
             Tile(_find(capture / "images", name), "input"),
@@ -133,7 +133,7 @@ def comparison_sheet(
     write_rgb(path, contact_sheet(rows, tile_width=320))
 
 
-def _telling(out: Path, cell: Cell, capture: Path) -> str:
+def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     """The frame to show: a bad one, but not the worst. At the upper quartile of the input's error against the
     truth; where there is no such pair, at the lower quartile of the scene's PSNR."""
     truth, observed = capture / "truth" / "observed" / "images", capture / "images"

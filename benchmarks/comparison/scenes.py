@@ -24,7 +24,7 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import write_bytes
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.parquet import damage_told
+from cleargs.parquet import read_errors
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import RUN_FILE, Device, RunSpec, read_run_file
@@ -89,7 +89,7 @@ class SceneRecipe:
 
 
 @dataclass
-class Ledger:
+class ChargedStages:
     """Which stages of a sample are made and paid for."""
 
     keys: set[str] = field(default_factory=set)
@@ -135,7 +135,7 @@ def make_scenes(
     for sample in samples:
         _require_reference(sample, load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed))
     for sample in samples:
-        ledger, work = Ledger(), None
+        charged, work = ChargedStages(), None
         for variant in variants:
             reporter.info(f"{sample.name}, {variant.label}")
             try:
@@ -154,7 +154,7 @@ def make_scenes(
                 lacking = ", ".join((*manifests[-1].inherited, *manifests[-1].missing))
                 yield f"{sample.name}, {variant.label}: {lacking}"
                 continue
-            made = Made(sample, variant, runner.run.folder, *ledger.charge(manifests), manifests)
+            made = Made(sample, variant, runner.run.folder, *charged.charge(manifests), manifests)
             if (trained := trained_steps(made)) != work.steps:
                 reporter.warn(
                     f"{sample.name}, {variant.label}: {trained} of {work.steps} steps, since no repair was "
@@ -336,15 +336,15 @@ def trained_steps(made: Made) -> int:
     logs = [made.run / manifest.stage / "train.parquet" for manifest in made.manifests]
     steps = 0
     for log in filter(Path.is_file, logs):
-        with damage_told(log):
+        with read_errors(log):
             steps += parquet.read_metadata(log).num_rows
     return steps
 
 
 def _all_noted(combine: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
     """The combined values; None where one is missing."""
-    noted = [value for value in values if value is not None]
-    return combine(noted) if noted and len(noted) == len(values) else None
+    known = [value for value in values if value is not None]
+    return combine(known) if known and len(known) == len(values) else None
 
 
 def _matrices(folder: Path) -> list[Any]:

@@ -69,13 +69,13 @@ class DeviceIteration(Iteration):
 
     def differentiate(self, image: Tensor) -> Tensor:
         """See `Iteration`; the loss itself stays on the device."""
-        self._meter.add(len(self._meter), image, self._target, gradient=self._slope)
+        self._losses.add(len(self._losses), image, self._target, gradient=self._slope)
         return self._slope
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
         """Several iterations, then the losses are read."""
         super().run_several(repetitions, clock)
-        self._meter.take()
+        self._losses.take()
 
 
 def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[DeviceBenchmark]:
@@ -148,8 +148,8 @@ class _CountingRasteriser(CudaRasteriser):
 
     @property
     def work(self) -> tuple[int, int]:
-        assert self._frame is not None
-        return len(self._frame.pair_ids), int(self._frame.deepest.sum())
+        assert self._state is not None
+        return len(self._state.pair_ids), int(self._state.deepest.sum())
 
 
 def count_pairs(gaussians: Gaussians, camera: Camera, device: torch.device) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from benchmarks.speed.probe import timed_kernels
 from benchmarks.speed.random_scenes import random_image
 from benchmarks.speed.timing import Clock
-from cleargs.splat.backend import Meter, rasteriser_for, set_threads, step_gaussians
+from cleargs.splat.backend import LossAccumulator, rasteriser_for, set_threads, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass, CpuRasteriser
@@ -38,7 +38,7 @@ class Iteration:
         self.engine = rasteriser_for(device)
         self._target = random_image(camera.width, camera.height).to(device)
         self._slope = torch.empty_like(self._target)
-        self._meter = Meter(device, SSIM_LAMBDA)
+        self._losses = LossAccumulator(device, SSIM_LAMBDA)
         self._moments = Moments.zeros(self.gaussians)
         self._rates: dict[str, float | Tensor] = dict.fromkeys(self.gaussians.tensors(), 0.0)
         self._step = 0
@@ -66,8 +66,8 @@ class Iteration:
 
     def differentiate(self, image: Tensor) -> Tensor:
         """The gradient of the loss by the image [H, W, 3]."""
-        self._meter.add(0, image, self._target, gradient=self._slope)
-        self._meter.take()
+        self._losses.add(0, image, self._target, gradient=self._slope)
+        self._losses.take()
         return self._slope
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
@@ -94,7 +94,7 @@ class _InspectableRasteriser(CpuRasteriser):
 
     @property
     def frame(self) -> CpuForwardPass:
-        frame: CpuForwardPass = self._frame
+        frame: CpuForwardPass = self._state
         return frame
 
 

@@ -28,7 +28,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import Device, RunSpec
 from cleargs.pipeline.runner import check_same_input
-from cleargs.pipeline.session import asked_run, opened_store, usable_cores
+from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
 from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
@@ -185,7 +185,7 @@ class Batch:
         return ("failed", failure) if (failure := last_error(self.log(scene))) else ("waiting", "")
 
     def _run(self, scene: SceneJob) -> RunSpec:
-        run = asked_run(
+        run = resolve_run(
             self.dag,
             scene.source,
             self.run_folder(scene),

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
-from cleargs.base_model import Record
+from cleargs.base_model import FrozenModel
 from cleargs.errors import InputError
 from cleargs.pipeline.config import merge, parse_toml
 from cleargs.pipeline.settings import flattened
@@ -31,7 +31,7 @@ class SheetError(InputError):
         self.problems = problems
 
 
-class SheetRow(Record):
+class SheetRow(FrozenModel):
     """One scene as the sheet gives it, the sheet's own defaults filled in."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")] = Field(
@@ -74,7 +74,7 @@ def read_scenes(path: Path) -> list[SceneJob]:
         try:
             scene = _scene(path.absolute().parent, where, SheetRow.model_validate(values))
         except ValidationError as error:
-            problems += [f"{where}: {_said(found)}" for found in error.errors(include_url=False)]
+            problems += [f"{where}: {_problem(found)}" for found in error.errors(include_url=False)]
             continue
         if scene.name in scenes:
             problems.append(f"{where}: the name {scene.name!r} is taken by {scenes[scene.name].where}")
@@ -92,7 +92,7 @@ def _scene(folder: Path, where: str, row: SheetRow) -> SceneJob:
     return SceneJob(row.name, folder / row.input, recipe, overrides, where)
 
 
-def _said(found: Any) -> str:
+def _problem(found: Any) -> str:
     """Return one complaint of pydantic in a line."""
     name = ".".join(map(str, found["loc"]))
     match found["type"]:

@@ -226,10 +226,10 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
     up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
-    return Similarity(_upright(up), origin, scale)
+    return Similarity(_up_rotation(up), origin, scale)
 
 
-def _upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The smallest rotation that takes ``up`` to -y; from nearly +y, the smallest after half a turn about x
     (there the smallest rotation's axis hangs on rounding errors)."""
     length = float(np.linalg.norm(up))

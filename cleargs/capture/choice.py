@@ -28,7 +28,7 @@ CHOICE = "chosen.json"
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
-def sharpest(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
+def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
     """``capture`` with each frame of a video exchanged for the sharpest of those that are nearer to its time
     than to the time of another chosen frame; ties go to the earlier one.
 

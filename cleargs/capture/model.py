@@ -118,7 +118,7 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
     write_bytes(folder / "points3D.bin", b"".join(points))
 
 
-def moved(
+def transform_model(
     model: SparseModel,
     *,
     scale: float,

@@ -65,11 +65,11 @@ def reconstruct(
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity, outcome)
+        return Reconstruction(_transformed(model, similarity), similarity, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
     poses = [frame.source.pose for frame in posed if frame.source.pose is not None]
     similarity = normalise(poses)
-    adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
+    adopted = None if given is None else _within_reach(_transformed(_adopted(given, posed), similarity))
     if adopted is not None and adopted.dropped:
         reporter.warn(
             f"{adopted.dropped} points of the input's sparse model are not finite or out of reach: left out"
@@ -196,7 +196,7 @@ def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, st
     return {frame.image: "no pose in the input" if frame.source.pose is None else found for frame in frames}
 
 
-def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
+def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
     images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
     return replace(model, images=images, xyz=similarity.points(model.xyz))
 

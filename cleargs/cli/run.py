@@ -31,7 +31,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
-from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, resolve_device
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device, resolve_run
 from cleargs.report.formatting import duration
 from cleargs.safe_io import printable
 
@@ -113,7 +113,7 @@ def run(
     """
     dag.until(until)
     reporter = make_reporter(quiet)
-    settings = asked_run(
+    settings = resolve_run(
         dag,
         source,
         folder,

@@ -62,7 +62,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                 continue
             files += len(manifest.files)
             place = folder.resolve()
-            lines = damages(place, manifest, manifest.files, opened.memo, afresh=True)
+            lines = damages(place, manifest, manifest.files, opened.memo, rehash=True)
             faults += [StoreFault("damaged", name, line) for line in lines]
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:
@@ -95,7 +95,7 @@ def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) ->
                 change = " is new"
             else:
                 try:
-                    if store.memo.digests_of(files[name], afresh=True)[""] != before[name]:
+                    if store.memo.digests_of(files[name], rehash=True)[""] != before[name]:
                         change = " has other content"
                 except InputError as error:
                     change = f": {error}"

@@ -66,7 +66,7 @@ def refine_pose(
         if normal is None or gradient is None:
             jacobian = np.stack(
                 [
-                    difference(moved(pose, axis)) - difference(moved(pose, -axis))
+                    difference(apply_twist(pose, axis)) - difference(apply_twist(pose, -axis))
                     for axis in np.diag(pixel * _DIFFERENCE)
                 ]
             ) / (2.0 * _DIFFERENCE)
@@ -74,7 +74,7 @@ def refine_pose(
             normal = np.einsum("im,jm->ij", jacobian, jacobian)
             gradient = np.einsum("im,m->i", jacobian, residual)
         damped = normal + np.diag(damping * normal.diagonal() + 1e-12)
-        candidate = moved(pose, -np.linalg.solve(damped, gradient) * pixel)
+        candidate = apply_twist(pose, -np.linalg.solve(damped, gradient) * pixel)
         tried = difference(candidate)
         if loss(tried) < lowest:
             pose, residual, lowest = candidate, tried, loss(tried)
@@ -90,7 +90,7 @@ def refine_pose(
     )
 
 
-def moved(camera: Camera, twist: Floats) -> Camera:
+def apply_twist(camera: Camera, twist: Floats) -> Camera:
     """``camera`` turned (``twist[:3]``, rotation vector) and moved (``twist[3:]``) in its own axes."""
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
+from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
 from cleargs.formation.observed import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
@@ -127,7 +127,7 @@ class CaptureFormation:
         def explained() -> FrameFormation:
             """How the frame was taken, in the light of the scene as it is."""
             frame = self._frames[frame_id]
-            return explain(
+            return fit_motion(
                 frame,
                 self._config,
                 camera,
@@ -159,11 +159,11 @@ class CaptureFormation:
             weight = self.weight(frame_id)
             if frame.model != "none":
                 motion = frame
-        doubt = None
+        robust_mask = None
         if begun and self._config.unexplained > 0.0:
             tolerance = self._config.unexplained
-            doubt = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
-        if motion is None and affine is None and doubt is None:
+            robust_mask = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
+        if motion is None and affine is None and robust_mask is None:
             return None
         return FormedView(
             camera,
@@ -173,7 +173,7 @@ class CaptureFormation:
             affines=affines,
             formation=motion,
             factor=factor,
-            doubt=doubt,
+            robust_mask=robust_mask,
         )
 
     def digest(self) -> str:

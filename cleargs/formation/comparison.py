@@ -39,12 +39,12 @@ OUTLIER, LIMIT = 0.03, 0.1
 MIN_MISFIT = 5e-4
 """Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
 
-JUDGE_BLOCK, JUDGE_EVERY = 16, 4
+HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 """Side in pixels of the blocks of which every fourth judges."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FramePair:
     """A raw frame and the render that should explain it.
 
     ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
@@ -61,7 +61,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class MotionFit:
     """A model of a frame, and how well it explains it."""
 
     model: Model
@@ -90,9 +90,9 @@ def luminance(image: Floats) -> Floats:
     return np.asarray(np.einsum("hwc,c->hw", linear_from_srgb(image), weights))
 
 
-def scales(sight: Sight) -> list[float]:
+def scales(pair: FramePair) -> list[float]:
     """The sizes at which a frame is compared, as shares of its own, the coarsest first."""
-    longest = max(sight.observed.shape)
+    longest = max(pair.observed.shape)
     sizes = [size for size, _ in LEVELS if size < longest] or [longest]
     if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
         sizes[-1] = longest
@@ -136,10 +136,10 @@ class SearchKernels(Protocol):
 class Level:
     """The problem at one size."""
 
-    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels = cpu) -> None:
+    def __init__(self, pair: FramePair, scale: float, kernels: SearchKernels = cpu) -> None:
         self._kernels = kernels
-        margin = sight.margin
-        height, width = sight.luminance.shape
+        margin = pair.margin
+        height, width = pair.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
 
         def reduced(image: Floats) -> Floats:
@@ -147,26 +147,26 @@ class Level:
 
         inner = np.s_[margin : height - margin, margin : width - margin]
         # Beyond the frame's border the render stands in, so that both are high-passed alike there.
-        observed, weight = sight.luminance.copy(), np.zeros_like(sight.luminance)
-        observed[inner], weight[inner] = sight.observed, sight.weight
-        self._image, self._observed = _high_passed(reduced(sight.luminance)), _high_passed(reduced(observed))
+        observed, weight = pair.luminance.copy(), np.zeros_like(pair.luminance)
+        observed[inner], weight[inner] = pair.observed, pair.weight
+        self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
         counted = (reduced(weight) > 0.99).astype(np.float32)
-        judging = _judging(counted.shape)
+        judging = _holdout_mask(counted.shape)
         self._fitting, self._judging = counted * ~judging, counted * judging
         if not self._judging.any():  # an image of a few blocks
             self._judging = self._fitting = counted
         self._total = float(self._judging.sum(dtype=np.float64))
-        depth, alpha = reduced(sight.depth), reduced(sight.alpha)
-        self.median = _median_depth(sight)
+        depth, alpha = reduced(pair.depth), reduced(pair.alpha)
+        self.median = _median_depth(pair)
         self.nearness = _nearness(depth, alpha, self.median)
-        self._basis = flow_basis(widened(sight.camera, margin), self.nearness)
+        self._basis = flow_basis(widened(pair.camera, margin), self.nearness)
         self.scale = size[0] / width
         rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
-        self._down = (rows / sight.camera.height - 0.5).astype(np.float32)
+        self._down = (rows / pair.camera.height - 0.5).astype(np.float32)
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
         self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
 
-    def judged(self, model: Model, motion: FrameMotion) -> Explanation:
+    def judged(self, model: Model, motion: FrameMotion) -> MotionFit:
         """How well a motion explains the pixels that judge."""
         total = max(self._total, 1.0)
         still = self._misfit(FrameMotion(), FINE, self._judging) / total
@@ -174,7 +174,7 @@ class Level:
         if model != "none":
             times = DISC if model == "defocus" else FINE
             misfit = self._misfit(motion, times, self._judging) / total
-        return Explanation(model, motion, misfit, still)
+        return MotionFit(model, motion, misfit, still)
 
     def cost(self, motion: FrameMotion, times: Floats = FINE) -> float:
         """What is left on the pixels that fit."""
@@ -214,14 +214,14 @@ class Level:
         )
 
 
-def _judging(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _holdout_mask(shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """True in every fourth block, no two of which share a side: bool [H, W]."""
-    row, column = (np.arange(side) // JUDGE_BLOCK for side in shape)
-    return np.asarray((column[None] + 2 * row[:, None]) % JUDGE_EVERY == 0)
+    row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
+    return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
 
 
-def _median_depth(sight: Sight) -> float:
-    depth, alpha = sight.depth[::4, ::4], sight.alpha[::4, ::4]
+def _median_depth(pair: FramePair) -> float:
+    depth, alpha = pair.depth[::4, ::4], pair.alpha[::4, ::4]
     seen = (alpha > MIN_COVERED) & (depth > 0.0)
     return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
 

@@ -26,7 +26,7 @@ MIN_LINEAR = 0.002
 """Linear light below which sRGB counts as steep as here."""
 
 
-def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats:
+def deblur(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats:
     """The image that looks like ``observed`` under the frame's formation B, and like ``render`` where that
     leaves it open.
 

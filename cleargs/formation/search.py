@@ -16,10 +16,10 @@ from cleargs.formation.comparison import (
     COARSE,
     DISC,
     LEVELS,
-    Explanation,
+    FramePair,
     Level,
+    MotionFit,
     SearchKernels,
-    Sight,
     scales,
 )
 from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
@@ -55,15 +55,15 @@ _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus
 
 
 def search(
-    sight: Sight, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
-) -> list[Explanation]:
+    pair: FramePair, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
+) -> list[MotionFit]:
     """Every model at its best, from scratch. The first is ``none``.
 
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
     kernels: the back end that computes misfits and normal equations.
     """
-    levels = [Level(sight, scale, kernels) for scale in scales(sight)]
+    levels = [Level(pair, scale, kernels) for scale in scales(pair)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -82,15 +82,15 @@ def search(
 
 
 def refine(
-    sight: Sight,
+    pair: FramePair,
     model: Model,
     motion: FrameMotion,
     *,
     pose: bool = False,
     kernels: SearchKernels = cpu,
-) -> list[Explanation]:
+) -> list[MotionFit]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = Level(sight, scales(sight)[-1], kernels)
+    level = Level(pair, scales(pair)[-1], kernels)
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
@@ -100,7 +100,7 @@ def refine(
     return [level.judged("none", still), level.judged(model, motion)]
 
 
-def preferred(found: list[Explanation]) -> Explanation:
+def preferred(found: list[MotionFit]) -> MotionFit:
     """The model with the least misfit on the pixels that judge, simpler ones at a discount."""
     return min(found, key=lambda e: e.misfit * (1.0 + PRICE * _PARTS[e.model]))
 

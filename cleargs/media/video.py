@@ -94,7 +94,7 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
         missing.discard(number)
         wide = max(1, round(aspect * frame.width))
         _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
-        yield number, _upright(frame, wide)
+        yield number, _oriented(frame, wide)
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
@@ -127,7 +127,7 @@ def _require_few(subject: str, width: int, height: int, what: str = "pixels") ->
         raise InputError(f"{subject} {width}x{height} {what}; at most {MAX_PIXELS} are read", hint=_HINT)
 
 
-def _upright(frame: VideoFrame, width: int) -> NDArray[np.uint8]:  # [H, W, 3]
+def _oriented(frame: VideoFrame, width: int) -> NDArray[np.uint8]:  # [H, W, 3]
     """A decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
     if width != frame.width:

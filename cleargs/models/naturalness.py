@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.base_model import Record
+from cleargs.base_model import FrozenModel
 from cleargs.models.tiling import Image, mean_over_tiles
 
 COEFFICIENTS = "naturalness.toml"
@@ -33,7 +33,7 @@ _ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
-class Quadratic(Record):
+class Quadratic(FrozenModel):
     """``weights . [1, z, z_i z_j (i <= j)]`` of the standardised features z."""
 
     mean: tuple[float, ...] = Field(description="Mean of each feature over the training patches.")

@@ -13,7 +13,7 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
-from cleargs.base_model import Record
+from cleargs.base_model import FrozenModel
 from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
 from cleargs.plugins import load_part, plugins
@@ -28,7 +28,7 @@ Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 _SHA256 = r"^[0-9a-f]{64}$"
 
 
-class Source(Record):
+class Source(FrozenModel):
     """The published file that carries the weights."""
 
     spec: str = Field(
@@ -57,7 +57,7 @@ class Source(Record):
         return f"{self.file} of {self.origin}" if self.origin else self.spec
 
 
-class InstalledFile(Record):
+class InstalledFile(FrozenModel):
     """A file that the installation writes into the model folder."""
 
     name: str = Field(description="File name in the model folder.")
@@ -69,7 +69,7 @@ class InstalledFile(Record):
     )
 
 
-class RegistryEntry(Record):
+class RegistryEntry(FrozenModel):
     """One entry of ``registry.toml``."""
 
     name: str = Field(description="What commands and settings call it.")

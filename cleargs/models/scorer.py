@@ -76,13 +76,13 @@ class InformedScorer:
 
     def score(self, image: Image, *, threads: int = 1) -> float:
         """See Scorer. Raises InputError, too, when the other scorer gives no number."""
-        said = self._scorer.score(image, threads=threads)
-        if not math.isfinite(said):
+        value = self._scorer.score(image, threads=threads)
+        if not math.isfinite(value):
             raise InputError(
-                f"the scorer {self.name} gave {said} instead of a score",
+                f"the scorer {self.name} gave {value} instead of a score",
                 hint="use another scorer, or export its model again",
             )
-        return min(max(said, 0.0), 100.0) * information(image)
+        return min(max(value, 0.0), 100.0) * information(image)
 
 
 def information(image: Image) -> float:

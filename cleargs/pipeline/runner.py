@@ -23,7 +23,7 @@ from cleargs.manifest import (
     write_manifest,
 )
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.live import noted
+from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import only_one
 from cleargs.pipeline.plan import (
     Planner,
@@ -34,7 +34,7 @@ from cleargs.pipeline.plan import (
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, noted_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
@@ -137,7 +137,7 @@ class Runner:
     def _finished(
         self, upstream: str, done: Mapping[str, Manifest], name: str, *, allow_partial: bool
     ) -> Manifest:
-        entry = self._find(upstream, self.planner.recipe(upstream, done))
+        entry = self._find(upstream, self.planner.stage_key(upstream, done))
         if entry is None or entry.manifest is None:
             raise StageError(
                 f"{name} needs {upstream}, which is not done",
@@ -150,9 +150,9 @@ class Runner:
             )
         return entry.manifest
 
-    def _find(self, name: str, recipe: StageKey) -> Entry | None:
-        """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
-        entry = self.store.find(name, recipe.key)
+    def _find(self, name: str, stage_key: StageKey) -> Entry | None:
+        """What the store holds for ``stage_key``; something damaged counts as nothing, with a warning."""
+        entry = self.store.find(name, stage_key.key)
         if entry is not None and entry.damage is not None:
             self.reporter.warn(
                 f"{name}: the stored results are damaged ({entry.damage}); they are made again"
@@ -162,23 +162,23 @@ class Runner:
 
     def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and let the run folder show them."""
-        recipe = self.planner.recipe(name, done)
-        entry = self.store.find(name, recipe.key)
+        stage_key = self.planner.stage_key(name, done)
+        entry = self.store.find(name, stage_key.key)
         manifest = entry.whole if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
-            recipe = self._read_again(name, done)
-            entry = self.store.find(name, recipe.key)
-            reasons = ("forced",) if forced else self.planner.reasons(recipe, entry)
-            with self.store.lock(recipe.key, self.reporter, name) as alone:
-                entry = self._find(name, recipe)
+            stage_key = self._read_again(name, done)
+            entry = self.store.find(name, stage_key.key)
+            reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
+            with self.store.lock(stage_key.key, self.reporter, name) as alone:
+                entry = self._find(name, stage_key)
                 manifest = entry.whole if entry is not None and not forced else None
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
-                    manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
-        manifest = self._with_inherited(manifest, recipe.inherited)
-        self.store.link(self.run.folder, name, recipe.key)
-        return StageOutcome(name, how, manifest, self.store.folder(name, recipe.key))
+                    manifest, how = self._make(stage_key, entry, forced=forced, alone=alone), "made"
+        manifest = self._with_inherited(manifest, stage_key.inherited)
+        self.store.link(self.run.folder, name, stage_key.key)
+        return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
 
     def _read_again(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
@@ -189,26 +189,26 @@ class Runner:
             manifest = done[upstream]
             folder = self.store.folder(upstream, manifest.key)
             names = [str(PurePosixPath(path, file)) for path in paths for file in manifest.under(path)]
-            damaged = next(damages(folder, manifest, names, self.store.memo, afresh=True), None)
+            damaged = next(damages(folder, manifest, names, self.store.memo, rehash=True), None)
             if damaged is not None:
                 raise StoreError(
                     f"{upstream}: the stored results are damaged ({damaged})",
                     hint="the same command makes them again",
                 )
-        return self.planner.recipe(name, done, afresh=True)
+        return self.planner.stage_key(name, done, rehash=True)
 
-    def _make(self, recipe: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
+    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""
-        name = recipe.parts.stage
+        name = stage_key.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(
-            recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
+            stage_key.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
         )
-        context = self.planner.context(name, recipe.inputs, work)
+        context = self.planner.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:
-            with noted(self.reporter, self.run.folder, name, work.folder) as reporter:
+            with recorded_progress(self.reporter, self.run.folder, name, work.folder) as reporter:
                 result = stage.run(replace(context, reporter=reporter))
         except BaseException:  # an interruption too: what it had done counts when it resumes
             work.note_seconds(earlier + time.monotonic() - clock)
@@ -220,7 +220,7 @@ class Runner:
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
         }
         now = self.planner.external_digests(name)
-        if now != {role: recipe.origins[role] for role in now}:
+        if now != {role: stage_key.origins[role] for role in now}:
             self.store.discard(work.folder)
             raise StageError(
                 f"the input changed while {name} was reading it", hint="the same command starts it again"
@@ -238,12 +238,12 @@ class Runner:
         }
         manifest = Manifest(
             stage=name,
-            key=recipe.key,
-            status="partial" if result.missing or recipe.inherited else "complete",
+            key=stage_key.key,
+            status="partial" if result.missing or stage_key.inherited else "complete",
             missing=result.missing,
-            inherited=recipe.inherited,
-            parts=recipe.parts,
-            origins=recipe.origins,
+            inherited=stage_key.inherited,
+            parts=stage_key.parts,
+            origins=stage_key.origins,
             files=files,
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
@@ -280,7 +280,7 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
 
     A capture that moved is the same when its content is.
     """
-    before = noted_source(run.folder)
+    before = read_source(run.folder)
     if before is None or before == run.source:
         return
     first = dag.names[0]

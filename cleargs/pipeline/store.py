@@ -248,7 +248,7 @@ class Store:
             folder.rename(rubbish)
         shutil.rmtree(rubbish, ignore_errors=True)
 
-    def kept(self, stage: str) -> Path:
+    def cache_folder(self, stage: str) -> Path:
         """Where ``stage`` keeps what it found out about single items."""
         return self.root / "kept" / stage
 
@@ -347,7 +347,7 @@ class Garbage:
     bytes: int
 
 
-def writer_lives(work: Path) -> bool:
+def writer_is_alive(work: Path) -> bool:
     """Return True if a process works in the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
     return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")

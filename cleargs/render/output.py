@@ -39,7 +39,7 @@ class Shot:
     """The frame of the capture to lay on its left."""
 
 
-class Photographer(Viewer):
+class ShotRenderer(Viewer):
     """Renders shots of one scene."""
 
     def picture(self, shot: Shot) -> Picture:
@@ -108,26 +108,26 @@ def write_shots(
         )
     if kind == "film":
         require_even(camera.width, camera.height)
-    photographer = Photographer(scene, device)
+    renderer = ShotRenderer(scene, device)
     with disk_errors(output):
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
 
     def pictures() -> Iterator[Picture]:
         for shot in shots:
-            yield photographer.picture(shot)
+            yield renderer.picture(shot)
             task.advance()
 
     if kind == "film":
         write_video(output, pictures(), fps, codec=codec)
     elif kind == "still":
-        photographer.write(output, shots[0])
+        renderer.write(output, shots[0])
         task.advance()
     else:
         (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
         names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
         with whole_folder(output.parent) as folder:
             for name, shot in zip(names, shots, strict=True):
-                photographer.write(folder / name, shot)
+                renderer.write(folder / name, shot)
                 task.advance()
             cameras = cameras_json(list(zip(names, (shot.camera for shot in shots), strict=True)))
             write_json(folder / "cameras.json", cameras)

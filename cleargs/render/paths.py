@@ -82,7 +82,7 @@ def smooth_path(
 def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
     """A turn in ``count`` steps around the point that ``cameras`` look at, from the first one's side.
 
-    At their median distance from the axis and median height; the axis is that of `upright`.
+    At their median distance from the axis and median height; the axis is that of `up_axis`.
 
     It is a full one in equal steps; where the cameras leave more than `WIDEST_GAP` of it out, it goes to and
     fro along what they saw, since beyond it the scene has nothing to show.
@@ -90,7 +90,7 @@ def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] 
     Raises InputError when they all look the same way.
     """
     centre = seen_point(cameras)
-    up = upright(cameras)
+    up = up_axis(cameras)
     offsets = np.stack([camera.centre for camera in cameras]) - centre
     heights = offsets @ up
     away = offsets - heights[:, None] * up
@@ -130,7 +130,7 @@ def seen_point(cameras: Sequence[Camera]) -> Array:  # [3]
     return point
 
 
-def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
+def up_axis(cameras: Sequence[Camera]) -> Array:  # [3] unit
     """Up: what the horizontal axes of ``cameras`` are perpendicular to, as nerfstudio finds it.
 
     The mean of their own ups would lean over, where they look down and stand on one side. Cameras whose

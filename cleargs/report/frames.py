@@ -168,7 +168,7 @@ FOLDER = "frames"
 BYTES = 8_500_000
 """About how much all layers together may take."""
 
-_BYTES_A_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
+_BYTES_PER_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
 _THUMBNAIL, _QUALITY = 240, 84
 
 RENDERED = 40
@@ -217,7 +217,7 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
 
     It is ``least`` where that would be too small to see anything.
     """
-    pixels = budget / (_BYTES_A_PIXEL * max(pictures, 1))
+    pixels = budget / (_BYTES_PER_PIXEL * max(pictures, 1))
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
 
 

@@ -40,7 +40,7 @@ from cleargs.report.frames import (
     write_jpeg,
     write_pictures,
 )
-from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
+from cleargs.report.report_json import PAGE, LastRun, last_run, linked_manifests, page_of, write_report_json
 from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
 from cleargs.rva.tables import B_CUES, R_CUES
@@ -94,7 +94,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
-    last = last or noted(run)
+    last = last or last_run(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
@@ -133,7 +133,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "viewer": viewer,
             },
         )
-        write_record(folder, manifests, last)
+        write_report_json(folder, manifests, last)
     return page_of(run)
 
 

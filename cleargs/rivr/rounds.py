@@ -33,7 +33,7 @@ from cleargs.rivr.candidates import (
     hide_masked,
     unbeaten,
 )
-from cleargs.rivr.distillation import Deblurred, Snapshot, observation
+from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
 from cleargs.splat.views import Mask, TrainingView
@@ -71,7 +71,7 @@ class Rules:
     gate: GateConfig
 
     def restored(
-        self, view: TrainingView, render: Image, scene: Snapshot
+        self, view: TrainingView, render: Image, scene: TrainedScene
     ) -> tuple[Image, Source, Deblurred | None]:
         """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
 
@@ -102,7 +102,7 @@ class Rules:
 def run_round(
     number: int,
     targets: Sequence[TrainingView],
-    scene: Snapshot,
+    scene: TrainedScene,
     rules: Rules,
     out: Path,
     reporter: Reporter,
@@ -132,7 +132,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: TrainingView, exr: str, scene: Snapshot, rules: Rules
+    number: int, view: TrainingView, exr: str, scene: TrainedScene, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 

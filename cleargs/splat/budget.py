@@ -62,7 +62,7 @@ def training_cost(
     return float(seconds.sum()), 1.5e-6 * budget
 
 
-def decided(config: Settings, views: Sequence[TrainingView]) -> Settings:
+def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
     """``config`` with the steps and the budget that it leaves open, for these views."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}

@@ -32,7 +32,7 @@ ROUNDS = 4
 """Rounds of a refinement, each with its share of the growth: a Gaussian with much of the error, such as a
 smear over half of a frame, is cut into up to sixteen."""
 
-PART = 0.7
+SPLIT_FRACTION = 0.7
 """How far the halves of a Gaussian lie from its middle, and their scale, as shares of its scale along its
 longest axis: together they spread about as far (0.7² + 0.7² = 0.98)."""
 
@@ -105,9 +105,9 @@ def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: F64, min_opacity: f
     """
     longest = arrays["log_scales"][cut].argmax(axis=1)
     axes = rotation_matrices(arrays["rotations"][cut])[np.arange(len(cut)), :, longest]
-    away = axes * (PART * np.exp(arrays["log_scales"][cut, longest]))[:, None]
-    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / PART), min_opacity, 1.0 - 1e-6)
-    arrays["log_scales"][cut, longest] += np.float32(math.log(PART))
+    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][cut, longest]))[:, None]
+    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
+    arrays["log_scales"][cut, longest] += np.float32(math.log(SPLIT_FRACTION))
     arrays["logit_opacities"][cut] = np.log(faint) - np.log1p(-faint)
     others = {name: array[cut] for name, array in arrays.items()}
     arrays["means"][cut] -= away

@@ -18,7 +18,7 @@ from cleargs.random_streams import Stream
 from cleargs.synth.optics import Aperture, Array, Lens, Shutter, World
 
 UP = np.array([0.0, 1.0, 0.0])
-DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
+DEGREES_PER_FRAME, MAX_DEGREES = 4.0, 150.0
 
 
 class Course(Protocol):
@@ -63,7 +63,7 @@ class Orbit:
 
     def __init__(self, focus: Array, frames: int, seed: int) -> None:
         self._focus = focus
-        self._arc = float(np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES)))
+        self._arc = float(np.radians(min(DEGREES_PER_FRAME * frames, MAX_DEGREES)))
         rng = np.random.default_rng([seed, Stream.ORBIT])
         self._phases = rng.uniform(0, 2 * np.pi, 2)  # of distance and height
 
@@ -85,18 +85,18 @@ class Orbit:
 
 FPS = 6.0
 """Frames a second: what a walk of a few degrees a frame needs."""
-FRAMES_A_PAUSE = 6.0
+FRAMES_PER_PAUSE = 6.0
 PAUSE = 0.8
 """The pace lies between 1 - PAUSE and 1 + PAUSE of its mean."""
 TREMOR_HZ = (1.0, 12.0)
 TREMOR_RADIANS = 0.005
 """Deviation of the aim, about a third of a degree, as of a hand that walks and tries to hold still."""
-FRAMES_A_SWING = 4.0
+FRAMES_PER_SWING = 4.0
 SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
-FRAMES_A_STRETCH = 32
+FRAMES_PER_STRETCH = 32
 STRETCH_SHARE = 0.375
-"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
+"""Of every `FRAMES_PER_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
 SHAKING = 12.0
 """How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
 STRETCH_EDGE = 1 / FPS
@@ -108,7 +108,7 @@ class Hand:
     distance the turn moves the image far more.
 
     The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames.
-    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
+    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_PER_STRETCH` frames.
     """
 
     def __init__(self, duration: float, seed: int, *, stretched: bool = False) -> None:
@@ -117,7 +117,7 @@ class Hand:
         amplitudes = 1 / self._frequencies
         amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
         self._amplitudes = amplitudes  # [harmonics, 3] radians
-        count = max(1, round(duration * FPS / FRAMES_A_SWING))
+        count = max(1, round(duration * FPS / FRAMES_PER_SWING))
         self._swing_times = (np.arange(count) + rng.uniform(0, 1, count)) / count * duration  # seconds
         direction = rng.uniform(0, 2 * np.pi, count)
         axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
@@ -147,7 +147,7 @@ class Hand:
 
 
 def _stretches(duration: float, seed: int) -> Array:
-    count = max(1, round(duration * FPS / FRAMES_A_STRETCH))
+    count = max(1, round(duration * FPS / FRAMES_PER_STRETCH))
     free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
     starts = np.arange(count) + free
     return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
@@ -162,7 +162,7 @@ class HandheldPath:
         """Seconds."""
         self.hand = Hand(self.duration, seed, stretched=stretched)
         self._course = course
-        self._pauses = max(1, round(frames / FRAMES_A_PAUSE))
+        self._pauses = max(1, round(frames / FRAMES_PER_PAUSE))
         rng = np.random.default_rng([seed, Stream.WALK])
         self._phase = rng.uniform(0, 2 * np.pi)  # of the pace, radians
 

@@ -85,10 +85,10 @@ def metered(light: Array) -> float:  # [H, W, 3] linear
 
 def auto_exposure(luminances: Array, step: float) -> Array:  # [F] of `metered`, seconds from frame to frame
     """The gain of each frame in stops [F], of mean 0: it goes towards what the frame asks for, with `LAG`."""
-    asked = -METERED * np.log2(luminances)
-    gains = asked.copy()
-    for number in range(1, len(asked)):
-        gains[number] = asked[number] + (gains[number - 1] - asked[number]) * math.exp(-step / LAG)
+    wanted = -METERED * np.log2(luminances)
+    gains = wanted.copy()
+    for number in range(1, len(wanted)):
+        gains[number] = wanted[number] + (gains[number - 1] - wanted[number]) * math.exp(-step / LAG)
     return np.asarray(gains - gains.mean(), np.float64)
 
 

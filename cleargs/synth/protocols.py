@@ -119,8 +119,8 @@ def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Gene
     """
     count = len(motions)
     pairs = np.arange(0, count - 1, 2)
-    spoilt = [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
-    by_speed = sorted(spoilt, key=lambda number: -motions[number].blur(0.02))
+    degraded = [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
+    by_speed = sorted(degraded, key=lambda number: -motions[number].blur(0.02))
     blurred = by_speed[: round(0.6 * len(by_speed))]
     defocused = sorted(by_speed[len(blurred) :])[::2]
     drift = 0.1 * np.sin(2 * np.pi * (np.arange(count) / 24 + rng.uniform()))
@@ -132,7 +132,7 @@ def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Gene
             blur, noise = rng.uniform(7, 22), 2 * NOISE
         elif number in defocused:
             radius = rng.uniform(3, 6)
-        elif number in spoilt:
+        elif number in degraded:
             stops += float(rng.choice([-1, 1]) * rng.uniform(1.3, 2.2))
             noise = 3 * NOISE
         exposure = duration_for(blur * scale, motion.blur)

@@ -59,7 +59,7 @@ def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]
             externals={},
             out=folders["g0"],
             checkpoints=folders["checkpoints"],
-            kept=folders["kept"],
+            cache=folders["kept"],
             seed=0,
             device=device,
             threads=torch.get_num_threads(),

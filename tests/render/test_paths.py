@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
-from cleargs.render.paths import Array, framed, seen_point, smooth_path, turntable, upright
+from cleargs.render.paths import Array, framed, seen_point, smooth_path, turntable, up_axis
 from cleargs.splat.camera import Camera, look_at
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -172,10 +172,10 @@ def test_cameras_on_one_side_that_look_down_do_not_tilt_the_table() -> None:
     cameras = around(np.zeros(3), np.linspace(0, np.pi, 12))
     own = -np.mean([each.world_to_camera[1, :3] for each in cameras], axis=0)
     assert np.degrees(np.arccos(own @ UP / np.linalg.norm(own))) > 8
-    assert np.degrees(np.arccos(upright(cameras) @ UP)) < 0.2
+    assert np.degrees(np.arccos(up_axis(cameras) @ UP)) < 0.2
     # The same axis for all: nothing but their own ups to go by.
     same = [look_at(np.array([x, 0.0, 0]), np.array([x, 0.0, 1]), UP) for x in range(4)]
-    np.testing.assert_allclose(upright([camera(pose) for pose in same]), UP, atol=1e-9)
+    np.testing.assert_allclose(up_axis([camera(pose) for pose in same]), UP, atol=1e-9)
 
 
 @pytest.mark.parametrize("first", [0, 5, 11])

@@ -49,13 +49,13 @@ class QwenFolder(QwenEvaluator):
             raise InputError(
                 f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
             ) from error
-        with self._fault_told():
+        with self._load_errors():
             kind = AutoConfig.from_pretrained(self._folder, local_files_only=True).model_type
             if kind not in _ARCHITECTURES:
                 raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
 
     @contextmanager
-    def _fault_told(self) -> Iterator[None]:
+    def _load_errors(self) -> Iterator[None]:
         try:
             yield
         except (OSError, ValueError, KeyError) as error:
@@ -78,7 +78,7 @@ class QwenFolder(QwenEvaluator):
         from transformers.utils.logging import disable_progress_bar
 
         disable_progress_bar()
-        with self._fault_told():
+        with self._load_errors():
             tokenizer = AutoTokenizer.from_pretrained(self._folder, local_files_only=True)
             images = Qwen2VLImageProcessorPil.from_pretrained(self._folder, local_files_only=True)
             model = AutoModelForImageTextToText.from_pretrained(

@@ -213,7 +213,7 @@ class QwenServer(QwenEvaluator):
     def _refusal(self, answer: httpx2.Response, raw: bytes) -> Exception:
         """What an HTTP status other than 2xx means for us."""
         code = answer.status_code
-        reason = f"the server answered {code}{self._words(raw)}"
+        reason = f"the server answered {code}{self._message_of(raw)}"
         if code in _BUSY:
             return PassingError(reason, after=_retry_after(answer.headers.get("Retry-After", "")))
         where = f"{reason} at {self._url}"
@@ -225,7 +225,7 @@ class QwenServer(QwenEvaluator):
             return StageError(f"{where}: it has moved", hint="set rva.qwen.base_url to its new address")
         return RefusedError(reason)
 
-    def _words(self, raw: bytes) -> str:
+    def _message_of(self, raw: bytes) -> str:
         """The server's explanation in one short line, without the key."""
         text = raw.decode("utf-8", "replace")
         with suppress(ValueError, RecursionError):

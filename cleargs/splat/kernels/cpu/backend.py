@@ -313,10 +313,10 @@ def warm_up() -> None:
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)
     affine_backward(image, affine, image)
-    _photograph()
+    _warm_up_formation()
 
 
-def _photograph() -> None:
+def _warm_up_formation() -> None:
     """What a moving camera makes of an image, and the search for its motion."""
     plane, colours = torch.ones(SIZE, SIZE), torch.zeros(SIZE, SIZE, CHANNELS)
     curve, still = torch.zeros(CURVE_STEPS + 1), torch.ones(MOTION_COLUMNS)

@@ -64,9 +64,9 @@ class CpuRasteriser(rasteriser.Rasteriser):
         return self._buffers.take(name, *shape, dtype=torch.int32).numpy().view(np.uint32)
 
     def _bin(
-        self, asked: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
+        self, inputs: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
     ) -> CpuForwardPass:
-        gaussians, camera = asked.gaussians, asked.camera
+        gaussians, camera = inputs.gaussians, inputs.camera
         n, width, height = gaussians.num, camera.width, camera.height
         view = projection.ProjectionView(*rasteriser.view_numbers(camera))
         splats = self._floats("splats", n, SPLAT_COLUMNS)
@@ -74,9 +74,9 @@ class CpuRasteriser(rasteriser.Rasteriser):
         radii = self._floats("radii", n)
         projection.project(
             read_parameters(gaussians),
-            asked.sh_count,
+            inputs.sh_count,
             view,
-            asked.antialias,
+            inputs.antialias,
             width,
             height,
             splats,
@@ -101,7 +101,7 @@ class CpuRasteriser(rasteriser.Rasteriser):
             order, pair_offsets, pair_tiles, counts, tile_offsets, pair_ids, pair_slots
         )
         return CpuForwardPass(
-            **vars(asked),
+            **vars(inputs),
             view=view,
             background=np.asarray(background, np.float32),
             splats=splats,
@@ -113,24 +113,24 @@ class CpuRasteriser(rasteriser.Rasteriser):
             last=self._floats("last", height, width),
         )
 
-    def _blend(self, frame: CpuForwardPass, depth: bool) -> Render:
-        width, height = frame.camera.width, frame.camera.height
+    def _blend(self, state: CpuForwardPass, depth: bool) -> Render:
+        width, height = state.camera.width, state.camera.height
         image = self._floats("image", height, width, 3)
         depths = self._floats("depth", height, width) if depth else None
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.forward(
                 width,
                 height,
-                frame.tile_offsets,
-                frame.pair_ids,
-                frame.splats,
-                frame.background,
+                state.tile_offsets,
+                state.pair_ids,
+                state.splats,
+                state.background,
                 image,
-                frame.transmittance,
-                frame.last,
+                state.transmittance,
+                state.last,
                 depths,
             )
-        alpha = np.subtract(np.float32(1), frame.transmittance, out=self._floats("alpha", height, width))
+        alpha = np.subtract(np.float32(1), state.transmittance, out=self._floats("alpha", height, width))
         return Render(
             torch.from_numpy(image),
             torch.from_numpy(alpha),
@@ -138,35 +138,35 @@ class CpuRasteriser(rasteriser.Rasteriser):
         )
 
     def _differentiate(
-        self, frame: CpuForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, state: CpuForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
         columns = SUM_DEPTH if grad_depth is None else PAIR_COLUMNS
-        pair_sums = self._floats("pair_sums", len(frame.pair_ids), columns)
+        pair_sums = self._floats("pair_sums", len(state.pair_ids), columns)
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.backward(
-                frame.camera.width,
-                frame.camera.height,
-                frame.tile_offsets,
-                frame.pair_ids,
-                frame.pair_slots,
-                frame.splats,
-                frame.background,
-                frame.transmittance,
-                frame.last,
+                state.camera.width,
+                state.camera.height,
+                state.tile_offsets,
+                state.pair_ids,
+                state.pair_slots,
+                state.splats,
+                state.background,
+                state.transmittance,
+                state.last,
                 grad_image.numpy(),
                 None if grad_alpha is None else grad_alpha.numpy(),
                 None if grad_depth is None else grad_depth.numpy(),
                 pair_sums,
             )
-        parameters = frame.gaussians.tensors()
+        parameters = state.gaussians.tensors()
         outputs = {name: self._floats(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         gradients.backpropagate(
-            read_parameters(frame.gaussians),
-            frame.sh_count,
-            frame.view,
-            frame.antialias,
-            frame.splats,
-            frame.pair_offsets,
+            read_parameters(state.gaussians),
+            state.sh_count,
+            state.view,
+            state.antialias,
+            state.splats,
+            state.pair_offsets,
             pair_sums,
             tuple(outputs.values()),
         )
