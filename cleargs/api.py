@@ -21,9 +21,7 @@ from cleargs.splat.budget import resolve_config
 from cleargs.splat.config import Quality
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
-    from numpy.typing import NDArray
 
     from cleargs import G0Config
     from cleargs.evaluate.config import EvalOptions
@@ -36,8 +34,7 @@ if TYPE_CHECKING:
     from cleargs.splat.trainer import Trained
     from cleargs.splat.types import Render
     from cleargs.splat.views import TrainingView
-
-    Image = NDArray[np.uint8] | NDArray[np.float32]
+    from cleargs.types import AnyImage, ImageF32
 
 Progress = Reporter | Say | None
 """Where progress and remarks go: to the logger ``cleargs`` (None), to a function that takes lines, or to a
@@ -210,7 +207,7 @@ def score_frames(
     return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})
 
 
-def score(image: Image, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
+def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
     """How good an image looks without a reference: 0 to 100, higher is better.
 
     ``scorer`` is clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX
@@ -221,7 +218,7 @@ def score(image: Image, *, scorer: str = "clarity-net", threads: int | None = No
     return load_scorer(scorer).score(_floats(image), threads=threads or usable_cores())
 
 
-def restore(image: Image, *, expert: str = "embedded", threads: int | None = None) -> NDArray[np.float32]:
+def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = None) -> ImageF32:
     """A sharper image of the same size [H, W, 3] by a restoration network, float32 in [0, 1].
 
     ``expert`` is embedded, an installed model or an ONNX file. Raises InputError for another name.
@@ -296,7 +293,7 @@ def _toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, default=str)
 
 
-def _floats(image: Image) -> NDArray[np.float32]:
+def _floats(image: AnyImage) -> ImageF32:
     import numpy as np
 
     floats = image.astype(np.float32)

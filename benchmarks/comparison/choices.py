@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.images import read_rgb_float
 from cleargs.base_model import FrozenModel
@@ -17,9 +16,9 @@ from cleargs.media.exr import from_layer, read_exr
 from cleargs.parquet import read_table
 from cleargs.rivr.tables import read_selection
 from cleargs.synth.synthetic_capture import FRAMES
+from cleargs.types import ImageF32
 
-Image = NDArray[np.float32]
-Distance = Callable[[Image, Image], float]
+Distance = Callable[[ImageF32, ImageF32], float]
 
 RAW = "observed"
 """The layer of the raw frame, which a method that keeps frames may choose too."""
@@ -132,19 +131,19 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     return found
 
 
-def exposed(image: Image, stops: float) -> Image:
+def exposed(image: ImageF32, stops: float) -> ImageF32:
     """An sRGB image as a camera would give it that is off by so many stops."""
     light = linear_from_srgb(image) * np.float32(2.0**stops)
     return np.asarray(srgb_from_linear(np.clip(light, 0.0, 1.0)), np.float32)
 
 
-def _psnr(image: Image, truth: Image) -> float:
+def _psnr(image: ImageF32, truth: ImageF32) -> float:
     """PSNR of unrounded images, dB: candidates that look equal in 8 bits still differ."""
     error = float(np.square(image - truth).mean(dtype=np.float64))
     return -10.0 * math.log10(max(error, _MIN_ERROR))
 
 
-def _candidates(exr: Path, chosen: str) -> Mapping[str, Image]:
+def _candidates(exr: Path, chosen: str) -> Mapping[str, ImageF32]:
     """What could have been chosen, and the raw frame."""
     layers = read_exr(exr).layers
     names = [name for name in ("render", "restored", "fused", RAW) if name in layers]

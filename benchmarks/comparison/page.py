@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader
-from numpy.typing import NDArray
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
 from benchmarks.comparison.findings import Compared
@@ -51,8 +49,6 @@ BYTES = 20_000_000
 REFERENCE, FILMED = "reference", "filmed"
 _FOLDER = "poses"
 _SHOWN_METRICS = ("psnr", "lpips_vgg", "lpips_alex")
-
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numba import prange
 
 from benchmarks.speed.probe import KERNELS
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import Array, Floats, kernel
+from cleargs.splat.kernels.cpu.jit import kernel
 from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass
 from cleargs.splat.kernels.cpu.rasterise import PIECES
 from cleargs.splat.kernels.cpu.simd import LANES
@@ -29,6 +29,7 @@ from cleargs.splat.kernels.splat_layout import (
     SKEW,
     TILE,
 )
+from cleargs.types import AnyArray, ArrayF32
 
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 PIXEL_CENTRE = np.float32(constants.PIXEL_CENTRE)
@@ -77,11 +78,11 @@ def size_of(frame: CpuForwardPass) -> Size:
 def count_contributions(
     width: int,
     height: int,
-    tile_offsets: Array,
-    pair_ids: Array,
-    splats: Floats,
-    last: Floats,
-    counts: Array,
+    tile_offsets: AnyArray,
+    pair_ids: AnyArray,
+    splats: ArrayF32,
+    last: ArrayF32,
+    counts: AnyArray,
 ) -> None:
     """Contributions and vectors of every tile, [T, 2]: those up to each pixel's last contributor."""
     tiles_x = (width + TILE - 1) // TILE

@@ -21,6 +21,7 @@ from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, read_json
+from cleargs.types import ImageU8
 
 CHOICE = "chosen.json"
 """In the folder of the working images: numbers of the frames that were chosen from the video."""
@@ -72,7 +73,7 @@ def _left_behind(file: Path, nearest: NDArray[np.intp], count: int) -> list[int]
         return None
 
 
-def sharpness(image: NDArray[np.uint8]) -> float:  # [H, W, 3] RGB, or [H, W] grey
+def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
     """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
 
     It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
@@ -88,7 +89,7 @@ def sharpness(image: NDArray[np.uint8]) -> float:  # [H, W, 3] RGB, or [H, W] gr
 
 
 def held_out(
-    rule: str, names: Sequence[str], read: Callable[[int], NDArray[np.uint8]], registered: Sequence[bool]
+    rule: str, names: Sequence[str], read: Callable[[int], ImageU8], registered: Sequence[bool]
 ) -> set[int]:
     """Indices of the test frames by ``ingest.holdout``; ``read`` gives frame i as RGB (for sharpest:N only).
 

@@ -21,6 +21,7 @@ from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
+from cleargs.types import ImageU8
 
 
 def publish(
@@ -113,7 +114,7 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics
 
 def _write_picture(
     frame: WorkFrame, undistortion: Undistorter, work: Path, out: Path, reporter: Reporter
-) -> NDArray[np.uint8]:
+) -> ImageU8:
     """Undistort image and mask of a frame (a killed run may have done so) and return the image."""
     target = out / "images" / frame.image
     if resumable(target, reporter):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cleargs.capture.cameras import Intrinsics, pinhole
 from cleargs.capture.prepare import reduced, reduced_size
 from cleargs.errors import InputError
+from cleargs.types import ImageU8, MaskU8, PlaneF32
 
 MAX_TANGENT = 1.75
 """A pinhole image reaches at most 60 degrees off its axis: fisheye images are cropped there."""
@@ -25,17 +26,17 @@ class Undistorter:
     pinhole: Intrinsics
     """Camera of the published image."""
     _lens: Intrinsics
-    _map: tuple[NDArray[np.float32], NDArray[np.float32]] | None
+    _map: tuple[PlaneF32, PlaneF32] | None
     """Where each pixel of the flat image, which is not reduced yet, lies in the lens's; None without
     distortion."""
 
-    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W, 3]
+    def image(self, rgb: ImageU8) -> ImageU8:  # [H, W, 3]
         """Bicubic into the flat image, then area averaging to the published size; sRGB throughout."""
         if self._map is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         return reduced(rgb, max(self.pinhole.width, self.pinhole.height))
 
-    def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W]
+    def mask(self, mask: MaskU8) -> MaskU8:  # [H, W]
         """The same way for a mask, nearest pixels throughout."""
         if self._map is not None:
             mask = np.asarray(cv2.remap(mask, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))

@@ -24,7 +24,6 @@ from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
-from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
@@ -33,6 +32,7 @@ from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
+from cleargs.types import ImageU8, MaskBool
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ class ReferenceView:
     """Stem of its file: what it is matched by."""
     camera: Camera
     """Pinhole of the image, in the scene's world."""
-    load: Callable[[], tuple[Pixels, Mask | None]]
+    load: Callable[[], tuple[ImageU8, MaskBool | None]]
     """Gives the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
 
     @property
@@ -330,7 +330,7 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
     return _by_stem(views)
 
 
-def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[Pixels, Mask | None]:
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
     """The pinhole image of a reference, and its mask."""
     image, stencil = read_image(frame), read_stencil(frame)
     if image.shape[1::-1] != (lens.width, lens.height):

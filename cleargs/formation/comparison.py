@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis, widened
+from cleargs.formation.motion import FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
+from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
@@ -51,11 +52,11 @@ class FramePair:
     every side; ``camera`` is the frame's.
     """
 
-    luminance: Floats  # [H + 2 margin, W + 2 margin] linear light
-    depth: Floats
-    alpha: Floats
-    observed: Floats  # [H, W] linear luminance
-    weight: Floats  # [H, W] 0 where a pixel does not count
+    luminance: ArrayF32  # [H + 2 margin, W + 2 margin] linear light
+    depth: ArrayF32
+    alpha: ArrayF32
+    observed: ArrayF32  # [H, W] linear luminance
+    weight: ArrayF32  # [H, W] 0 where a pixel does not count
     camera: Camera
     margin: int
 
@@ -82,7 +83,7 @@ def explained_share(misfit: float, misfit_still: float) -> float:
     return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
-def luminance(image: Floats) -> Floats:
+def luminance(image: ArrayF32) -> ArrayF32:
     """Linear luminance [H, W] of an sRGB image."""
     kr, kb = LUMA["bt709"]
     # einsum, not BLAS, whose order of summation may depend on its threads.
@@ -106,11 +107,11 @@ class SearchKernels(Protocol):
 
     def misfit(
         self,
-        image: Floats,
-        observed: Floats,
-        weight: Floats,
-        fields: tuple[Floats, Floats, Floats],
-        samples: Floats,
+        image: ArrayF32,
+        observed: ArrayF32,
+        weight: ArrayF32,
+        fields: tuple[ArrayF32, ArrayF32, ArrayF32],
+        samples: ArrayF32,
         limit: float,
     ) -> float:
         """Return the sum of weight * min(|observed - exposed image|, limit)."""
@@ -118,17 +119,17 @@ class SearchKernels(Protocol):
 
     def normal_equations(
         self,
-        stack: Floats,
-        observed: Floats,
-        weight: Floats,
-        basis: Floats,
-        down: Floats,
-        offset: Floats,
-        sweep: Floats,
-        times: Floats,
+        stack: ArrayF32,
+        observed: ArrayF32,
+        weight: ArrayF32,
+        basis: ArrayF32,
+        down: ArrayF32,
+        offset: ArrayF32,
+        sweep: ArrayF32,
+        times: ArrayF32,
         outlier: float,
         active: NDArray[np.int64],
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
         ...
 
@@ -142,7 +143,7 @@ class Level:
         height, width = pair.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
 
-        def reduced(image: Floats) -> Floats:
+        def reduced(image: ArrayF32) -> ArrayF32:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
         inner = np.s_[margin : height - margin, margin : width - margin]
@@ -176,18 +177,18 @@ class Level:
             misfit = self._misfit(motion, times, self._judging) / total
         return MotionFit(model, motion, misfit, still)
 
-    def cost(self, motion: FrameMotion, times: Floats = FINE) -> float:
+    def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
         """What is left on the pixels that fit."""
         return self._misfit(motion, times, self._fitting)
 
-    def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
+    def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
         fields = self.fields(motion)
         return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
-    def fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
+    def fields(self, motion: FrameMotion) -> tuple[ArrayF32, ArrayF32, ArrayF32]:
         """Offset, sweep and radius: see `DisplacementFields`."""
 
-        def flow(twist: Vector) -> Floats:
+        def flow(twist: ArrayF64) -> ArrayF32:
             if not twist.any():
                 return np.zeros(self._basis.shape[1:], np.float32)
             # einsum, for its fixed order of summation.
@@ -197,7 +198,7 @@ class Level:
         radius = np.abs(self.nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self.scale)
         return offset, flow(motion.blur), radius
 
-    def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[Vector, Vector]:
+    def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         offset, sweep, _ = self.fields(motion)
         return self._kernels.normal_equations(
@@ -214,7 +215,7 @@ class Level:
         )
 
 
-def _holdout_mask(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
     """True in every fourth block, no two of which share a side: bool [H, W]."""
     row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
     return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
@@ -226,7 +227,7 @@ def _median_depth(pair: FramePair) -> float:
     return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
 
 
-def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
+def _nearness(depth: ArrayF32, alpha: ArrayF32, median: float) -> ArrayF32:
     """As in the kernel `displacements`."""
     seen = (alpha > MIN_COVERED) & (depth > 0.0)
     near = np.ones_like(depth)
@@ -234,5 +235,5 @@ def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
     return near
 
 
-def _high_passed(image: Floats) -> Floats:
+def _high_passed(image: ArrayF32) -> ArrayF32:
     return np.asarray(image - cv2.GaussianBlur(image, (0, 0), HIGH_PASS), np.float32)

@@ -12,7 +12,8 @@ import numpy as np
 from cleargs.capture.tables import Frame
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
-from cleargs.splat.views import Mask, Pixels, TrainingView
+from cleargs.splat.views import TrainingView
+from cleargs.types import AnyImage, MaskBool
 
 
 def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
@@ -46,7 +47,7 @@ def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Pa
     ]
 
 
-def _load(image: Path, mask: Path | None) -> tuple[Pixels, Mask | None]:
+def _load(image: Path, mask: Path | None) -> tuple[AnyImage, MaskBool | None]:
     """Decode a PNG and its mask (0 = ignore)."""
     pixels = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
     ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask is not None else None

@@ -22,8 +22,9 @@ from cleargs.formation.comparison import (
     SearchKernels,
     scales,
 )
-from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
+from cleargs.formation.motion import TWIST, FrameMotion, Model
 from cleargs.splat.kernels.cpu import backend as cpu
+from cleargs.types import ArrayF64
 
 WARM_STEPS = 2
 """Gauss-Newton steps of a fit that starts from the last one."""
@@ -187,7 +188,7 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
     return motion
 
 
-def _rotation(length: float, angle: float) -> Vector:
+def _rotation(length: float, angle: float) -> ArrayF64:
     twist = np.zeros(TWIST)
     twist[3], twist[4] = length * math.sin(angle), length * math.cos(angle)
     return twist

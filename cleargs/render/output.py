@@ -10,7 +10,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, sync_tree, whole_folder, write_json
@@ -21,9 +20,9 @@ from cleargs.progress import Task
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.scene import Scene
 from cleargs.splat.viewer import Viewer
+from cleargs.types import ImageU8
 
 Kind = Literal["film", "still", "folder"]
-Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
 
 _NUMBER = re.compile(r"%0?\d*d")
 _OPAQUE = 1 / 255
@@ -42,7 +41,7 @@ class Shot:
 class ShotRenderer(Viewer):
     """Renders shots of one scene."""
 
-    def picture(self, shot: Shot) -> Picture:
+    def picture(self, shot: Shot) -> ImageU8:
         """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
         rendered = self.view(shot.camera)
         if shot.filmed is None:
@@ -112,7 +111,7 @@ def write_shots(
     with disk_errors(output):
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
 
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Iterator[ImageU8]:
         for shot in shots:
             yield renderer.picture(shot)
             task.advance()
@@ -134,7 +133,7 @@ def write_shots(
             sync_tree(folder)
 
 
-def _fitted(image: Picture, height: int, width: int) -> Picture:
+def _fitted(image: ImageU8, height: int, width: int) -> ImageU8:
     """``image`` at the place that `cleargs.render.paths.framed` gives its content, black around it."""
     scale = min(width / image.shape[1], height / image.shape[0])
     wide, high = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))

@@ -24,7 +24,7 @@ from cleargs.formation.table import read_formation, write_formation
 from cleargs.models.scorer import Scorer
 from cleargs.parquet import read_table, write_table
 from cleargs.progress import Reporter
-from cleargs.rivr.candidates import Image, hide_masked
+from cleargs.rivr.candidates import hide_masked
 from cleargs.rivr.harm import Fidelity
 from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
@@ -34,7 +34,8 @@ from cleargs.splat.state import read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trainer
 from cleargs.splat.types import Render
-from cleargs.splat.views import Mask, TrainingView
+from cleargs.splat.views import TrainingView
+from cleargs.types import ImageF32, MaskBool
 
 SCENE, STATE, LOG = "scene.ply", "state.safetensors", "train.parquet"
 EXPOSURE, FORMATION = "exposure.parquet", "formation.parquet"
@@ -46,7 +47,7 @@ CHECKPOINT = "checkpoint.safetensors"
 class Deblurred:
     """A raw frame without what its camera did to it."""
 
-    image: Image
+    image: ImageF32
     """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
     formation: FrameFormation
     """What was undone."""
@@ -56,14 +57,14 @@ class Deblurred:
 class Explained:
     """A raw frame as the training explains it."""
 
-    image: Image
+    image: ImageF32
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
     """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
 
 
-def observation(view: TrainingView) -> tuple[Image, Mask | None]:
+def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
     """O_t as float32 sRGB, and its mask."""
     pixels, mask = view.load()
     if pixels.dtype == np.uint8:
@@ -85,9 +86,9 @@ class TrainedScene:
         self.formations, self._weights = read_formation(folder / FORMATION)
         self._engine = rasteriser_for(device)
 
-    def render(self, view: TrainingView) -> Image:
+    def render(self, view: TrainingView) -> ImageF32:
         """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
-        image: Image = render_observed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
+        image: ImageF32 = render_observed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
     def _render_observed(self, view: TrainingView) -> Tensor:

@@ -25,7 +25,6 @@ from cleargs.rivr.candidates import (
     CANDIDATES,
     KEPT,
     CandidateChoice,
-    Image,
     Source,
     choose,
     fuse,
@@ -36,7 +35,8 @@ from cleargs.rivr.candidates import (
 from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
-from cleargs.splat.views import Mask, TrainingView
+from cleargs.splat.views import TrainingView
+from cleargs.types import ImageF32, MaskBool
 
 PREFIX = "cleargs:"
 """How the names of the attributes in the EXR begin."""
@@ -71,8 +71,8 @@ class Rules:
     gate: GateConfig
 
     def restored(
-        self, view: TrainingView, render: Image, scene: TrainedScene
-    ) -> tuple[Image, Source, Deblurred | None]:
+        self, view: TrainingView, render: ImageF32, scene: TrainedScene
+    ) -> tuple[ImageF32, Source, Deblurred | None]:
         """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
 
         What ``scene`` says of the frame's camera is undone.
@@ -84,10 +84,10 @@ class Rules:
             return self._restored_observation(view), "observation", None
         return self._restored(deblurred.image), "deblurred", deblurred
 
-    def _restored(self, image: Image) -> Image:
+    def _restored(self, image: ImageF32) -> ImageF32:
         return self.expert.restore(image, threads=self.threads)
 
-    def _restored_observation(self, view: TrainingView) -> Image:
+    def _restored_observation(self, view: TrainingView) -> ImageF32:
         """As the cache gives it back, so that every round and every resumed run has the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
@@ -238,15 +238,15 @@ def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView
     """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
     @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
-    def mask() -> Mask | None:
+    def mask() -> MaskBool | None:
         return target.load()[1]
 
-    def load() -> tuple[Image, Mask | None]:
+    def load() -> tuple[ImageF32, MaskBool | None]:
         return from_layer(read_exr(out / row.exr).layers[row.chosen]), mask()
 
     return replace(target, weight=1.0, kind="pseudo", load=load)
 
 
-def _score(scorer: Scorer, image: Image, threads: int) -> float:
+def _score(scorer: Scorer, image: ImageF32, threads: int) -> float:
     """In single precision, as the EXR holds it."""
     return float(np.float32(scorer.score(image, threads=threads)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,10 +15,7 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.random_streams import Stream
 from cleargs.splat.camera import Camera
-
-Pixels = NDArray[Any]
-"""An image [H, W, 3]: uint8, or float32 sRGB in [0, 1]."""
-Mask = NDArray[np.bool_]
+from cleargs.types import AnyImage, MaskBool
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 """Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
@@ -34,7 +31,7 @@ class TrainingView:
     """Factor on the loss: the RVA weight w_i of a real frame."""
     kind: Literal["real", "pseudo"]
     """A captured frame, or a repaired one."""
-    load: Callable[[], tuple[Pixels, Mask | None]]
+    load: Callable[[], tuple[AnyImage, MaskBool | None]]
     """Gives image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and mask [H, W] (True counts; None: all do).
     Called when first needed, and again when the cache could not keep the image."""
 
@@ -48,7 +45,7 @@ def require_views(views: Sequence[TrainingView]) -> None:
         )
 
 
-def unseen_pixels(frame_id: int, height: int, width: int) -> Mask:
+def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
     """The pixels [H, W] of a frame, and of its repairs, that no training sees; they follow from ``frame_id``.
 
     How well a scene shows them says how good it is without a frame held out. They lie in blocks, since a
@@ -122,7 +119,9 @@ class ImageCache:
         return image, mask
 
 
-def _prepare(view: TrainingView, factor: float, training: bool) -> tuple[NDArray[np.generic], Mask | None]:
+def _prepare(
+    view: TrainingView, factor: float, training: bool
+) -> tuple[NDArray[np.generic], MaskBool | None]:
     """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
     image, mask = view.load()
     camera = view.camera.scaled(factor)

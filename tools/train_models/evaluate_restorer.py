@@ -27,14 +27,8 @@ from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.expert import load_expert
-from tools.train_models.degrade import (
-    IDENTITY,
-    Degradation,
-    Image,
-    Kernel,
-    degrade,
-    motion_kernel,
-)
+from cleargs.types import ImageF32
+from tools.train_models.degrade import IDENTITY, Degradation, Kernel, degrade, motion_kernel
 from tools.train_models.train_restorer import list_photos, read_photo, source_of
 
 BANDS = ((7, 11), (12, 16), (17, 21))
@@ -56,15 +50,15 @@ class RestorationCase:
     """A photograph (sRGB [H, W, 3] in [0, 1]), its blurred version and the kernel that made it."""
 
     source: str
-    sharp: Image
-    blurred: Image
+    sharp: ImageF32
+    blurred: ImageF32
     kernel: Kernel
 
 
-Method = Callable[[RestorationCase], Image]
+Method = Callable[[RestorationCase], ImageF32]
 
 
-def psnr(image: Image, reference: Image) -> float:
+def psnr(image: ImageF32, reference: ImageF32) -> float:
     """PSNR in dB of sRGB values in [0, 1] without a border of `MARGIN` pixels; infinite for equal images."""
     inner = slice(MARGIN, -MARGIN)
     error = image[inner, inner].astype(np.float64) - reference[inner, inner]
@@ -72,13 +66,13 @@ def psnr(image: Image, reference: Image) -> float:
     return float("inf") if mean == 0.0 else -10.0 * np.log10(mean)
 
 
-def unsharp_mask(image: Image, sigma: float, amount: float) -> Image:
+def unsharp_mask(image: ImageF32, sigma: float, amount: float) -> ImageF32:
     """Sharpening by ``amount`` times the difference to a Gaussian blur of ``sigma`` pixels."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     return np.clip(image + np.float32(amount) * (image - smooth), 0.0, 1.0)
 
 
-def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
+def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
     """Wiener deconvolution in linear light: spectrum times conj(K) / (|K|² + noise_to_signal)."""
     reach = 2 * kernel.shape[0]
     padded = np.pad(linear_from_srgb(image), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
@@ -186,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def expert_method(spec: str) -> Method:
         expert = load_expert(spec)
 
-        def restore(case: RestorationCase) -> Image:
+        def restore(case: RestorationCase) -> ImageF32:
             started = time.perf_counter()
             restored = expert.restore(case.blurred, threads=options.threads)
             spent[spec] = spent.get(spec, 0.0) + time.perf_counter() - started

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from cleargs.errors import InputError
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
 from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
+from cleargs.types import ArrayF64
 
 _IMAGE = "<|image_pad|>"
 _ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
@@ -92,7 +92,7 @@ class QwenFolder(QwenEvaluator):
         matcher = llguidance.LLMatcher(vocabulary, grammar)
         return model.to(self._device).eval(), tokenizer, images, matcher
 
-    def score(self, picture: EncodedImage) -> Floats:
+    def score(self, picture: EncodedImage) -> ArrayF64:
         """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._config.local_threads)

@@ -22,10 +22,10 @@ from typing import Any
 import httpx2
 
 from cleargs.errors import InputError, StageError
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig, check_base_url
 from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
+from cleargs.types import ArrayF64
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"
@@ -125,7 +125,7 @@ class QwenServer(QwenEvaluator):
                 hint="name one with --set rva.qwen.model=NAME, or serve the other",
             )
 
-    def score(self, picture: EncodedImage) -> Floats:
+    def score(self, picture: EncodedImage) -> ArrayF64:
         """See `QwenEvaluator.score`. A reply outside the schema is answered with what is wrong with it."""
         if self._gone:
             raise UnscoredError(self._gone)  # this frame need not wait for the same end

@@ -14,9 +14,10 @@ from torch import Tensor
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels.cpu import binning, gradients, projection, rasterise
-from cleargs.splat.kernels.cpu.jit import LAUNCHING, Array, Floats
+from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.splat_layout import PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH
 from cleargs.splat.types import Render
+from cleargs.types import AnyArray, ArrayF32
 
 TILES_PER_CHUNK = 8
 """Tiles handed to a thread at a time: real scenes are uneven, so the queue must be finer than the threads."""
@@ -27,14 +28,14 @@ class CpuForwardPass(rasteriser.ForwardPass):
     """What the backward pass needs of one forward pass."""
 
     view: projection.ProjectionView
-    background: Floats  # [3]
-    splats: Floats  # [N, 16]
-    pair_offsets: Array  # [N + 1]
-    tile_offsets: Array  # [tiles + 1]
-    pair_ids: Array  # [P]
-    pair_slots: Array  # [P]
-    transmittance: Floats  # [H, W]
-    last: Floats  # [H, W]
+    background: ArrayF32  # [3]
+    splats: ArrayF32  # [N, 16]
+    pair_offsets: AnyArray  # [N + 1]
+    tile_offsets: AnyArray  # [tiles + 1]
+    pair_ids: AnyArray  # [P]
+    pair_slots: AnyArray  # [P]
+    transmittance: ArrayF32  # [H, W]
+    last: ArrayF32  # [H, W]
 
 
 def read_parameters(gaussians: Gaussians) -> projection.Parameters:
@@ -54,13 +55,13 @@ class CpuRasteriser(rasteriser.Rasteriser):
     def _launching(self) -> AbstractContextManager[Any]:
         return LAUNCHING
 
-    def _floats(self, name: str, *shape: int) -> Floats:
+    def _floats(self, name: str, *shape: int) -> ArrayF32:
         return self._buffers.take(name, *shape).numpy()
 
-    def _integers(self, name: str, *shape: int) -> Array:  # int64
+    def _integers(self, name: str, *shape: int) -> AnyArray:  # int64
         return self._buffers.take(name, *shape, dtype=torch.int64).numpy()
 
-    def _numbers(self, name: str, *shape: int) -> Array:  # uint32
+    def _numbers(self, name: str, *shape: int) -> AnyArray:  # uint32
         return self._buffers.take(name, *shape, dtype=torch.int32).numpy().view(np.uint32)
 
     def _bin(
