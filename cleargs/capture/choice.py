@@ -43,7 +43,7 @@ def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
         return capture
-    chosen = _left_behind(folder / CHOICE, nearest, len(times))
+    chosen = _saved_choice(folder / CHOICE, nearest, len(times))
     if chosen is None:
         best = np.full(len(times), -1.0)
         chosen = [0] * len(times)
@@ -64,7 +64,7 @@ def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter
     return replace(capture, frames=tuple(video_frame(source, timeline, number) for number in chosen))
 
 
-def _left_behind(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
+def _saved_choice(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
     """The choice of a killed run, or None where there is none that fits."""
     try:
         chosen = [int(number) for number in read_json(file)]

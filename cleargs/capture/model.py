@@ -36,7 +36,7 @@ class ModelImage:
     xy: NDArray[np.float64]  # [K, 2] px, the centre of the first pixel is 0.5
     point_ids: NDArray[np.int64]  # [K]
 
-    def kept(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
+    def select(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
         """With these keypoints alone."""
         return replace(self, xy=self.xy[which], point_ids=self.point_ids[which])
 
@@ -53,10 +53,10 @@ class SparseModel:
     dropped: int = 0
     """Points of the file that are not finite, and were left out."""
 
-    def kept(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
+    def select(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
         """With these points alone, in the images too."""
         ids = self.point_ids[which]
-        images = {key: image.kept(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
+        images = {key: image.select(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
         return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
 
 

@@ -81,7 +81,7 @@ def publish(
         )
     rgb_mean = np.rint(sums[kept] / samples[kept, None]).astype(np.uint8)
     cameras = {number: camera for camera, number in numbers.items()}
-    published = replace(model, cameras=cameras, images=images).kept(kept)
+    published = replace(model, cameras=cameras, images=images).select(kept)
     table = [
         _frame_row(
             index,
@@ -132,7 +132,7 @@ def _write_picture(
 def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
     """The observations in the published image; those in the cropped margin are gone."""
     xy = undistortion.points(image.xy)
-    return replace(image, xy=xy).kept(undistortion.inside(xy))
+    return replace(image, xy=xy).select(undistortion.inside(xy))
 
 
 def _write_points(

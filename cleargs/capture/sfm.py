@@ -204,7 +204,7 @@ def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
 def _within_reach(model: SparseModel) -> SparseModel:
     """The model without the points beyond `FARTHEST`, which single precision may not hold."""
     near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
-    return replace(model.kept(near), dropped=model.dropped + int((~near).sum()))
+    return replace(model.select(near), dropped=model.dropped + int((~near).sum()))
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:

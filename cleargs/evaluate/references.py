@@ -117,7 +117,7 @@ def reference_of(
         found = _held_out(ingest, frames)
     else:
         listed = _listed(directory)
-        own = _by_stem((stem_of(frame.name), _own_pose(frame)) for frame in frames if frame.registered)
+        own = _by_stem((stem_of(frame.name), _run_pose(frame)) for frame in frames if frame.registered)
         hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
@@ -179,7 +179,7 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.info(text)
 
 
-def _own_pose(frame: Frame) -> Pose:
+def _run_pose(frame: Frame) -> Pose:
     """The pose that the run has of a registered frame."""
     values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     numbers = np.array([value for value in values if value is not None], np.float64)
@@ -295,7 +295,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
 
 
 def _about_there(camera: Camera, frame: Frame) -> bool:
-    pose = _own_pose(frame)
+    pose = _run_pose(frame)
     near = np.linalg.norm(camera.centre - pose.centre) < SAME_VIEW
     return bool(near) and rotation_between(camera.world_to_camera[:3, :3], pose.rotation) < np.degrees(
         SAME_VIEW

@@ -152,11 +152,11 @@ class Level:
         observed[inner], weight[inner] = pair.observed, pair.weight
         self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
         counted = (reduced(weight) > 0.99).astype(np.float32)
-        judging = _holdout_mask(counted.shape)
-        self._fitting, self._judging = counted * ~judging, counted * judging
-        if not self._judging.any():  # an image of a few blocks
-            self._judging = self._fitting = counted
-        self._total = float(self._judging.sum(dtype=np.float64))
+        holdout = _holdout_mask(counted.shape)
+        self._fitting, self._holdout = counted * ~holdout, counted * holdout
+        if not self._holdout.any():  # an image of a few blocks
+            self._holdout = self._fitting = counted
+        self._total = float(self._holdout.sum(dtype=np.float64))
         depth, alpha = reduced(pair.depth), reduced(pair.alpha)
         self.median = _median_depth(pair)
         self.nearness = _nearness(depth, alpha, self.median)
@@ -167,14 +167,14 @@ class Level:
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
         self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
 
-    def judged(self, model: Model, motion: FrameMotion) -> MotionFit:
+    def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
         """How well a motion explains the pixels that judge."""
         total = max(self._total, 1.0)
-        still = self._misfit(FrameMotion(), FINE, self._judging) / total
+        still = self._misfit(FrameMotion(), FINE, self._holdout) / total
         misfit = still
         if model != "none":
             times = DISC if model == "defocus" else FINE
-            misfit = self._misfit(motion, times, self._judging) / total
+            misfit = self._misfit(motion, times, self._holdout) / total
         return MotionFit(model, motion, misfit, still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:

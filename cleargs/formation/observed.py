@@ -31,15 +31,15 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
-CELLS = 24
+ERROR_CELLS = 24
 """Cells along the longer side of a frame. Over a cell, detail that is missing or lies a little beside its
 place cancels out; what does not belong to the scene does not."""
 
-ORDINARY = 5.0
+MEDIAN_FACTOR = 5.0
 """Multiple of the frame's median difference that is an ordinary one still: where all of a frame differs, as
 with an exposure that is not known yet, nothing moves."""
 
-NONE = 1e-6
+EPSILON = 1e-6
 """Difference, and share of the pixels, that stands for none."""
 
 
@@ -59,15 +59,15 @@ def pixel_weights(
     (2023).
     """
     height, width = render.shape[:2]
-    per_pixel = CELLS / max(height, width)
+    per_pixel = ERROR_CELLS / max(height, width)
     cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
     counted = torch.ones_like(render[..., 0]) if mask is None else mask.float()
     difference = (render - target).permute(2, 0, 1) * counted
-    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
+    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(EPSILON)
     unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
-    ordinary = (ORDINARY * unexplained.median()).clamp_min(tolerance)
+    ordinary = (MEDIAN_FACTOR * unexplained.median()).clamp_min(tolerance)
     here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
-    return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
+    return (ordinary / here.clamp_min(EPSILON)).clamp_max(1.0).square()
 
 
 @dataclass(eq=False)

@@ -41,14 +41,14 @@ RADII = (1.0, 2.0, 3.0, 4.5, 7.0)
 NARROWING = (0.25, 0.12, 0.06)
 """Steps of its pattern search, as shares of the radius and of the range of nearness."""
 
-PRICE = 0.005
+MODEL_PENALTY = 0.005
 """Share of the misfit that each further motion must explain to be preferred to a simpler model."""
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
-FLOOR = 1e-4
+DAMPING_FLOOR = 1e-4
 """Damping of every direction, as a share of the stiffest: what the image does not show stays near zero."""
 CONVERGED = 1e-3
-TRIES = 4
+MAX_TRIES = 4
 
 POSE, BLUR, SKEW = (slice(k * TWIST, (k + 1) * TWIST) for k in range(3))
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
@@ -79,7 +79,7 @@ def search(
     for level in levels[1:]:
         disc = _narrowed(level, disc)
     found["defocus"] = disc
-    return [levels[-1].judged("none", still), *(levels[-1].judged(name, found[name]) for name in found)]
+    return [levels[-1].evaluate("none", still), *(levels[-1].evaluate(name, found[name]) for name in found)]
 
 
 def refine(
@@ -98,12 +98,12 @@ def refine(
         motion = _narrowed(level, motion)
     elif model != "none":
         motion = _best(level, [motion], model, WARM_STEPS, pose)
-    return [level.judged("none", still), level.judged(model, motion)]
+    return [level.evaluate("none", still), level.evaluate(model, motion)]
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
     """The model with the least misfit on the pixels that judge, simpler ones at a discount."""
-    return min(found, key=lambda e: e.misfit * (1.0 + PRICE * _PARTS[e.model]))
+    return min(found, key=lambda e: e.misfit * (1.0 + MODEL_PENALTY * _PARTS[e.model]))
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
@@ -171,8 +171,8 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
         diagonal = matrix.diagonal()
         if diagonal.max() <= 0.0:
             break  # nothing to see
-        for _ in range(TRIES):
-            damped = matrix + np.diag(damping * diagonal + FLOOR * diagonal.max())
+        for _ in range(MAX_TRIES):
+            damped = matrix + np.diag(damping * diagonal + DAMPING_FLOOR * diagonal.max())
             trial = vector.copy()
             trial[active] += np.linalg.solve(damped, side)
             tried = motion.with_vector(trial)

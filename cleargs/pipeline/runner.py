@@ -82,13 +82,13 @@ class Runner:
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
-        with self._alone(), self.store.in_use():
+        with self._lock_run(), self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
             self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
             write_run_file(self.run)
             self.store.add_root(self.run.folder)
             for name in (plan.stage for plan in plans):
-                outcome = self._bring(name, done, forced=name in forced)
+                outcome = self._find_or_make(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
                 if outcome.how == "made":
@@ -99,7 +99,7 @@ class Runner:
                     break
         return outcomes
 
-    def _alone(self) -> AbstractContextManager[bool]:
+    def _lock_run(self) -> AbstractContextManager[bool]:
         """Keep the run folder for this process; wait while another one works there."""
         return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
@@ -125,12 +125,12 @@ class Runner:
         """
         check_address_space()
         done: dict[str, Manifest] = {}
-        with self._alone(), self.store.in_use():
+        with self._lock_run(), self.store.in_use():
             self.store.add_root(self.run.folder)
             self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
                 done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
-            outcome = self._bring(name, done, forced=force)
+            outcome = self._find_or_make(name, done, forced=force)
             self._unlink_outdated()
         return outcome
 
@@ -160,14 +160,14 @@ class Runner:
             return None
         return entry
 
-    def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
+    def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and let the run folder show them."""
         stage_key = self.planner.stage_key(name, done)
         entry = self.store.find(name, stage_key.key)
         manifest = entry.whole if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
-            stage_key = self._read_again(name, done)
+            stage_key = self._rehashed_key(name, done)
             entry = self.store.find(name, stage_key.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
             with self.store.lock(stage_key.key, self.reporter, name) as alone:
@@ -180,7 +180,7 @@ class Runner:
         self.store.link(self.run.folder, name, stage_key.key)
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
 
-    def _read_again(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
+    def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
 
         Raises StoreError when an upstream result is damaged.

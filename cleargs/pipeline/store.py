@@ -158,20 +158,20 @@ class Store:
             try:
                 yield alone
             finally:
-                self._hand_back(key)
+                self._release(key)
 
     def _only_readable(self) -> bool:
         return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
-    def _own(self) -> str:
+    def _owner_suffix(self) -> str:
         """The ending of this process's own work folders, where no lock keeps another one out."""
         return f"@{socket.gethostname()}-{os.getpid()}"
 
-    def _hand_back(self, key: str) -> None:
+    def _release(self, key: str) -> None:
         """Leave this process's own work folders of ``key`` to the next try."""
-        for folder in (self.root / "work").glob(f"{key}*{self._own()}"):
+        for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
             with suppress(OSError):  # another process left something there already
-                folder.rename(folder.with_name(folder.name.removesuffix(self._own())))
+                folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def open_work(
         self,
@@ -192,7 +192,7 @@ class Store:
         work = WorkFolder(self.root / "work" / (f"{key}.forced" if fresh else key))
         with disk_errors(work.folder):
             if not alone:
-                left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._own()))
+                left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._owner_suffix()))
                 with suppress(OSError):  # nothing is there, or another process took it
                     left.folder.rename(work.folder)
             _keep_only(work.out, leftovers)

@@ -85,7 +85,7 @@ def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: floa
     return max(candidates.values()) - raw <= margin
 
 
-def hardly_changes(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:
+def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:
     """Whether the repair hardly changes the raw frame: |D - O|^2 < 0.15 |R - O|^2.
 
     A frame that is blurred or skewed differs from a good scene's render by just that, and its repair undoes

@@ -28,8 +28,8 @@ from cleargs.rivr.candidates import (
     Source,
     choose,
     fuse,
-    hardly_changes,
     hide_masked,
+    is_negligible_change,
     unbeaten,
 )
 from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
@@ -119,7 +119,7 @@ def run_round(
     with reporter.task(label, total=len(targets)) as task:
         for view in targets:
             exr = f"{folder}/{view.frame_id:06d}.exr"
-            row = recorded_row(out, exr)
+            row = read_row(out, exr)
             if row is None or (row.round, row.frame_id) != (number, view.frame_id):
                 if (out / exr).exists():
                     reporter.warn(f"{exr}: what an earlier try left cannot be used and is made again")
@@ -164,7 +164,7 @@ def repair(
             view.weight > 0.0  # without its repair a frame of no weight would be lost
             and unbeaten(raw[0], primary, rules.margin)
             and unbeaten(raw[1], tiebreak, rules.margin)
-            and hardly_changes(observed, shown["restored"], shown["render"])
+            and is_negligible_change(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
     refused = rejection_reason(shown["restored"], observed, shown["render"], rules.gate)
@@ -213,7 +213,7 @@ def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> No
             remove(place)
 
 
-def recorded_row(out: Path, exr: str) -> Selection | None:
+def read_row(out: Path, exr: str) -> Selection | None:
     """The row that the EXR at ``out/exr`` carries; None where there is no whole EXR."""
     if not (out / exr).exists():
         return None

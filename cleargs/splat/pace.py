@@ -46,7 +46,7 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
 
     Remembered from an earlier measurement. Without one it is measured where somebody is told so (``say``).
     """
-    pace = remembered_pace()
+    pace = cached_pace()
     if pace is not None or say is None:
         return 1.0 if pace is None else pace
     say("measuring the pace of this machine (once; kernels may have to be compiled for it)")
@@ -58,7 +58,7 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
     return milliseconds / REFERENCE_MS
 
 
-def remembered_pace() -> float | None:
+def cached_pace() -> float | None:
     """What was measured on this machine before; None where nothing was, or the note of it is damaged."""
     with suppress(*FAULTS):
         return _sound(read_json(_note())["milliseconds"]) / REFERENCE_MS

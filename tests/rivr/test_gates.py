@@ -17,7 +17,7 @@ from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr.gates import GateConfig, all_masked, colour_differences, rejection_reason, shifts
-from cleargs.rivr.rounds import recorded_row
+from cleargs.rivr.rounds import read_row
 from cleargs.rivr.tables import read_selection
 from cleargs.stages import rivr
 from cleargs.types import ImageF32
@@ -175,7 +175,7 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
         rows = read_selection(context.out / "selection.parquet")
         assert all(row.accepted for row in rows)
         assert all("restored" in read_exr(context.out / row.exr).layers for row in rows)
-        assert [recorded_row(context.out, row.exr) for row in rows] == rows
+        assert [read_row(context.out, row.exr) for row in rows] == rows
         chosen[share], reasons[share] = {row.chosen for row in rows}, {row.reason for row in rows}
     assert "render" not in chosen[1.0]
     assert chosen[0.1] == {"render"}
