@@ -59,7 +59,7 @@ class G0Config(TrainConfig):
     """Spread of the frames' gains from which ``auto`` is on: with a fixed exposure it stays below."""
 
 
-VERSION = 24
+VERSION = 25
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {

@@ -27,9 +27,6 @@ from cleargs.splat.formation import Renderer
 from cleargs.splat.types import group
 from cleargs.splat.views import TrainingView
 
-SEARCH_EVERY = 4
-"""One in so many fits of a frame begins from scratch."""
-
 ROLLING = 0.015
 """Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
 docs/formation.md."""
@@ -51,6 +48,17 @@ def rolls(frames: Iterable[FrameFormation]) -> bool:
     return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
 
 
+def median_misfit(frames: Iterable[FrameFormation], weights: Mapping[int, float]) -> float:
+    """Return the median misfit, in which each frame counts with its weight by RVA; 0 where none is known."""
+    known = sorted((frame.misfit, weights.get(frame.frame_id, 0.0)) for frame in frames if frame.misfit > 0.0)
+    half, passed = 0.5 * math.fsum(weight for _, weight in known), 0.0
+    for misfit, weight in known:
+        passed += weight
+        if passed >= half:
+            return misfit
+    return 0.0
+
+
 class CaptureFormation:
     """Fulfils `cleargs.splat.formation.Formation` for a capture."""
 
@@ -69,10 +77,7 @@ class CaptureFormation:
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
-        # Counted anew: every training begins with a search, which pays (docs/experiments/formation.md).
-        self._frames = {
-            frame_id: replace(known.get(frame_id, FrameFormation(frame_id)), draws=0) for frame_id in real
-        }
+        self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 
@@ -97,18 +102,9 @@ class CaptureFormation:
         prior, frame = self._weights[frame_id], self._frames[frame_id]
         if frame.model == "none" or frame.misfit <= 0.0:
             return prior
-        trust: float = min(1.0, self._reference() / frame.misfit) ** self._config.trust
+        reference = median_misfit(self._frames.values(), self._weights)
+        trust: float = min(1.0, reference / frame.misfit) ** self._config.trust
         return max(prior, trust)
-
-    def _reference(self) -> float:
-        """The weighted median of the misfits."""
-        known = sorted((f.misfit, self._weights[f.frame_id]) for f in self._frames.values() if f.misfit > 0.0)
-        half, passed = 0.5 * math.fsum(weight for _, weight in known), 0.0
-        for misfit, weight in known:
-            passed += weight
-            if passed >= half:
-                return misfit
-        return 0.0
 
     def form(
         self,
@@ -136,9 +132,8 @@ class CaptureFormation:
                 mask,
                 render,
                 factor=factor,
-                warm=(frame.draws // self._config.every) % SEARCH_EVERY != 0,
                 rolling=self._rolls(),
-                test_rolling=frame_id in self._tested,
+                test_rolling=frame_id in self._tested and frame.skew_gain is None,
             )
 
         begun = progress >= self._config.start

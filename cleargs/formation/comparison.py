@@ -7,6 +7,7 @@ part in a fit: they judge which model explains the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import cv2
@@ -156,26 +157,52 @@ class Level:
         self._fitting, self._holdout = counted * ~holdout, counted * holdout
         if not self._holdout.any():  # an image of a few blocks
             self._holdout = self._fitting = counted
-        self._total = float(self._holdout.sum(dtype=np.float64))
-        depth, alpha = reduced(pair.depth), reduced(pair.alpha)
-        self.median = _median_depth(pair)
-        self.nearness = _nearness(depth, alpha, self.median)
-        self._basis = flow_basis(widened(pair.camera, margin), self.nearness)
+        self._total = max(float(self._holdout.sum(dtype=np.float64)), 1.0)
+        self._pair, self._reduced = pair, reduced
         self.scale = size[0] / width
         rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
         self._down = (rows / pair.camera.height - 0.5).astype(np.float32)
+
+    # Only a fit needs these: the misfit without any motion is had without them.
+
+    @cached_property
+    def median(self) -> float:
+        """Median depth of the render."""
+        return _median_depth(self._pair)
+
+    @cached_property
+    def nearness(self) -> ArrayF32:
+        """Median depth over depth, [H, W]."""
+        depth, alpha = (self._reduced(image) for image in (self._pair.depth, self._pair.alpha))
+        return _nearness(depth, alpha, self.median)
+
+    @cached_property
+    def _basis(self) -> ArrayF32:
+        return flow_basis(widened(self._pair.camera, self._pair.margin), self.nearness)
+
+    @cached_property
+    def _stack(self) -> ArrayF32:
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
-        self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
+        return np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
+
+    @cached_property
+    def _nowhere(self) -> ArrayF32:
+        return np.zeros((2, *self._image.shape), np.float32)
+
+    @cached_property
+    def _still(self) -> float:
+        """Misfit without any motion."""
+        fields = self._nowhere, self._nowhere, self._nowhere[0]
+        total = self._kernels.misfit(self._image, self._observed, self._holdout, fields, samples(1), LIMIT)
+        return total / self._total
 
     def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
-        """How well a motion explains the pixels that judge."""
-        total = max(self._total, 1.0)
-        still = self._misfit(FrameMotion(), FINE, self._holdout) / total
-        misfit = still
+        """Return how well a motion explains the pixels that take no part in a fit."""
+        misfit = self._still
         if model != "none":
             times = DISC if model == "defocus" else FINE
-            misfit = self._misfit(motion, times, self._holdout) / total
-        return MotionFit(model, motion, misfit, still)
+            misfit = self._misfit(motion, times, self._holdout) / self._total
+        return MotionFit(model, motion, misfit, self._still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
         """What is left on the pixels that fit."""
@@ -190,12 +217,17 @@ class Level:
 
         def flow(twist: ArrayF64) -> ArrayF32:
             if not twist.any():
-                return np.zeros(self._basis.shape[1:], np.float32)
+                return self._nowhere
             # einsum, for its fixed order of summation.
             return np.asarray(np.einsum("n,nchw->chw", twist.astype(np.float32), self._basis))
 
-        offset = flow(motion.pose) + flow(motion.skew) * self._down[:, None]
-        radius = np.abs(self.nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self.scale)
+        offset = flow(motion.pose)
+        if motion.skew.any():
+            offset = offset + flow(motion.skew) * self._down[:, None]
+        radius = self._nowhere[0]
+        if motion.disc_px > 0.0:
+            disc = np.float32(motion.disc_px * self.scale)
+            radius = np.abs(self.nearness - np.float32(motion.focus)) * disc
         return offset, flow(motion.blur), radius
 
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:

@@ -8,19 +8,27 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.comparison import FramePair, MotionFit, explained_share, luminance
+from cleargs.formation.comparison import MIN_MISFIT, FramePair, MotionFit, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
-from cleargs.formation.search import preferred, refine, search
-from cleargs.formation.warp import displacement_fields
+from cleargs.formation.pretest import BlurEvidence, blur_evidence
+from cleargs.formation.search import blur_along, preferred, refine, search
+from cleargs.formation.warp import Warp, displacement_fields
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
-from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 from cleargs.splat.types import Render
+
+EVIDENCE = 0.03
+"""Share of the squared error on unseen tiles that further blur must explain before a frame is searched. It is
+from tuning captures (docs/experiments/formation.md)."""
+SEARCHED_SHARE = 0.05
+"""Margin of a search, as a share of the longer side."""
 
 MARGIN_STEP = 4
 """Margins are multiples of this, px."""
@@ -80,44 +88,78 @@ def fit_motion(
     render: Renderer,
     *,
     factor: float = 1.0,
-    warm: bool = False,
     rolling: bool = False,
     test_rolling: bool = False,
 ) -> FrameFormation:
-    """How a raw frame was taken, in the light of the scene that ``render`` shows.
+    """Estimate how a raw frame was taken, from the scene that ``render`` shows.
+
+    A frame is searched only where the test of `pretest` finds blur that its present model does not explain,
+    or where it has to be asked for a rolling shutter. Otherwise what is known is refined.
 
     Args:
-        frame: what is known already; its model stays in the race.
-        camera: of the frame, reduced by ``factor``.
-        affine: the frame's colour, [3, 4].
-        target, mask: the frame, [H, W, 3] sRGB and [H, W].
-        warm: refine what is known instead of searching among all models.
-        rolling: whether models with a skew are in the race.
-        test_rolling: whether to tell, where they are not, what such a model would explain (`skew_gain`).
+        frame: What is known already. Its model remains a candidate.
+        camera: Of the frame, reduced by ``factor``.
+        affine: The frame's colour, [3, 4].
+        target: The frame, [H, W, 3] sRGB.
+        mask: Its mask, [H, W].
+        rolling: Admit models with a skew.
+        test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
     """
-    # What was found under the other belief about the shutter is searched for anew.
+    # What was found under the other belief about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
     untested = rolling and _admitted(frame.model, rolling=False) and unmeasured
-    warm = warm and _admitted(frame.model, rolling) and not untested
-    # The motions that a search will find are not known yet.
-    reach = frame.reach_px * factor if warm else 0.05 * max(camera.width, camera.height)
-    margin = margin_for(reach, camera)
+    margin = margin_for(frame.reach_px * factor, camera)
     rendered = render(widened(camera, margin))
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
-    known = _scaled(frame.motion, factor)
-    if warm:
-        found = refine(pair, frame.model, known, pose=config.pose)
-        best = found[-1]
-    else:
-        found = search(pair, skew=rolling or test_rolling, pose=config.pose)
-        frame = replace(frame, skew_gain=_skew_gain(found) if rolling or test_rolling else None)
-        if frame.model != "none":
-            found += refine(pair, frame.model, known, pose=config.pose)[1:]
+    found = refine(pair, frame.model, _scaled(frame.motion, factor), pose=config.pose)
+    best = _accepted(found[-1], found[0], frame.model, config)
+    evidence = _unexplained(pair, rendered, best)
+    asked = untested or test_rolling or not _admitted(frame.model, rolling)
+    if asked or (evidence.gain > EVIDENCE and best.misfit > MIN_MISFIT):
+        wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
+        if wide > margin:
+            margin, rendered = wide, render(widened(camera, wide))
+            pair = frame_pair(rendered, affine, target, mask, camera, margin)
+        whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
+        known, found = (
+            found[-1],
+            search(
+                pair,
+                start=blur_along(whole.length, whole.angle),
+                skew=rolling or test_rolling,
+                defocus=whole.disc_gain > whole.line_gain,
+                pose=config.pose,
+            ),
+        )
+        if rolling or test_rolling:
+            frame = replace(frame, skew_gain=_skew_gain(found))
+        if known.model != "none":
+            found += refine(pair, known.model, known.motion, pose=config.pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
-    # Hysteresis: what was taken before may stay at half the gain that lets a model in.
-    if best.explained < config.accept * (0.5 if frame.model == best.model else 1.0):
-        best = found[0]
+        best = _accepted(best, found[0], frame.model, config)
     return _described(frame, best, factor, camera, rendered, margin)
+
+
+def _accepted(best: MotionFit, still: MotionFit, before: Model, config: FormationConfig) -> MotionFit:
+    """Return ``best`` where it explains enough, else ``still``.
+
+    The model of ``before`` may stay at half the gain that admits a new one.
+    """
+    return best if best.explained >= config.accept * (0.5 if best.model == before else 1.0) else still
+
+
+def _unexplained(pair: FramePair, rendered: Render, fit: MotionFit) -> BlurEvidence:
+    """Return how much blurrier the frame is than the render as its camera saw it under ``fit``."""
+    shown = pair.luminance
+    if fit.model != "none":
+        assert rendered.depth is not None
+        fields = displacement_fields(fit.motion, pair.camera, rendered.depth, rendered.alpha, pair.margin)
+        light = np.repeat(pair.luminance[..., None], CHANNELS, axis=2)
+        exposed = Warp.of(fields, pair.margin).forward(torch.from_numpy(light).to(rendered.depth.device))
+        shown = exposed[..., 0].cpu().numpy()
+    elif pair.margin:
+        shown = shown[pair.margin : -pair.margin, pair.margin : -pair.margin]
+    return blur_evidence(np.ascontiguousarray(shown), pair.observed, pair.weight)
 
 
 def _admitted(model: Model, rolling: bool) -> bool:
@@ -155,6 +197,15 @@ def _described(
     frame: FrameFormation, best: MotionFit, factor: float, camera: Camera, rendered: Render, margin: int
 ) -> FrameFormation:
     """The frame with a new explanation; lengths in pixels of the full image."""
+    if best.model == "none":
+        return FrameFormation(
+            frame.frame_id,
+            FrameMotion(median_depth=best.motion.median_depth),
+            misfit=best.misfit,
+            misfit_still=best.misfit_still,
+            skew_gain=frame.skew_gain,
+            draws=frame.draws,
+        )
     motion = _scaled(best.motion, 1.0 / factor)
     depth, alpha = rendered.depth, rendered.alpha
     assert depth is not None
@@ -209,13 +260,13 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """The frame of which `as_row` gave this; without ``draws``, as before the first one."""
+    """The frame of which `as_row` gave this; without ``draws`` (an older table), as before the first one."""
     vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
         FrameMotion(**{name: row[name] for name in LENS}).with_vector(vector),
         row["model"],
-        draws=row.get("draws", 0),
+        draws=row.get("draws") or 0,
         **{name: row[name] for name in (*MEASURED, "skew_gain")},
     )
 

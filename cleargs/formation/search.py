@@ -56,7 +56,13 @@ _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus
 
 
 def search(
-    pair: FramePair, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
+    pair: FramePair,
+    *,
+    start: FrameMotion | None = None,
+    skew: bool = True,
+    defocus: bool = True,
+    pose: bool = False,
+    kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
     """Every model at its best, from scratch. The first is ``none``.
 
@@ -68,17 +74,19 @@ def search(
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
-    start = _best(coarse, _starts(coarse, still), models[0], LEVELS[0][1], pose)
+    starts = _starts(coarse, still) if start is None else _near(coarse, still, start)
+    begun = _best(coarse, starts, models[0], LEVELS[0][1], pose)
     found: dict[Model, FrameMotion] = {}
     for model in models:
-        motion = _restricted(start, model)
+        motion = _restricted(begun, model)
         for level, (_, steps) in zip(levels, LEVELS, strict=False):
             motion = _best(level, [motion, still], model, steps, pose)
         found[model] = motion
-    disc = _sharpest_disc(coarse, still)
-    for level in levels[1:]:
-        disc = _narrowed(level, disc)
-    found["defocus"] = disc
+    if defocus:
+        disc = _sharpest_disc(coarse, still)
+        for level in levels[1:]:
+            disc = _narrowed(level, disc)
+        found["defocus"] = disc
     return [levels[-1].evaluate("none", still), *(levels[-1].evaluate(name, found[name]) for name in found)]
 
 
@@ -90,13 +98,19 @@ def refine(
     pose: bool = False,
     kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
-    """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
+    """Fit ``model`` again from the numbers of the last fit, at the finest level.
+
+    Returns:
+        The fit of ``none`` first, then that of ``model`` where it is another.
+    """
     level = Level(pair, scales(pair)[-1], kernels)
+    if model == "none":
+        return [level.evaluate("none", FrameMotion())]
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
         motion = _narrowed(level, motion)
-    elif model != "none":
+    else:
         motion = _best(level, [motion], model, WARM_STEPS, pose)
     return [level.evaluate("none", still), level.evaluate(model, motion)]
 
@@ -133,6 +147,14 @@ def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
     first = [motions[k] for k in np.argsort(costs, kind="stable")[:STARTS]]
     # Short: at none the slope by the blur vanishes, and the descent would stay there.
     return [*first, replace(still, blur=_rotation(0.5 * pixel, 0.0)), still]
+
+
+def _near(level: Level, still: FrameMotion, start: FrameMotion) -> list[FrameMotion]:
+    """``start``, a short blur of the same direction, and no motion."""
+    start = replace(start, median_depth=still.median_depth)
+    length = float(np.linalg.norm(start.blur))
+    short = replace(start, blur=start.blur * (0.5 / level.scale / length)) if length > 0.0 else None
+    return [motion for motion in (start, short, still) if motion is not None]
 
 
 def _sharpest_disc(level: Level, still: FrameMotion) -> FrameMotion:
@@ -186,6 +208,15 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
             break
         damping = max(damping / 4.0, 1e-4)
     return motion
+
+
+def blur_along(length: float, angle: float) -> FrameMotion:
+    """Return a straight blur of ``length`` px along a direction of the image, by turns of the camera.
+
+    Args:
+        angle: From the x axis towards the y axis, radians.
+    """
+    return FrameMotion(blur=_rotation(length, math.pi - angle))
 
 
 def _rotation(length: float, angle: float) -> ArrayF64:

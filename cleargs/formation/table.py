@@ -32,6 +32,7 @@ def _twist(name: str) -> list[pa.Field]:
 FORMATION = pa.schema(
     [
         column("frame_id", pa.int32(), "active frame"),
+        column("draws", pa.int64(), "steps on the frame since its formation is looked for", nullable=True),
         column("model", pa.string(), "none, blur, skew, both (blur and skew) or defocus"),
         column("blur_px", pa.float64(), "mean length of the pixels' ways while they were exposed, px"),
         column(

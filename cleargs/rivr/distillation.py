@@ -120,15 +120,20 @@ class TrainedScene:
             if self.exposure is None
             else torch.from_numpy(self.exposure.of(view.frame_id).astype(np.float32))
         )
-        found = fit_motion(
-            self.formations.get(view.frame_id, FrameFormation(view.frame_id)),
-            FormationConfig(),
-            view.camera,
-            affine,
-            torch.from_numpy(observed),
-            None if mask is None else torch.from_numpy(mask),
-            self._with_depth,
-            rolling=rolls(self.formations.values()),
+        known = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
+        found = (
+            known
+            if known.draws > 0
+            else fit_motion(
+                known,
+                FormationConfig(),
+                view.camera,
+                affine,
+                torch.from_numpy(observed),
+                None if mask is None else torch.from_numpy(mask),
+                self._with_depth,
+                rolling=rolls(self.formations.values()),
+            )
         )
         if found.model == "none":
             return None

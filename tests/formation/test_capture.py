@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,10 +17,12 @@ from cleargs.formation.capture import (
     _tested_frames,
     rolls,
 )
+from cleargs.formation.comparison import FramePair, MotionFit
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.observed import render_observed
+from cleargs.formation.search import search
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera
@@ -122,6 +125,72 @@ def test_sharp_frames_train_as_without_it_bit_for_bit(tmp_path: Path) -> None:
     for name, tensor in without.scene.gaussians.tensors().items():
         assert torch.equal(tensor, with_it.scene.gaussians.tensors()[name]), name
     assert with_it.rows.equals(without.rows)
+
+
+@pytest.fixture
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[FramePair]:
+    """Return the frames that are searched, in order, while the search still runs."""
+    pairs: list[FramePair] = []
+
+    def counted(pair: FramePair, **settings: Any) -> list[MotionFit]:
+        pairs.append(pair)
+        return search(pair, **settings)
+
+    monkeypatch.setattr("cleargs.formation.frame.search", counted)
+    return pairs
+
+
+NO_TEST = 0.001
+"""A gain of skews, measured before: the shutter is not asked for again."""
+
+
+def known(**blurs: FrameMotion) -> dict[int, FrameFormation]:
+    """Return what an earlier training found: ``f2=BLUR``."""
+    still = {k: FrameFormation(k, skew_gain=NO_TEST) for k in range(FRAMES)}
+    moved = {int(name[1:]): motion for name, motion in blurs.items()}
+    return still | {
+        k: FrameFormation(k, motion, "blur", blur_px=7.0, reach_px=4.0, skew_gain=NO_TEST)
+        for k, motion in moved.items()
+    }
+
+
+def test_a_frame_is_searched_once(tmp_path: Path, searched: list[FramePair]) -> None:
+    """After that its motion is followed; sharp frames are never searched."""
+    formation = CaptureFormation(views(), LOOK, known=known())
+    run(tmp_path, views(), formation)
+    assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
+    assert formation.frames[BLURRED].draws > 2 * LOOK.every
+    assert len(searched) == 1
+
+
+def test_what_is_known_is_not_searched_again(tmp_path: Path, searched: list[FramePair]) -> None:
+    formation = CaptureFormation(views(), LOOK, known=known(f2=BLUR))
+    run(tmp_path, views(), formation)
+    assert formation.frames[BLURRED].blur_px == pytest.approx(7.0, abs=1.0)
+    assert not searched
+
+
+def test_a_motion_that_no_longer_explains_its_frame_is_searched_again(
+    tmp_path: Path, searched: list[FramePair]
+) -> None:
+    """The known blur goes down, the frame's across."""
+    other = FrameMotion(blur=np.array([0, 0, 0, 7.0, 0, 0]), median_depth=3.0)
+    formation = CaptureFormation(views(), LOOK, known=known(f2=other))
+    run(tmp_path, views(), formation)
+    found = formation.frames[BLURRED]
+    assert abs(found.motion.blur[4]) == pytest.approx(7.0, abs=1.0) and abs(found.motion.blur[3]) < 1.0
+    assert searched
+
+
+def test_the_next_training_goes_on_counting(tmp_path: Path) -> None:
+    first = CaptureFormation(views(), LOOK)
+    run(tmp_path, views(), first)
+    write_formation(tmp_path / "formation.parquet", first, dict.fromkeys(range(FRAMES), 1.0))
+    frames, _ = read_formation(tmp_path / "formation.parquet")
+    second = CaptureFormation(views(), LOOK, known=frames)
+    assert {k: frame.draws for k, frame in second.frames.items()} == {
+        k: frame.draws for k, frame in first.frames.items()
+    }
 
 
 def crossed() -> list[TrainingView]:

@@ -14,6 +14,7 @@ from cleargs.splat import densification
 from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu import blur_sums as blur_kernels
 from cleargs.splat.kernels.cpu import elementwise, frame_warp, loss
 from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
@@ -282,6 +283,21 @@ def normal_equations(
     return lower + np.tril(lower, -1).T, sides.sum(axis=0)
 
 
+def blur_sums(
+    render: ArrayF32,  # [H, W]
+    observed: ArrayF32,  # [H, W]
+    weight: ArrayF32,  # [H, W]
+    stride: int,
+    tile: int,
+) -> npt.NDArray[np.float64]:  # [2, 8, 8]
+    rows = max(0, -(-(len(render) - 2) // stride))
+    sums = np.empty((rows, 2, blur_kernels.TERMS, blur_kernels.TERMS))
+    with LAUNCHING:
+        blur_kernels.blur_sums(render, observed, weight, stride, tile, sums)
+    lower: npt.NDArray[np.float64] = sums.sum(axis=0)
+    return np.asarray(lower + np.tril(lower, -1).swapaxes(1, 2))
+
+
 # -- compiling ahead of use ------------------------------------------------------------------------------
 
 SIZE = 16
@@ -344,3 +360,4 @@ def _warm_up_formation() -> None:
         1.0,
         np.arange(6),
     )
+    blur_sums(pixels, pixels, pixels, 2, 4)

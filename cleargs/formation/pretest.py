@@ -1,0 +1,148 @@
+"""A test of a few milliseconds that says if a photograph is blurrier than a render, and along which way.
+
+For a small blur of covariance S the photograph is
+
+    offset + gain * render + shift . grad(render) + tr(S H(render)) / 2
+
+where H is the Hessian of the render. These are seven numbers by least squares. They are fitted on the tiles
+of one colour of a checkerboard and judged on the tiles of the other colour, and the reverse. Both images are
+smoothed first, so that a blur is small against the detail that is left: one fit per size of a pyramid.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cleargs.splat.kernels.cpu import backend as cpu
+from cleargs.types import ArrayF64, PlaneF32
+
+LARGEST = 640
+"""Longest side of the largest image that is compared, px: the finest level of a search."""
+SIZES = 4
+"""Sizes of the pyramid, each half of the one before."""
+SMALLEST = 24
+"""Shorter side below which a size is left out, px."""
+SIGMA = 1.0
+"""Standard deviation of the Gaussian that smooths both images at every size, px."""
+STRIDE = 2
+"""Rows and columns from one pixel that is read to the next."""
+TILE = 32
+"""Side of a tile at the largest size, px. It stays the same part of the image at smaller sizes."""
+MIN_TILE = 4
+
+MIN_VARIANCE = 0.1
+"""Variance below which a blur is no evidence, px^2: that of a sweep of 1.1 px."""
+
+_STILL, _ALL = 4, 7
+"""Numbers of the fit without a blur, and of the whole fit."""
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class BlurEvidence:
+    """How much blurrier than the render a photograph is. Lengths are in pixels of the photograph."""
+
+    line_gain: float
+    """Share of the squared error on unseen tiles that a blur along one direction removes."""
+    line: float
+    """Variance of that blur, px^2: L^2 / 12 for a straight sweep of length L. Negative where the render is
+    blurrier than the photograph."""
+    angle: float
+    """Its direction, radians from the x axis towards the y axis."""
+    disc_gain: float
+    """Share that a blur removes that is equal in all directions."""
+    disc: float
+    """Variance of that blur along any direction, px^2: R^2 / 4 for a disc of radius R."""
+
+    @property
+    def gain(self) -> float:
+        """Share of the better of the two; 0 where neither blurs by as much as `MIN_VARIANCE`."""
+        line = self.line_gain if self.line > MIN_VARIANCE else 0.0
+        disc = self.disc_gain if self.disc > MIN_VARIANCE else 0.0
+        return max(line, disc, 0.0)
+
+    @property
+    def length(self) -> float:
+        """Length of a straight sweep with the variance of the line, px."""
+        return math.sqrt(12.0 * max(self.line, 0.0))
+
+
+NO_EVIDENCE = BlurEvidence(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def blur_evidence(
+    render: PlaneF32,  # [H, W] linear luminance
+    observed: PlaneF32,  # [H, W] likewise
+    weight: PlaneF32,  # [H, W] 0 where a pixel does not count
+) -> BlurEvidence:
+    """Return the evidence at the size of the pyramid where a blur explains most."""
+    height, width = observed.shape
+    scale = min(1.0, LARGEST / max(height, width))
+    best = NO_EVIDENCE
+    for k in range(SIZES):
+        size = round(0.5**k * scale * width), round(0.5**k * scale * height)
+        if (min(size) < SMALLEST and k > 0) or min(size) < 3:
+            break
+        counted = (_reduced(weight, size, smooth=False) > 0.99).astype(np.float32)
+        sums = cpu.blur_sums(
+            _reduced(render, size), _reduced(observed, size), counted, STRIDE, max(MIN_TILE, TILE >> k)
+        )
+        found = _fitted(sums, width / size[0])
+        if found.gain > best.gain:
+            best = found
+    return best
+
+
+def _reduced(image: PlaneF32, size: tuple[int, int], *, smooth: bool = True) -> PlaneF32:
+    if size != image.shape[::-1]:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), SIGMA), np.float32) if smooth else image
+
+
+def _fitted(
+    sums: ArrayF64,  # [2, 8, 8] products of the regressors over the tiles of each colour
+    pixel: float,  # photograph pixels per pixel of this size
+) -> BlurEvidence:
+    halves = (sums[0], sums[1]), (sums[1], sums[0])
+
+    def fit(shape: ArrayF64) -> tuple[float, ArrayF64]:
+        """Return the squared error on unseen tiles, and the mean of the numbers [7]."""
+        numbers = [_solved(fitting, shape) for fitting, _ in halves]
+        errors = [_error(judging, x) for (_, judging), x in zip(halves, numbers, strict=True)]
+        return math.fsum(errors), np.mean(numbers, axis=0)
+
+    still = np.eye(_ALL)[:, :_STILL]
+    none = fit(still)[0]
+    if none <= 0.0:
+        return NO_EVIDENCE
+    sxx, sxy, syy = fit(np.eye(_ALL))[1][_STILL:]
+    x, y = np.linalg.eigh([[sxx, sxy], [sxy, syy]])[1][:, 1]
+    (line, along), (disc, round_) = (
+        fit(np.column_stack([still, [0.0, 0.0, 0.0, 0.0, *moments]]))
+        for moments in ((x * x, x * y, y * y), (1.0, 0.0, 1.0))
+    )
+    return BlurEvidence(
+        1.0 - line / none,
+        float(pixel**2 * (along[4] + along[6])),
+        math.atan2(y, x),
+        1.0 - disc / none,
+        float(pixel**2 * round_[4]),
+    )
+
+
+def _solved(sums: ArrayF64, shape: ArrayF64) -> ArrayF64:
+    """Return the seven numbers of the best fit among the combinations of the columns of ``shape`` [7, K]."""
+    matrix = shape.T @ sums[:_ALL, :_ALL] @ shape
+    scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-30))
+    matrix = matrix / scale / scale[:, None] + _RIDGE * np.eye(len(matrix))
+    solution = np.linalg.solve(matrix, shape.T @ sums[:_ALL, _ALL] / scale)
+    return np.asarray(shape @ (solution / scale))
+
+
+def _error(sums: ArrayF64, numbers: ArrayF64) -> float:
+    left = np.append(numbers, -1.0)
+    return float(left @ sums @ left)
