@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -32,7 +32,7 @@ def schema_of(row: type) -> pa.Schema:
 
 def _column(name: str, hint: Any) -> pa.Field:
     annotation, *kind, meaning = get_args(hint)
-    members = get_args(annotation) if get_origin(annotation) is UnionType else (annotation,)
+    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
     plain = str if get_origin(members[0]) is Literal else members[0]
     usual = {int: pa.int32(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
     return column(name, kind[0] if kind else usual[plain], meaning, nullable=NoneType in members)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
@@ -16,6 +16,9 @@ from cleargs.random_streams import Stream
 
 from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries
+
+if TYPE_CHECKING:
+    from cleargs.rivr.targets import Supervision
 
 
 class FinalDistilConfig(DistilConfig):
@@ -39,7 +42,7 @@ class ConsolidateConfig(Settings):
     distil: FinalDistilConfig = Field(FinalDistilConfig(), description="the final distillation")
 
 
-VERSION = 24
+VERSION = 25
 CONFIG = ConsolidateConfig
 SETTINGS = ("g0", "rivr")
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -79,6 +82,8 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     from .cost import capture_size, pace
 
     g0, (frames, megapixels) = context.settings["g0"], capture_size(context)
+    if g0.quality == "draft":
+        return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
     training = context.config.distil.applied_to(g0, frames)
     seconds, memory = training_cost(training, frames, megapixels)
     return Estimate(
@@ -111,12 +116,19 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     rivr, harm = context.inputs["rivr"], context.settings["rivr"].harm
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], harm.held_back)
+    if context.settings["g0"].quality == "draft":
+        return _unchanged(context, supervision)
     scorer = load_scorer(config.scorer, network_device(context.device, reporter.warn))
     rows = read_selection(rivr / "selection.parquet")
     repairs, kept = latest_accepted(rows), kept_raw(rows)
+    unrepaired = kept.intersection(row.frame_id for row in rows if row.exr is not None)
     write_repairs(context.out / "repairs.parquet", repairs)
 
     g0 = TrainedScene(context.inputs["g0"], context.device)
+    draft = context.settings["g0"].quality == "draft"
+    if draft:
+        reporter.info("consolidation: a draft is not consolidated; the scene is G0's, unchanged")
+        repairs, kept = [], set()
     start = TrainedScene(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:
@@ -161,7 +173,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     return StageResult(
         summary={
             "repairs": len(repairs),
-            "chosen": chosen_counts(repairs) | {"observed": len(kept)},
+            "chosen": chosen_counts(repairs) | {"observed": len(unrepaired)},
             "latest_rounds": dict(sorted(Counter(str(row.round) for row in repairs).items())),
             "scorer": scorer.name,
             "held_back": asdict(verdict),
@@ -169,3 +181,18 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
             "psnr_unseen": final.psnr_unseen(supervision.real),
         }
     )
+
+
+def _unchanged(context: StageContext[ConsolidateConfig], supervision: Supervision) -> StageResult:
+    """Publish G0's scene as it is, which is all that a draft does."""
+    from cleargs.rivr.distillation import TrainedScene, publish
+    from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
+    from cleargs.rivr.tables import write_repairs
+
+    context.reporter.info("consolidation: a draft trains no further; the scene is G0's, unchanged")
+    g0 = TrainedScene(context.inputs["g0"], context.device)
+    write_repairs(context.out / "repairs.parquet", [])
+    publish(g0, [], context.out, None)
+    worst = supervision.worst(list(supervision.views), SHEET_FRAMES)
+    write_before_after_sheet(context.out / "before_after.png", worst, g0, g0, {}, context.inputs["rivr"])
+    return StageResult(summary={"repairs": 0, "published": "G0", "draft": True})

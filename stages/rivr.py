@@ -16,7 +16,7 @@ from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
 from cleargs.rivr.gates import GateConfig
 from cleargs.rivr.harm import HarmConfig
-from cleargs.splat.config import Quality, TrainConfig
+from cleargs.splat.config import TrainConfig
 
 from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries
@@ -47,7 +47,7 @@ class RivrConfig(Settings):
     targets: Literal["auto", "all", "degraded"] = Field(
         "auto",
         description="frames to repair: all registered training frames, or those that are not strong; auto = "
-        "all, but degraded in a draft",
+        "those that image formation and RVA leave in need, and the next ones up to a sixteenth of the frames",
     )
     expert: str = Field(
         "embedded",
@@ -100,12 +100,6 @@ class RivrConfig(Settings):
     distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
     harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
 
-    def which_targets(self, quality: Quality) -> Literal["all", "degraded"]:
-        """``targets``, decided: a draft is a look within minutes, and repairs take most of RIVR's time."""
-        if self.targets == "auto":
-            return "degraded" if quality == "draft" else "all"
-        return self.targets
-
     def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
         """A training of ``steps`` steps in round ``round`` (from 1), ``done`` of whose steps lie behind, with
         its part of the schedule.
@@ -118,7 +112,10 @@ class RivrConfig(Settings):
         return whole.model_copy(update={"steps": steps, "begin": begin, "end": begin + step * steps})
 
 
-VERSION = 26
+AUTO_SHARE = 0.125
+"""Share of the frames that `auto` is expected to repair, for estimates."""
+
+VERSION = 27
 CONFIG = RivrConfig
 SETTINGS = ("g0",)
 INPUTS: Mapping[str, tuple[str, ...]] = {
@@ -165,7 +162,9 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
 
     config, g0 = context.config, context.settings["g0"]
     frames, megapixels = capture_size(context)
-    targets = frames if config.which_targets(g0.quality) == "all" else _degraded(context, frames)
+    if g0.quality == "draft":
+        return Estimate(minutes=0.0, memory_gb=1.0, disk_gb=0.0)
+    targets = _expected_targets(context, frames)
     deblurs = config.use_observation and config.undo_motion
     restorings = 1 if config.use_observation and not deblurs else config.rounds
     restoring = 1.0 if config.expert == "embedded" else 40.0
@@ -182,8 +181,10 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     )
 
 
-def _degraded(context: StageContext[RivrConfig], frames: int) -> int:
-    """How many frames RVA does not call strong; half of them before it has run."""
+def _expected_targets(context: StageContext[RivrConfig], frames: int) -> int:
+    """Return how many frames are likely repaired; before RVA has run half of them count as degraded."""
+    if context.config.targets != "degraded":
+        return frames if context.config.targets == "all" else max(2, round(AUTO_SHARE * frames))
     from cleargs.parquet import read_table
     from cleargs.rva.tables import FRAMES
 
@@ -202,6 +203,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.harm import judge_harm
+    from cleargs.rivr.need import frames_to_repair, rows_of_others
     from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
     from cleargs.rivr.tables import refused_repairs, round_figures, write_selection
@@ -211,7 +213,11 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     config, threads, reporter = context.config, context.threads, context.reporter
     set_threads(threads)
     supervision = load_supervision(context.inputs["ingest"], context.inputs["rva"], config.harm.held_back)
-    targets = supervision.targets(config.which_targets(context.settings["g0"].quality))
+    g0 = TrainedScene(context.inputs["g0"], context.device)
+    if context.settings["g0"].quality == "draft":
+        return _unchanged(context, supervision, g0)
+    chosen = frames_to_repair(config.targets, supervision, g0.formations)
+    targets = [supervision.views[frame_id] for frame_id in chosen]
     forget_others(context.out, config.rounds, targets)
     networks_on = network_device(context.device, reporter.warn)
     expert = load_expert(config.expert, networks_on)
@@ -229,12 +235,14 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         margin=config.margin,
         gate=config.gate,
     )
-    g0 = TrainedScene(context.inputs["g0"], context.device)
-    rows, trainings, current = _repair_and_distil(context, supervision, targets, rules, g0)
+    reporter.info(f"RIVR: {len(targets)} of {len(supervision.views)} frames are tried")
+    others = rows_of_others(chosen, supervision, g0.formations)
+    rows, trainings, current = _repair_and_distil(context, supervision, targets, others, rules, g0)
     write_selection(context.out / "selection.parquet", rows)
-    if 2 * (refused := refused_repairs(rows)) > len(rows):
+    made = len(rows) - len(others)
+    if 2 * (refused := refused_repairs(rows)) > made:
         reporter.warn(
-            f"{refused} of {len(rows)} repairs by {expert.name} were refused: they agree with neither the "
+            f"{refused} of {made} repairs by {expert.name} were refused: they agree with neither the "
             "raw frame nor the render (candidates.png shows some); the renders stand in for them"
         )
 
@@ -264,11 +272,18 @@ def _repair_and_distil(
     context: StageContext[RivrConfig],
     supervision: Supervision,
     targets: Sequence[TrainingView],
+    others: Sequence[Selection],
     rules: Rules,
     g0: TrainedScene,
 ) -> tuple[list[Selection], list[Path], TrainedScene]:
-    """Every round along the trajectory, group by group: what each frame got, the folders of the trainings,
-    and the last scene.
+    """Run every round along the trajectory, group by group.
+
+    A round in which no candidate is taken is the last one. Its training also takes the steps of the rounds
+    that are left.
+
+    Returns:
+        The rows of all frames (``others``, those of the frames that no round repairs, first), the folders of
+        the trainings, and the last scene.
     """
     from cleargs.rivr.distillation import drop_state
     from cleargs.rivr.rounds import pseudo_view, run_round
@@ -277,12 +292,14 @@ def _repair_and_distil(
 
     config, reporter, g0_config = context.config, context.reporter, context.settings["g0"]
     frames = len(supervision.real)
-    groups = trajectory_groups(targets, config.group, config.distil.applied_to(g0_config, frames).length)
-    rows: list[Selection] = []
+    length = config.distil.applied_to(g0_config, frames).length
+    groups = trajectory_groups(targets, config.group, length)
+    rows = list(others)
     trainings: list[Path] = []
     current = g0
     for number in range(1, config.rounds + 1):
         steps = done = 0
+        taken = False
         for place, group in enumerate(groups):
             label = f"round {number}" + (f", group {place + 1} of {len(groups)}" if len(groups) > 1 else "")
             found = run_round(
@@ -302,6 +319,13 @@ def _repair_and_distil(
                 if row.accepted and row.frame_id not in kept
             ]
             steps += group.steps
+            taken = any(row.accepted for row in rows if row.round == number)
+            left = (config.rounds - number) * length
+            if place + 1 == len(groups) and not taken and left:
+                steps += left
+                reporter.info(
+                    f"{label}: no candidate is taken; the {steps} steps left train without new ones"
+                )
             # Without either the scene stays as it is, and the next group gets the steps.
             if not (repairs or kept) or not steps:
                 continue
@@ -321,4 +345,20 @@ def _repair_and_distil(
             if trainings:
                 drop_state(trainings[-1])
             trainings.append(current.folder)
+        if not taken:
+            break
     return rows, trainings, current
+
+
+def _unchanged(context: StageContext[RivrConfig], supervision: Supervision, g0: TrainedScene) -> StageResult:
+    """Publish G0's scene as it is, which is all that a draft does."""
+    from cleargs.rivr.distillation import publish
+    from cleargs.rivr.sheets import write_candidates_sheet
+    from cleargs.rivr.tables import Selection, write_selection
+
+    context.reporter.info("RIVR: a draft makes no repairs; the scene is G0's, unchanged")
+    rows = [Selection.not_tried(frame_id, "not tried: a draft") for frame_id in supervision.views]
+    write_selection(context.out / "selection.parquet", rows)
+    publish(g0, [], context.out, None)
+    write_candidates_sheet(context.out / "candidates.png", [], context.out)
+    return StageResult(summary={"rounds": [], "published": "G0", "draft": True})

@@ -80,8 +80,9 @@ def test_every_artifact_is_there_to_inspect(finished: Path) -> None:
     selection = pq.read_table(finished / "rivr" / "selection.parquet").to_pylist()
     # One strong frame is held back from distillation to tell whether it did harm.
     targets = sum(frame["registered"] for frame in frames) - 1
-    assert len(selection) == 2 * targets
-    for row in selection:
+    tried = [row for row in selection if row["exr"] is not None]
+    assert len(tried) == 2 * targets
+    for row in tried:
         assert (finished / "rivr" / row["exr"]).is_file()
     for stage in ("g0", "rivr", "consolidate"):
         vertices = PlyData.read(finished / stage / "scene.ply")["vertex"]

@@ -113,7 +113,7 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     for row in read_selection(run / "rivr" / "selection.parquet"):
         stem = stems[row.frame_id]
         sharp = folder / f"{stem}.png"
-        if stem not in stops or not sharp.is_file():
+        if row.exr is None or stem not in stops or not sharp.is_file():
             continue
         truth = exposed(read_rgb_float(sharp), stops[stem])
         candidates = _candidates(run / "rivr" / row.exr, row.chosen)

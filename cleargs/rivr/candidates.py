@@ -30,6 +30,9 @@ NEGLIGIBLE = 0.15
 """Change by the repair, as a share of what the render leaves unexplained, below which there is nothing to
 repair. docs/experiments/rivr.md has the measurement."""
 
+EXPLAINED = "explained: "
+"""How the reason of a row begins whose frame the formation explains."""
+
 KEPT = "needs no repair"
 """The reason of a row whose raw frame is kept."""
 

@@ -23,6 +23,7 @@ from cleargs.models.scorer import Scorer
 from cleargs.progress import Reporter
 from cleargs.rivr.candidates import (
     CANDIDATES,
+    EXPLAINED,
     KEPT,
     CandidateChoice,
     Source,
@@ -34,19 +35,20 @@ from cleargs.rivr.candidates import (
 )
 from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
-from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
+from cleargs.rivr.tables import Selection, chosen_counts
 from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
 PREFIX = "cleargs:"
 """How the names of the attributes in the EXR begin."""
 
-_NULLABLE = tuple(field.name for field in SELECTION if field.nullable)
+_OPTIONAL = (
+    *("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px"),
+)
+"""Attributes that an EXR has only where its candidates do."""
 
 TRUSTED = 0.5
 """Weight from which a frame that the formation explains supervises by itself instead of by a repair."""
-EXPLAINED = "explained: "
-"""How the reason of such a frame begins."""
 
 
 @dataclass(frozen=True)
@@ -221,8 +223,9 @@ def read_row(out: Path, exr: str) -> Selection | None:
         attributes: dict[str, Any] = dict(read_exr(out / exr, PREFIX).attributes)
         values = {name.removeprefix(PREFIX): value for name, value in attributes.items()}
         frame_id, accepted = values.pop("frame"), bool(values.pop("accepted"))
-        absent: dict[str, Any] = dict.fromkeys(_NULLABLE)
-        return Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
+        absent: dict[str, Any] = dict.fromkeys(_OPTIONAL)
+        found = Selection(exr=exr, frame_id=frame_id, accepted=accepted, **(absent | values))
+        return None if found.primary_render is None else found
     except (StoreError, KeyError, TypeError):
         return None
 
@@ -241,8 +244,11 @@ def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView
     def mask() -> MaskBool | None:
         return target.load()[1]
 
+    assert row.exr is not None  # what is accepted has been made
+    exr = out / row.exr
+
     def load() -> tuple[ImageF32, MaskBool | None]:
-        return from_layer(read_exr(out / row.exr).layers[row.chosen]), mask()
+        return from_layer(read_exr(exr).layers[row.chosen]), mask()
 
     return replace(target, weight=1.0, kind="pseudo", load=load)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cleargs.media.contact_sheet import Tile, contact_sheet
-from cleargs.media.exr import from_layer, read_exr
+from cleargs.media.exr import from_layer
 from cleargs.media.image import write_rgb
 from cleargs.rivr.candidates import CANDIDATES
 from cleargs.rivr.distillation import TrainedScene, observation
@@ -44,7 +44,7 @@ def write_before_after_sheet(
             Tile(observation(view)[0], "observed"),
         ]
         if (row := repairs.get(view.frame_id)) is not None:
-            image = from_layer(read_exr(rivr / row.exr).layers[row.chosen])
+            image = from_layer(row.layers(rivr)[row.chosen])
             line.append(Tile(image, f"repair: {row.chosen}, round {row.round}"))
         elif repaired:
             line.append(Tile(None, "no repair"))
@@ -53,7 +53,7 @@ def write_before_after_sheet(
 
 
 def _candidates(row: Selection, rivr: Path) -> list[Tile]:
-    layers = read_exr(rivr / row.exr).layers
+    layers = row.layers(rivr)
     head = f"frame {row.frame_id}, round {row.round}: observed"
     if row.primary_observed is not None:
         head += f" {row.primary_observed:.1f} / {row.tiebreak_observed:.1f}"

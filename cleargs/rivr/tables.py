@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
 
 import pyarrow as pa
 
+from cleargs.media.exr import Layer, read_exr
 from cleargs.parquet import read_table, schema_of, write_table
 from cleargs.rivr.candidates import CANDIDATES, Chosen, Source
 from cleargs.rivr.gates import REFUSED
@@ -28,26 +29,52 @@ class Selection:
     round: Annotated[int, "from 1"]
     frame_id: Annotated[int, "target frame t"]
     exr: Annotated[
-        str, "layers render, restored, fused, observed, deblurred, explained; below the rivr folder"
+        str | None,
+        "layers render, restored, fused, observed, deblurred, explained; below the rivr folder; null where "
+        "the frame was not tried",
     ]
-    primary_metric: Annotated[str, _NAME]
-    primary_render: Annotated[float, pa.float32(), f"primary {_SCORE} the render R_t"]
-    primary_restored: Annotated[float, pa.float32(), f"primary {_SCORE} the restored observation D_t"]
+    primary_metric: Annotated[str | None, _NAME]
+    primary_render: Annotated[float | None, pa.float32(), f"primary {_SCORE} the render R_t"]
+    primary_restored: Annotated[float | None, pa.float32(), f"primary {_SCORE} the restored observation D_t"]
     primary_fused: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_FUSED}"]
     primary_observed: Annotated[float | None, pa.float32(), f"primary {_SCORE} {_OBSERVED}"]
     tiebreak_metric: Annotated[
-        str, f"{_NAME} among the candidates within rivr.margin of the best primary score"
+        str | None, f"{_NAME} among the candidates within rivr.margin of the best primary score"
     ]
-    tiebreak_render: Annotated[float, pa.float32(), f"tiebreak {_SCORE} the render R_t"]
-    tiebreak_restored: Annotated[float, pa.float32(), f"tiebreak {_SCORE} the restored observation D_t"]
+    tiebreak_render: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} the render R_t"]
+    tiebreak_restored: Annotated[
+        float | None, pa.float32(), f"tiebreak {_SCORE} the restored observation D_t"
+    ]
     tiebreak_fused: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_FUSED}"]
     tiebreak_observed: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_OBSERVED}"]
-    restored_from: Annotated[Source, "what the expert restored to D_t: observation, deblurred or render"]
+    restored_from: Annotated[
+        Source | None, "what the expert restored to D_t: observation, deblurred or render"
+    ]
     blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
     skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]
     chosen: Annotated[Chosen, "render, restored or fused; observed: the raw frame needs no repair"]
     accepted: Annotated[bool, "whether the chosen candidate became a pseudo observation"]
     reason: Annotated[str, "why it was chosen, or why there is no pseudo observation"]
+
+    def layers(self, rivr: Path) -> Mapping[str, Layer]:
+        """Return the layers of the frame's EXR, which is below the rivr folder.
+
+        Raises:
+            ValueError: The frame was not tried.
+            StoreError: The EXR is missing or damaged.
+        """
+        if self.exr is None:
+            raise ValueError(f"frame {self.frame_id} was not tried")
+        return read_exr(rivr / self.exr).layers
+
+    @classmethod
+    def not_tried(cls, frame_id: int, reason: str) -> Selection:
+        """Return the row of a frame that is kept as filmed without a candidate."""
+        rows: dict[str, Any] = dict.fromkeys(field.name for field in fields(cls))
+        return cls(
+            **rows
+            | {"round": 1, "frame_id": frame_id, "chosen": "observed", "accepted": False, "reason": reason}
+        )
 
 
 @dataclass(frozen=True)
@@ -107,6 +134,7 @@ def write_repairs(path: Path, repairs: list[Selection]) -> None:
 def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
     """What round ``number`` chose, for the manifest."""
     rows = [row for row in rows if row.round == number]
+    tried = [row for row in rows if row.exr is not None]
     refused = [row for row in rows if not row.accepted and row.chosen != "observed"]
     means = {
         f"{role}_{name}": fmean(scores)
@@ -116,12 +144,15 @@ def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
     }
     return {
         "round": number,
-        "chosen": chosen_counts(rows),
+        "tried": len(tried),
+        "chosen": chosen_counts(tried),
         "accepted": sum(row.accepted for row in rows),
         "refused": dict(Counter(row.reason for row in refused)),
         "repairs_refused": refused_repairs(rows),
         "tie_breaks": sum(row.reason.startswith("tie-break") for row in rows),
-        "scorers": {"primary": rows[0].primary_metric, "tiebreak": rows[0].tiebreak_metric},
+        "scorers": {name: getattr(tried[0], f"{name}_metric") for name in ("primary", "tiebreak")}
+        if tried
+        else {},
         "mean_scores": means,
     }
 

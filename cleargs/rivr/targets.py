@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import pyarrow as pa
 
@@ -18,8 +17,6 @@ from cleargs.formation.frames import view_of
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.views import TrainingView
-
-Targets: TypeAlias = Literal["all", "degraded"]
 
 
 @dataclass(frozen=True)
@@ -112,15 +109,10 @@ class Supervision:
         """The held-back frames."""
         return [self.views[frame_id] for frame_id in self.holdout_ids]
 
-    def targets(self, which: Targets) -> list[TrainingView]:
-        """The frames that every round repairs: ``all``, or those whose role is not ``strong``, but never the
-        held-back ones.
-        """
-        return [
-            self.views[frame.frame_id]
-            for frame in self.assessments
-            if frame.frame_id not in self.holdout_ids and (which == "all" or frame.role != "strong")
-        ]
+    @property
+    def candidates(self) -> list[FrameAssessment]:
+        """The frames that may be repaired: all except the held-out ones."""
+        return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
 
     def worst(self, frame_ids: Sequence[int], count: int) -> list[TrainingView]:
         """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""

@@ -34,6 +34,8 @@ def main(runs: list[Path]) -> None:
         }
         figures: dict[tuple[int, str], list[tuple[float, float]]] = defaultdict(list)
         for row in read_selection(run / "rivr" / "selection.parquet"):
+            if row.exr is None:
+                continue
             truth = np.float32(1 / 255) * read_rgb(truths[row.frame_id])
             images = {
                 name: from_layer(layer) for name, layer in read_exr(run / "rivr" / row.exr).layers.items()

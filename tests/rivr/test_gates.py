@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planted import FAULTS
-from tiny_capture import Capture, Contrast, Sharpen, tiny_rivr, write_capture
+from tiny_capture import Capture, Contrast, Sharpen, tiny_rivr, tried_rows, write_capture
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr.gates import GateConfig, all_masked, colour_differences, rejection_reason, shifts
 from cleargs.rivr.rounds import read_row
-from cleargs.rivr.tables import read_selection
 from cleargs.stages import rivr
 from cleargs.types import ImageF32
 
@@ -172,7 +171,7 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
         )
         (made,) = rivr.run(context).summary["rounds"]
         refused[share] = made["repairs_refused"]
-        rows = read_selection(context.out / "selection.parquet")
+        rows = tried_rows(context)
         assert all(row.accepted for row in rows)
         assert all("restored" in read_exr(context.out / row.exr).layers for row in rows)
         assert [read_row(context.out, row.exr) for row in rows] == rows

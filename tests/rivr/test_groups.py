@@ -17,10 +17,9 @@ from test_stages import (
     expert,
     make_capture,
 )
-from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_g0, tiny_rivr
+from tiny_capture import ROLES, Capture, Sharpen, tiny_consolidate, tiny_g0, tiny_rivr, tried_rows
 
 from cleargs.media.exr import read_exr
-from cleargs.rivr.tables import read_selection
 from cleargs.rivr.targets import trajectory_groups
 from cleargs.stages import consolidate, rivr
 
@@ -69,7 +68,7 @@ def logged(context: Any) -> dict[str, list[Any]]:
 def test_all_group_sizes_train_equally_long(capture: Capture, group: int | None) -> None:
     context = capture.context("rivr", tiny_rivr(group=group))
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert [(row.round, row.frame_id) for row in rows] == [(n, k) for n in (1, 2) for k in TARGETS]
     assert [logged(context)["round"].count(number) for number in (1, 2)] == [STEPS, STEPS]
 
@@ -116,7 +115,7 @@ def test_every_frame_is_a_target_and_nothing_is_judged(capture: Capture) -> None
     config = tiny_rivr(rounds=1, group=4, harm={"held_back": 0.0, "psnr_margin": 0.0, "score_margin": 0.0})
     context = capture.context("rivr", config, g0=wrecking)
     result = rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert [row.frame_id for row in rows] == list(range(len(ROLES)))
     assert result.summary["held_back"]["frames"] == []
     assert result.summary["held_back"]["psnr_after"] is None

@@ -20,9 +20,8 @@ def test_the_repairs_have_a_column_where_there_are_any(
 ) -> None:
     grey = np.full((32, 200, 3), 0.5, np.float32)
     monkeypatch.setattr(sheets, "observation", lambda view: (grey, None))
-    monkeypatch.setattr(sheets, "read_exr", lambda path: SimpleNamespace(layers={"restored": grey}))
     scene: Any = SimpleNamespace(render=lambda view: grey)
-    row = SimpleNamespace(exr="a.exr", chosen="restored", round=1)
+    row = SimpleNamespace(layers=lambda folder: {"restored": grey}, chosen="restored", round=1)
     views = [SimpleNamespace(frame_id=frame_id) for frame_id in (1, 2)]
     repairs = dict.fromkeys(repaired, cast(Any, row))
     write_before_after_sheet(tmp_path / "a.png", cast(Any, views), scene, scene, repairs, tmp_path)

@@ -24,6 +24,7 @@ from tiny_capture import (
     tiny_consolidate,
     tiny_g0,
     tiny_rivr,
+    tried_rows,
     write_capture,
 )
 
@@ -94,7 +95,7 @@ def test_every_round_repairs_every_target(capture: Capture, expert: Sharpen) -> 
 
     assert expert.calls == len(TARGETS)  # once a frame, not once a round
     assert pq.read_schema(context.out / "selection.parquet").names == SELECTION.names
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert [(row.round, row.frame_id) for row in rows] == [(n, k) for n in (1, 2) for k in TARGETS]
     assert all(row.accepted for row in rows)
     assert {row.primary_metric for row in rows} == {"contrast"}
@@ -135,7 +136,7 @@ def test_later_rounds_render_the_distilled_scene(capture: Capture) -> None:
 def test_degraded_targets_only(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(targets="degraded", rounds=1))
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
 
 
@@ -155,7 +156,7 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
     capture.use_good_scene()
     context = capture.context("rivr", tiny_rivr(undo_motion=True))
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     sharp = {row.frame_id for row in rows if row.restored_from == "observation"}
     # Every round renders, and so deblurs, anew; a frame that nothing explains is restored once as it is.
     assert expert.calls == sum(row.restored_from == "deblurred" for row in rows) + len(sharp)
@@ -180,7 +181,7 @@ def test_the_expert_sees_the_frame_without_its_motion(capture: Capture, expert: 
 def test_without_fusion_there_are_two_candidates(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(use_fused=False, rounds=1))
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert {row.chosen for row in rows} <= {"render", "restored"}
     assert {(row.primary_fused, row.tiebreak_fused) for row in rows} == {(None, None)}
     assert set(read_exr(context.out / rows[0].exr).layers) == {"render", "restored", "observed"}
@@ -225,7 +226,7 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     write_formation(capture.root / "g0" / "formation.parquet", formation, weights)
     context = capture.context("rivr", tiny_rivr(rounds=1, keep_raw=True))
     rivr.run(context)
-    rows = {row.frame_id: row for row in read_selection(context.out / "selection.parquet")}
+    rows = {row.frame_id: row for row in tried_rows(context)}
     assert (rows[blurred].chosen, rows[blurred].accepted) == ("observed", False)
     assert rows[blurred].reason == "explained: blur 6.0 px"
     layers = read_exr(context.out / rows[blurred].exr).layers
@@ -242,7 +243,7 @@ def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest
     capture.use_good_scene()
     context = capture.context("rivr", keeping(), g0=PLAIN)
     result = rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     kept = {(row.round, row.frame_id) for row in rows if row.chosen == "observed"}
     sharp = {k for k in TARGETS if ROLES[k] == "strong"}
     assert kept == {(n, k) for n in (1, 2) for k in sharp}
@@ -265,7 +266,7 @@ def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest
 def test_where_every_frame_is_kept_the_scene_trains_on_raw_frames(capture: Capture) -> None:
     first = capture.context("rivr", tiny_rivr(rounds=1))
     rivr.run(first)
-    rows = read_selection(first.out / "selection.parquet")
+    rows = tried_rows(first)
     rows = [dataclasses.replace(row, accepted=False, chosen="observed") for row in rows]
     write_selection(first.out / "selection.parquet", rows)
     context = capture.context("consolidate", tiny_consolidate())
@@ -279,7 +280,7 @@ def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) 
     """Kept raw after a repair: the repair is taken back; repaired after being kept: the repair counts."""
     context = capture.context("rivr", tiny_rivr())
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     raw = {(2, 1), (1, 4)}
     rows = [
         dataclasses.replace(row, accepted=False, chosen="observed")
@@ -297,7 +298,7 @@ def test_the_latest_round_decides_whether_a_frame_is_repaired(capture: Capture) 
 def test_the_papers_rule_scores_no_raw_frame(capture: Capture) -> None:
     context = capture.context("rivr", tiny_rivr(rounds=1))
     rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
+    rows = tried_rows(context)
     assert {(row.primary_observed, row.tiebreak_observed) for row in rows} == {(None, None)}
     assert "observed" not in {row.chosen for row in rows}
     assert all(row.accepted for row in rows)
@@ -317,7 +318,7 @@ def test_masked_pixels_do_not_reach_the_scores(
         monkeypatch.setattr(expert, "restore", ruin)
         context = capture.context("rivr", tiny_rivr(rounds=1, use_fused=False), run=run)
         rivr.run(context)
-        rows = read_selection(context.out / "selection.parquet")
+        rows = tried_rows(context)
         return next(row for row in rows if row.frame_id == MASKED_FRAME)
 
     untouched, masked, seen = scores("a", slice(0, 0)), scores("b", slice(0, 20)), scores("c", slice(20, 40))
@@ -347,7 +348,7 @@ def test_harm_keeps_the_better_scene(capture: Capture, stage: str) -> None:
 def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> None:
     first = capture.context("rivr", tiny_rivr())
     rivr.run(first)
-    rows = read_selection(first.out / "selection.parquet")
+    rows = tried_rows(first)
     refused = {(2, 1), (1, 4), (2, 4)}
     rows = [dataclasses.replace(row, accepted=(row.round, row.frame_id) not in refused) for row in rows]
     write_selection(first.out / "selection.parquet", rows)
@@ -366,20 +367,39 @@ def test_consolidation_takes_the_latest_accepted_repair(capture: Capture) -> Non
     assert result.summary["repairs"] == len(TARGETS) - 1
 
 
-def test_a_draft_repairs_only_what_is_not_sharp(capture: Capture) -> None:
-    context = capture.context("rivr", tiny_rivr(rounds=1), g0=tiny_g0(quality="draft"))
-    rivr.run(context)
-    rows = read_selection(context.out / "selection.parquet")
-    assert [row.frame_id for row in rows] == [k for k in TARGETS if ROLES[k] != "strong"]
-    assert tiny_rivr(targets="all").which_targets("draft") == "all"
+def test_a_draft_publishes_the_first_scene_unchanged(capture: Capture) -> None:
+    draft = tiny_g0(quality="draft")
+    first = capture.context("rivr", tiny_rivr(), g0=draft)
+    assert rivr.run(first).summary["published"] == "G0"
+    rows = read_selection(first.out / "selection.parquet")
+    assert [row.frame_id for row in rows] == list(range(len(ROLES)))
+    assert {(row.exr, row.chosen, row.reason) for row in rows} == {(None, "observed", "not tried: a draft")}
+    second = capture.context("consolidate", tiny_consolidate(), g0=draft)
+    assert consolidate.run(second).summary == {"repairs": 0, "published": "G0", "draft": True}
+    for context, stage in ((first, rivr), (second, consolidate)):
+        assert same_scene(context.out, capture.root / "g0")
+        assert set(stage.OUTPUTS) <= {path.name for path in context.out.iterdir()}
+
+
+def test_a_round_in_which_nothing_is_taken_ends_the_rounds(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its training takes the steps of the rounds that are left, on the raw frames."""
+    lines: list[str] = []
+    monkeypatch.setattr(SilentReporter, "info", lambda reporter, text: lines.append(text))
+    monkeypatch.setattr("cleargs.rivr.rounds.all_masked", lambda mask: "every pixel of the frame is masked")
+    context = capture.context("rivr", tiny_rivr(rounds=3, targets="auto"))
+    result = rivr.run(context)
+    assert [made["round"] for made in result.summary["rounds"]] == [1]
+    log = pq.read_table(context.out / "train.parquet").to_pydict()
+    assert len(log["frame_id"]) == 3 * 12 and set(log["kind"]) == {"real"}
+    assert any("no candidate is taken" in line for line in lines)
 
 
 def test_consolidation_without_repairs_is_g0_byte_for_byte(capture: Capture) -> None:
     first = capture.context("rivr", tiny_rivr(rounds=1))
     rivr.run(first)
-    rows = [
-        dataclasses.replace(row, accepted=False) for row in read_selection(first.out / "selection.parquet")
-    ]
+    rows = [dataclasses.replace(row, accepted=False) for row in tried_rows(first)]
     write_selection(first.out / "selection.parquet", rows)
 
     context = capture.context("consolidate", tiny_consolidate())

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from cleargs.formation.frame import FrameFormation
+from cleargs.rivr.need import frames_to_repair, rows_of_others
 from cleargs.rivr.targets import FrameAssessment, Supervision, select_holdout
 
 
@@ -30,11 +32,43 @@ def supervision() -> Supervision:
 
 
 def test_all_takes_every_frame_but_the_held_back() -> None:
-    assert supervision().targets("all") == [10, 11, 12, 14, 15]
+    assert frames_to_repair("all", supervision(), {}) == [10, 11, 12, 14, 15]
 
 
 def test_degraded_leaves_the_strong_ones_out() -> None:
-    assert supervision().targets("degraded") == [11, 12, 14, 15]
+    assert frames_to_repair("degraded", supervision(), {}) == [11, 12, 14, 15]
+
+
+def found(**misfits: float) -> dict[int, FrameFormation]:
+    """Formations of frames ``f10``, ``f11``, ... with these misfits, of which none has a model."""
+    return {int(name[1:]): FrameFormation(int(name[1:]), misfit=misfit) for name, misfit in misfits.items()}
+
+
+def test_auto_takes_what_formation_and_rva_leave_in_need() -> None:
+    """Frame 12 is suppressed, 14 reactivated without a model, 11 has three times the median misfit."""
+    formations = found(f10=0.01, f11=0.03, f13=0.01, f14=0.01, f15=0.01)
+    assert frames_to_repair("auto", supervision(), formations) == [11, 12, 14]
+    formations[14] = replace(formations[14], model="blur", blur_px=5.0)
+    assert frames_to_repair("auto", supervision(), formations) == [11, 12]
+
+
+def test_auto_tries_two_frames_at_least_and_a_sixteenth_of_many() -> None:
+    few = Supervision({}, appraised(["strong"] * 5), [])
+    formations = found(f10=0.012, f11=0.011, f12=0.013, f13=0.01, f14=0.01)
+    assert frames_to_repair("auto", few, formations) == [10, 12]
+    many = Supervision({}, appraised(["strong"] * 50), [])
+    assert len(frames_to_repair("auto", many, {})) == 4
+
+
+def test_every_frame_that_is_not_tried_says_why_it_is_kept() -> None:
+    formations = found(f10=0.01) | {11: FrameFormation(11, model="blur", blur_px=5.2)}
+    rows = {row.frame_id: row for row in rows_of_others([12, 14, 15], supervision(), formations)}
+    assert {frame_id: row.reason for frame_id, row in rows.items()} == {
+        10: "not tried: needs no repair",
+        11: "not tried: explained: blur 5.2 px",
+        13: "not tried: it measures harm",
+    }
+    assert all(row.exr is None and row.chosen == "observed" and not row.accepted for row in rows.values())
 
 
 @pytest.mark.parametrize(("strong", "expected"), [(1, 1), (7, 1), (8, 1), (16, 2), (23, 2), (24, 3)])

@@ -21,6 +21,7 @@ from cleargs.media.image import write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
+from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
@@ -124,12 +125,18 @@ def tiny_g0(**changes: Any) -> G0Config:
     return G0Config(**({"checkpoint_interval": 5} | changes))
 
 
+def tried_rows(context: StageContext[Any]) -> list[Selection]:
+    """The rows of the frames that a finished RIVR tried."""
+    return [row for row in read_selection(context.out / "selection.parquet") if row.exr is not None]
+
+
 def tiny_rivr(**changes: Any) -> RivrConfig:
     """Two rounds of a few steps, no margin of harm exceeded; the paper's rules: raw frames as they are, three
     candidates, and every target frame gets a pseudo observation.
     """
     settings: dict[str, Any] = {
         "rounds": 2,
+        "targets": "all",
         "undo_motion": False,
         "use_fused": True,
         "keep_raw": False,
