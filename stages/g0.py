@@ -59,6 +59,11 @@ class G0Config(TrainConfig):
     """Spread of the frames' gains from which ``auto`` is on: with a fixed exposure it stays below."""
 
 
+def effective(config: G0Config, sections: Mapping[str, Any]) -> G0Config:
+    """Return the settings with the end of the schedule: in a draft nothing follows."""
+    return config.model_copy(update={"end": 1.0}) if config.quality == "draft" else config
+
+
 VERSION = 25
 CONFIG = G0Config
 SETTINGS: tuple[str, ...] = ()

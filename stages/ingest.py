@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field, field_validator
 
@@ -50,6 +51,21 @@ class IngestConfig(SfmConfig, CaptureConfig):
         if not value.strip(" ,"):
             raise ValueError("expected none, every:N, sharpest:N or a list of frame names")
         return value
+
+
+DRAFT_FRAMES, DRAFT_SIZE = 60, 640
+"""Most frames of a draft, and their longest side, px."""
+
+
+def effective(config: IngestConfig, sections: Mapping[str, Any]) -> IngestConfig:
+    """Return the settings within the limits of a draft, where the run is one."""
+    if getattr(sections.get("g0"), "quality", None) != "draft":
+        return config
+    limits = {
+        "max_frames": min(config.max_frames, DRAFT_FRAMES),
+        "max_size": min(config.max_size, DRAFT_SIZE),
+    }
+    return config.model_copy(update=limits)
 
 
 VERSION = 8

@@ -247,3 +247,27 @@ def test_a_folder_without_a_model_is_said_before_any_work(tmp_path: Path) -> Non
     assert isinstance(config, RvaConfig)
     with pytest.raises(InputError, match="holds no Qwen3-VL model"):
         check_evaluator(config)
+
+
+def test_a_draft_limits_the_capture_and_trains_g0_to_its_end() -> None:
+    """What the user has set is kept for a later run of another quality."""
+    config = load_config(installed(), overrides=["g0.quality=draft", "ingest.max_frames=200"])
+    asked: Any = config.sections
+    used: Any = config.effective
+    assert (asked["ingest"].max_frames, asked["ingest"].max_size) == (200, 960)
+    assert (used["ingest"].max_frames, used["ingest"].max_size) == (60, 640)
+    assert asked["g0"].end < 1.0 and used["g0"].end == 1.0
+    smaller: Any = load_config(installed(), "smoke", ["g0.quality=draft"]).effective
+    assert (smaller["ingest"].max_frames, smaller["ingest"].max_size) == (24, 480)
+
+
+@pytest.mark.parametrize("quality", ["standard", "high"])
+def test_other_qualities_share_their_ingest(quality: str) -> None:
+    config = load_config(installed(), overrides=[f"g0.quality={quality}"])
+    assert config.effective == config.sections
+
+
+@pytest.mark.parametrize("recipe", ["paper", "paper-open", "smoke"])
+def test_these_recipes_try_every_frame(recipe: str) -> None:
+    sections: Any = load_config(installed(), recipe).sections
+    assert sections["rivr"].targets == "all"

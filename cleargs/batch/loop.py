@@ -113,7 +113,7 @@ class Batch:
                 with opened_store(run.store) as store:
                     check_same_input(run, self.dag, store)
                 for stage in self.dag.until(self.until)[1:]:  # the first one's files are the capture
-                    self.dag.load(stage).externals(run.config.sections[stage], run.source)
+                    self.dag.load(stage).externals(run.config.effective[stage], run.source)
             except InputError as error:
                 problems.append(f"{scene.where}: {error}; {error.hint}")
         if problems:

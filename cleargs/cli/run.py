@@ -47,7 +47,7 @@ PICTURES = ("before_after.png", "candidates.png")
 Examples:
   cleargs run video.mp4 -o room
   cleargs run photos/ -o room --workflow smoke            does it work at all, in a minute
-  cleargs run photos/ -o room --quality draft             a look; then the same with --quality standard
+  cleargs run photos/ -o room --quality draft             a look; --quality standard starts again from ingest
   cleargs run photos/ -o room --set ingest.max_frames=60 --set rva.tau_R=0.7
   cleargs run photos/ -o room --dry-run                   what would be done, why, and the cost
   cleargs run photos/ -o room --until rva                 stop before training

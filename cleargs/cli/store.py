@@ -82,7 +82,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
 def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
     """What differs between the files outside the store that a stage was made from, and those there now."""
     stage = manifest.stage
-    for role, place in dag.load(stage).externals(run.config.sections[stage], run.source).items():
+    for role, place in dag.load(stage).externals(run.config.effective[stage], run.source).items():
         before = manifest.origins.get(role)
         if before is None:
             continue  # the stage was made with other settings, which `cleargs status` tells

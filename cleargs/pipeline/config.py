@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
+from cleargs.pipeline.stage import Stage
 from cleargs.safe_io import FAULTS, cause, read_text
 
 RECIPES = "cleargs.workflows"
@@ -35,6 +36,8 @@ class Config:
     seed: int
     sections: Mapping[str, BaseModel]
     """Stage -> its settings, defaults filled in."""
+    effective: Mapping[str, BaseModel]
+    """The same as the settings of other stages change them: what a stage is run with and what its key holds."""
 
     def document(self) -> Document:
         """The full configuration as TOML holds it (settings that are None are left out)."""
@@ -157,7 +160,13 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
             sections[name] = model.model_validate(document.get(name, {}), context=sections)
         except ValidationError as error:
             raise _setting_error(name, models, error) from error
-    return Config(seed, sections)
+    return Config(seed, sections, {name: _effective(dag.load(name), name, sections) for name in sections})
+
+
+def _effective(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> BaseModel:
+    """Return the settings of a stage as those of other stages change them."""
+    changed: BaseModel = getattr(stage, "effective", lambda config, others: config)(sections[name], sections)
+    return changed
 
 
 def _setting_error(

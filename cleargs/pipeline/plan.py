@@ -92,14 +92,14 @@ class Planner:
         With ``rehash`` every external is read, whatever the memo says of it. Raises InputError when one (the
         capture, a model) cannot be read.
         """
-        stage, config = self.dag.load(name), self.run.config.sections[name]
+        stage, config = self.dag.load(name), self.run.config.effective[name]
         inputs, origins = self.inputs(name, done)
         digests = self.external_digests(name, rehash=rehash)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
             version=stage.VERSION,
-            config=stage_key_config(stage, name, self.run.config.sections),
+            config=stage_key_config(stage, name, self.run.config.effective),
             inputs=inputs,
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
@@ -128,7 +128,7 @@ class Planner:
         return inputs, origins
 
     def _externals(self, name: str) -> Mapping[str, External]:
-        return self.dag.load(name).externals(self.run.config.sections[name], self.run.source)
+        return self.dag.load(name).externals(self.run.config.effective[name], self.run.source)
 
     def external_digests(self, name: str, *, rehash: bool = False) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest of what ``name`` reads outside the store.
@@ -200,8 +200,8 @@ class Planner:
     def context(self, name: str, inputs: Mapping[str, Path], work: WorkFolder) -> StageContext[Any]:
         """All that the stage ``name`` is told."""
         return StageContext(
-            config=self.run.config.sections[name],
-            settings={other: self.run.config.sections[other] for other in self.dag.load(name).SETTINGS},
+            config=self.run.config.effective[name],
+            settings={other: self.run.config.effective[other] for other in self.dag.load(name).SETTINGS},
             source=self.run.source,
             inputs=inputs,
             externals=self._externals(name),
@@ -236,7 +236,7 @@ class Planner:
         return parts.model_copy(
             update={
                 "config": _known(
-                    stage_key_config(self.dag.load(name), name, self.run.config.sections), parts.config
+                    stage_key_config(self.dag.load(name), name, self.run.config.effective), parts.config
                 ),
                 "seed": self.run.config.seed,
                 "inputs": _known(self.inputs(name, shown)[0], parts.inputs),

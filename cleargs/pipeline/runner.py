@@ -74,7 +74,7 @@ class Runner:
         plans = self.planner.plan(until, forced)
         for plan in plans:
             if plan.state != "done":
-                self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
+                self.dag.load(plan.stage).preflight(self.run.config.effective[plan.stage])
         check_disk(plans, self.store.root)
         plans = self.planner.at_measured_pace(plans)
         for line in (*redo_lines(plans), cost_line(plans)):
@@ -286,7 +286,7 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
     first = dag.names[0]
     made = last_shown(run.folder, first)
     if made is not None:
-        externals = dag.load(first).externals(run.config.sections[first], run.source)
+        externals = dag.load(first).externals(run.config.effective[first], run.source)
         now = {role: tree_digest(store.memo.digests_of(place)) for role, place in externals.items()}
         if now == dict(made.parts.externals):
             return

@@ -92,7 +92,8 @@ class Stage(Protocol):
     Whatever else such a try left there is thrown away."""
     LIBRARIES: tuple[str, ...]
     """Distributions whose version changes results; their versions enter the key. A stage may also have a
-    function ``other_libraries(device)``: name -> version of what computes on that device only."""
+    function ``other_libraries(device)``: name -> version of what computes on that device only. And it may
+    have a function ``effective(config, sections)``: its settings as those of other stages change them."""
 
     def externals(self, config: Any, source: Path) -> Mapping[str, External]:
         """Role -> files outside the store whose content enters the key (capture, model weights)."""
