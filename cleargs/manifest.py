@@ -78,6 +78,8 @@ class Manifest(FrozenModel):
     started: str
     """UTC, ISO 8601."""
     seconds: float
+    compile_seconds: float = 0.0
+    """Spent on compiling kernels, which a machine does once; no part of ``seconds``."""
     cpu_seconds: float | None = None
     """Processor time of all threads and child processes; None where an earlier version did the work."""
     peak_memory_gb: float | None = None

@@ -43,6 +43,10 @@ class Reporter(Protocol):
         """Something the user should look at, although the work continues."""
 
 
+COMPILING = "compiling kernels, once on this machine"
+"""Label of a task that a machine does once: its seconds are no part of a stage's."""
+
+
 class Rate:
     """Steps a second, of the last seconds: where steps grow longer, the mean of all would flatter."""
 

@@ -30,7 +30,7 @@ class FinalDistilConfig(DistilConfig):
 
 
 class ConsolidateConfig(Settings):
-    """Full-Trajectory Repair Consolidation. When its scene is rejected, [rivr.harm] says."""
+    """Full-Trajectory Repair Consolidation. The limits for its scene are in [rivr.harm]."""
 
     RETIRED: ClassVar[Mapping[str, Any]] = {"harm": Inherited("rivr")}
 
@@ -61,7 +61,7 @@ LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
-    """The scorer's model file, whose content enters the key; none for one of another package."""
+    """Return the scorer's model file, whose content enters the key; none for one of another package."""
     from cleargs.models.registry import model_file
 
     path = model_file(config.scorer, "scorer")
@@ -69,14 +69,18 @@ def externals(config: ConsolidateConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: ConsolidateConfig) -> None:
-    """The scorer: raises InputError for one that is not installed, damaged or of another form."""
+    """Load the scorer.
+
+    Raises:
+        InputError: It is not installed, damaged or of another form.
+    """
     from cleargs.models.scorer import load_scorer
 
     load_scorer(config.scorer)
 
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
-    """The training, and two looks at the frames that are held back."""
+    """Return the cost of the training."""
     from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace
@@ -94,7 +98,7 @@ def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
 
 
 def run(context: StageContext[ConsolidateConfig]) -> StageResult:
-    """Latest accepted repairs -> distillation from RIVR's scene -> the check for harm."""
+    """Distil the latest accepted repairs from RIVR's scene and check for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
     from cleargs.rivr.distillation import TrainedScene, publish

@@ -77,22 +77,23 @@ LIBRARIES = ("torch", "numba", "numpy", "scipy", "opencv-contrib-python-headless
 
 
 def other_libraries(device: Device) -> Mapping[str, str]:
-    """What else computes on ``device``."""
+    """Return further libraries that compute on ``device``."""
     return {"triton": installed_version("triton")} if device == "cuda" else {}
 
 
 def externals(config: G0Config, source: Path) -> Mapping[str, Path]:
-    """Nothing outside the store."""
+    """Return no file: all inputs are in the store."""
     return {}
 
 
 def preflight(config: G0Config) -> None:
-    """It needs no model."""
+    """Check nothing: no model is needed."""
 
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
-    """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
-    buffers.
+    """Return steps times a cost per pixel and per Gaussian.
+
+    The memory is that of the images, the Gaussians and the buffers of the kernels.
     """
     from cleargs.splat.budget import training_cost
 
@@ -109,7 +110,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
 
 
 def run(context: StageContext[G0Config]) -> StageResult:
-    """Sparse points -> Gaussians -> trained on the active frames, each with its RVA weight."""
+    """Make Gaussians of the sparse points and train them on the active frames with their RVA weights."""
     from cleargs.capture.tables import load_frames, load_observations, load_points
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
@@ -190,7 +191,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
 def _exposure(
     config: G0Config, views: list[TrainingView], sparse: SparsePoints
 ) -> tuple[Exposure | None, float]:
-    """Affines to learn, or None; and the measured spread of the frames' gains."""
+    """Return affines to learn, or None, and the spread of the frames' gains."""
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
 
     gains = frame_gains(views, sparse)
@@ -201,6 +202,6 @@ def _exposure(
 
 
 def _mean(values: list[float]) -> float | None:
-    """Of the finite ones: a frame of which no pixel counts has an infinite PSNR."""
+    """Return the mean of the finite values; a frame without a pixel that counts has an infinite PSNR."""
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None

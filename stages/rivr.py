@@ -1,4 +1,4 @@
-"""RIVR: render, restore, fuse, select and distil, round after round along the trajectory."""
+"""RIVR: render, restore, fuse, select and distil in rounds along the trajectory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class RoundsConfig(DistilConfig):
 class RivrConfig(Settings):
     """Render-Guided In-Video Restoration."""
 
-    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="times that every target frame is repaired")
+    rounds: int = Field(2, ge=1, le=MAX_ROUNDS, description="rounds in which every target frame is repaired")
     targets: Literal["auto", "all", "degraded"] = Field(
         "auto",
         description="frames to repair: all registered training frames, or those that are not strong; auto = "
@@ -52,7 +52,7 @@ class RivrConfig(Settings):
     expert: str = Field(
         "embedded",
         description="restoration expert: embedded, a name of `cleargs models list`, an ONNX file, or one "
-        "that another package brings",
+        "of another package",
         json_schema_extra={"key": False, "plugin": "experts"},  # its content is in the key
     )
     primary_scorer: str = Field(
@@ -96,15 +96,21 @@ class RivrConfig(Settings):
         description="a third candidate, the render with the detail of what was restored; true: the paper's. "
         "With undo_motion the restored frame has the render's detail already, and would have it twice",
     )
-    gate: GateConfig = Field(GateConfig(), description="when a repair is refused")
+    gate: GateConfig = Field(GateConfig(), description="limits beyond which a repair is refused")
     distil: RoundsConfig = Field(RoundsConfig(), description="distillation of each round")
-    harm: HarmConfig = Field(HarmConfig(), description="when the distilled scene is rejected for G0")
+    harm: HarmConfig = Field(
+        HarmConfig(), description="limits beyond which the distilled scene is rejected for G0"
+    )
 
     def distillation(self, g0: TrainConfig, round: int, done: int, steps: int, frames: int) -> TrainConfig:
-        """A training of ``steps`` steps in round ``round`` (from 1), ``done`` of whose steps lie behind, with
-        its part of the schedule.
+        """Return the settings of a training with its part of the schedule.
 
-        frames: active ones, on which the steps of a round rest where they are unset.
+        Args:
+            g0: Settings of the first scene.
+            round: Round, from 1.
+            done: Steps of the round before this training.
+            steps: Steps of this training.
+            frames: Active frames, from which the steps of a round follow where they are unset.
         """
         whole = self.distil.applied_to(g0, frames)
         step = (whole.end - whole.begin) / (self.rounds * whole.length)
@@ -129,7 +135,7 @@ LIBRARIES = REPAIR_LIBRARIES
 
 
 def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
-    """The model files, whose content enters the key (the version of what other packages bring does)."""
+    """Return the model files, whose content enters the key; of other packages the version does."""
     from cleargs.models.registry import model_file
 
     files = {
@@ -141,8 +147,10 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 
 def preflight(config: RivrConfig) -> None:
-    """The expert and the scorers: raises InputError for one that is not installed, damaged or of another
-    form.
+    """Load the expert and the scorers.
+
+    Raises:
+        InputError: One is not installed, damaged or of another form.
     """
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
@@ -153,8 +161,10 @@ def preflight(config: RivrConfig) -> None:
 
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
-    """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
-    one), making and scoring candidates 2 s (two cores). Every group leaves a scene.
+    """Return the cost of the candidates and of the distillations.
+
+    On two cores undoing motion takes about 3 s per megapixel, restoring 1 s (40 s with another expert than
+    the embedded one), making and scoring candidates 2 s. Every group leaves a scene.
     """
     from cleargs.splat.budget import training_cost
 
@@ -195,9 +205,7 @@ def _expected_targets(context: StageContext[RivrConfig], frames: int) -> int:
 
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
-    """Candidates -> scores -> choice -> distillation, for every group of every round; then the check for
-    harm.
-    """
+    """Make, score, choose and distil candidates, group by group and round by round; check for harm."""
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
@@ -243,7 +251,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     if 2 * (refused := refused_repairs(rows)) > made:
         reporter.warn(
             f"{refused} of {made} repairs by {expert.name} were refused: they agree with neither the "
-            "raw frame nor the render (candidates.png shows some); the renders stand in for them"
+            "raw frame nor the render (candidates.png shows some); the renders replace them"
         )
 
     before = g0.fidelity(supervision.holdout_views, rules.primary, threads)

@@ -80,9 +80,9 @@ quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
     callback=_quality,
-    help="The cost of a run: draft is a look at no more than 60 frames of 640 px, without repairs; standard is "
-    "for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets that a recipe "
-    "names stay.  [default: standard]",
+    help="The cost of a run: draft is a look at no more than 60 frames of 640 px, without repairs; standard "
+    "is for publishing; high takes four times its steps and twice its Gaussians. Steps and budgets that a "
+    "recipe names stay.  [default: standard]",
 )
 
 

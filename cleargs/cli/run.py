@@ -287,6 +287,8 @@ def _times(outcomes: Sequence[StageOutcome]) -> str:
     if made:
         stages = ", ".join(f"{outcome.stage} {duration(outcome.manifest.seconds)}" for outcome in made)
         words.append(f"{duration(sum(outcome.manifest.seconds for outcome in made))} ({stages})")
+        if (compiling := sum(outcome.manifest.compile_seconds for outcome in made)) >= 1.0:
+            words.append(f"{duration(compiling)} for compiling kernels, once on this machine")
     if found:
         words.append(f"already there: {', '.join(found)}")
     return "; ".join(words)

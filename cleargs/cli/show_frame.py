@@ -18,9 +18,11 @@ from cleargs.report.frames import (
     MEANINGS,
     FrameRow,
     camera_of,
+    formed_layers,
     last_scene,
     layers_of,
     load_rows,
+    scene_with_models,
     scores_of,
 )
 from cleargs.rivr.gates import REFUSED
@@ -188,7 +190,7 @@ def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow)
 
     They are the frame as filmed, those of the latest round's EXR, and the last scene at the frame.
     """
-    images = layers_of(row, run)
+    images = {**layers_of(row, run), **formed_layers(row, run, scene_with_models([row], run, stages))}
     scene = last_scene(stages)
     if scene is not None and row.frame.registered:
         images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
@@ -240,6 +242,8 @@ def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple
         yield f"round {found.round}", f"{CHOICES[found.chosen]}{refused} ({found.reason})"
         for metric, scores in scores_of(found):
             yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
+        if found.restored_from is None:
+            continue
         moved = found.blur_px is not None
         motion = f": blur {found.blur_px:.1f} px, skew {found.skew_px:.1f} px" if moved else ""
         yield "", f"restored from {SOURCES[found.restored_from]}{motion}"

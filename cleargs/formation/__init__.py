@@ -1,4 +1,4 @@
-"""What a camera does to a sharp image (colour, motion blur, rolling shutter, defocus); finding the numbers.
+"""Image formation: colour, motion blur, rolling shutter and defocus, and the search for their numbers.
 
 A raw frame is compared with the render *as its camera saw it*:
 

@@ -1,8 +1,11 @@
 """The formation of every frame of a capture, found while a scene is trained on them.
 
-A frame's formation is estimated again each time the frame has been drawn so often
-(`FormationConfig.every`), in the light of the scene as it is then: blurred frames have taught it some of
-their blur, and the sharper it becomes the more of their motion shows.
+A frame is looked at again after every `FormationConfig.every` steps on it. Its motion is then refined with
+the scene of that time. A test of a few milliseconds (`pretest`) says if blur is left that
+nothing explains; only then the frame is searched. Sharp frames are therefore tested and not searched. The
+sharper the scene becomes, the more of their blur the test finds.
+
+Later trainings continue with the formations of the first one, and count on.
 """
 
 from __future__ import annotations
@@ -28,21 +31,22 @@ from cleargs.splat.types import group
 from cleargs.splat.views import TrainingView
 
 ROLLING = 0.015
-"""Share of the misfit that a rolling shutter must explain beyond all else, in half of a capture's frames:
-docs/formation.md."""
+"""Share of the misfit that a rolling shutter must explain in addition to all else, in half of a capture's
+frames. Source: measurements in docs/formation.md."""
 ROLLING_START = 0.1
-"""Share of the schedule from which frames are tested for it. A scene learns to look like skewed frames, and
-where few frames see a place it hides a skew before `FormationConfig.start`: docs/experiments/formation.md."""
+"""Share of the schedule from which frames are tested for a rolling shutter. A scene learns to look like
+skewed frames. At a place that few frames see, it hides a skew before `FormationConfig.start`
+(docs/experiments/formation.md)."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
-"""Frames that must have been tested before a rolling shutter is believed, and most that are tested; between
-these, half of the capture's frames are."""
+"""Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
+are tested."""
 
 
 def rolls(frames: Iterable[FrameFormation]) -> bool:
-    """Whether the capture's shutter rolls, by what its frames say together.
+    """Return True if the capture's shutter rolls, by the skews of all frames together.
 
-    A camera's shutter rolls in every frame or in none, but a single skew can absorb what the geometry or
-    the pose of one frame has wrong.
+    A camera's shutter rolls in every frame or in none. A single skew can also absorb an error of one frame's
+    pose or geometry.
     """
     gains = [frame.skew_gain for frame in frames if frame.skew_gain is not None]
     return len(gains) >= MIN_TESTED_FRAMES and median(gains) > ROLLING
@@ -71,7 +75,15 @@ class CaptureFormation:
         lr_exposure: float = 0.0,
         known: Mapping[int, FrameFormation] | None = None,
     ) -> None:
-        """``exposure`` None: no colour affines. ``known``: what an earlier training found."""
+        """Begin with what is known of the frames.
+
+        Args:
+            views: Views of the training.
+            config: Settings.
+            exposure: Colour affines to begin with; None for a training without any.
+            lr_exposure: Learning rate of the affines.
+            known: Formations that an earlier training has found, by frame_id.
+        """
         weighted = [view for view in views if view.weight > 0.0]
         self._config = config
         self._affines = None if exposure is None else _affines(exposure, weighted, lr_exposure)
@@ -88,16 +100,16 @@ class CaptureFormation:
 
     @property
     def frames(self) -> dict[int, FrameFormation]:
-        """What is known of the raw frames, by frame_id."""
+        """Formations of the raw frames, by frame_id."""
         return dict(self._frames)
 
     def weight(self, frame_id: int) -> float:
-        """The weight of a raw frame in the training: RVA's, or what it has earned where that is more.
+        """Return the weight of a raw frame in the training: RVA's, or what it has earned if that is more.
 
             w = max(w_RVA, trust),  trust = min(1, rho / misfit)^p
 
-        rho is the median misfit of the frames, each counted with its w_RVA, and p is `FormationConfig.trust`:
-        a frame that its model explains as well as reliable frames are explained teaches like one of them.
+        rho is the median misfit of the frames, each counted with its w_RVA, and p is `FormationConfig.trust`.
+        A frame that its model explains as well as reliable frames are explained has the weight of one.
         """
         prior, frame = self._weights[frame_id], self._frames[frame_id]
         if frame.model == "none" or frame.misfit <= 0.0:
@@ -121,7 +133,7 @@ class CaptureFormation:
         affine = None if affines is None else affines.affine(frame_id)
 
         def explained() -> FrameFormation:
-            """How the frame was taken, in the light of the scene as it is."""
+            """Return the frame's formation, estimated with the present scene."""
             frame = self._frames[frame_id]
             return fit_motion(
                 frame,
@@ -172,7 +184,7 @@ class CaptureFormation:
         )
 
     def digest(self) -> str:
-        """A digest of the settings and of what it starts from."""
+        """Return a digest of the settings and of the formations at the start."""
         digest = hashlib.sha256(self._config.model_dump_json().encode())
         for name, tensor in sorted(self.state().items()):
             digest.update(name.encode())
@@ -180,7 +192,7 @@ class CaptureFormation:
         return digest.hexdigest()
 
     def state(self) -> dict[str, Tensor]:
-        """The numbers of all frames, and the affines with their moments."""
+        """Return the numbers of all frames, and the affines with their moments."""
         state = {"frames": torch.from_numpy(packed(self._frames.values()))}
         if self._affines is not None:
             for name, array in self._affines.arrays().items():
@@ -195,7 +207,7 @@ class CaptureFormation:
             self._affines.restore({name: tensor.numpy() for name, tensor in affines.items()})
 
     def fault(self) -> str | None:
-        """What in it is not finite; None where all is."""
+        """Return the name of what is not finite; None if all numbers are."""
         if self._affines is not None and not np.isfinite(self._affines.affines).all():
             return "exposure is not finite"
         return None
@@ -205,13 +217,13 @@ class CaptureFormation:
 
 
 def _tested_frames(count: int) -> list[int]:
-    """Which of ``count`` frames in a row are tested for a rolling shutter: evenly spread."""
+    """Return the indices, evenly spread, of the frames that are tested for a rolling shutter."""
     tested = min(count, max(MIN_TESTED_FRAMES, min(MAX_TESTED_FRAMES, count // 2)))
     return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
 def _affines(exposure: Exposure, views: Sequence[TrainingView], rate: float) -> AffineOptimiser:
-    """Affines for every frame given or seen; the median counts the weights of the real views."""
+    """Return affines for all frames; the median counts the weights of the real views."""
     frame_ids = np.union1d(exposure.frame_ids, [view.frame_id for view in views]).astype(np.int32)
     weights: NDArray[np.float64] = np.zeros(len(frame_ids))
     for view in views:

@@ -1,7 +1,7 @@
-"""How well numbers of a motion explain a raw frame: the comparison of frame and render at one size.
+"""Comparison of a raw frame and a render under a motion, at one size.
 
 The difference of high-passed luminance in linear light counts. A quarter of the pixels, in blocks, takes no
-part in a fit: they judge which model explains the frame.
+part in a fit. These pixels decide which model explains the frame.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from cleargs.types import ArrayF32, ArrayF64, MaskBool
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
 NEAR_SIZE = 1.5
-"""An image that is larger than a level by less is that level itself."""
+"""An image that is larger than a level by less than this factor takes the place of that level."""
 
 FINE, COARSE = samples(13), samples(9)
 """Sample times of an exposure."""
 DISC = samples(32)
 
 HIGH_PASS = 6.0
-"""Standard deviation in pixels of the Gaussian whose blur is taken from both images: what differs slowly, as
-light does, says nothing of motion."""
+"""Standard deviation, px, of the Gaussian whose blur is subtracted from both images. Slow differences, as
+those of light are, contain no motion."""
 
 OUTLIER, LIMIT = 0.03, 0.1
-"""Differences of linear light from which they count linearly, and no further."""
+"""Differences of linear light: from the first on they count linearly, from the second on no further."""
 
 MIN_MISFIT = 5e-4
-"""Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
+"""Misfit, in linear light, below which there is nothing to explain: the error of rounding to eight bits."""
 
 HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
-"""Side in pixels of the blocks of which every fourth judges."""
+"""Side, px, of the blocks, of which every fourth is held out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +64,12 @@ class FramePair:
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """A model of a frame, and how well it explains it."""
+    """A model of a frame with the misfit that it leaves."""
 
     model: Model
     motion: FrameMotion
     misfit: float
-    """Mean difference that remains on the judging pixels, each at most `LIMIT`."""
+    """Mean difference that remains on the held-out pixels, each at most `LIMIT`."""
     misfit_still: float
     """The same without any motion."""
 
@@ -80,12 +80,12 @@ class MotionFit:
 
 
 def explained_share(misfit: float, misfit_still: float) -> float:
-    """Share of ``misfit_still`` that is gone in ``misfit``; 0 where there was next to nothing."""
+    """Return the share of ``misfit_still`` that is gone in ``misfit``; 0 where there was almost nothing."""
     return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
 def luminance(image: ArrayF32) -> ArrayF32:
-    """Linear luminance [H, W] of an sRGB image."""
+    """Return the linear luminance [H, W] of an sRGB image."""
     kr, kb = LUMA["bt709"]
     # einsum, not BLAS, whose order of summation may depend on its threads.
     weights = np.array([kr, 1.0 - kr - kb, kb], np.float32)
@@ -93,7 +93,7 @@ def luminance(image: ArrayF32) -> ArrayF32:
 
 
 def scales(pair: FramePair) -> list[float]:
-    """The sizes at which a frame is compared, as shares of its own, the coarsest first."""
+    """Return the sizes at which a frame is compared, as shares of its size, the coarsest first."""
     longest = max(pair.observed.shape)
     sizes = [size for size, _ in LEVELS if size < longest] or [longest]
     if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
@@ -104,7 +104,7 @@ def scales(pair: FramePair) -> list[float]:
 
 
 class SearchKernels(Protocol):
-    """Kernels that a search for a frame's motion runs; the CPU's back end has them, others may be passed."""
+    """Kernels that a search for a frame's motion runs. The CPU's back end has them; others may be passed."""
 
     def misfit(
         self,
@@ -139,6 +139,13 @@ class Level:
     """The problem at one size."""
 
     def __init__(self, pair: FramePair, scale: float, kernels: SearchKernels = cpu) -> None:
+        """Reduce both images.
+
+        Args:
+            pair: The frame and the render.
+            scale: Size of this level over that of the frame.
+            kernels: Back end that computes misfits and normal equations.
+        """
         self._kernels = kernels
         margin = pair.margin
         height, width = pair.luminance.shape
@@ -148,7 +155,7 @@ class Level:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
         inner = np.s_[margin : height - margin, margin : width - margin]
-        # Beyond the frame's border the render stands in, so that both are high-passed alike there.
+        # Outside the frame the render replaces it, so that both are high-passed alike at the border.
         observed, weight = pair.luminance.copy(), np.zeros_like(pair.luminance)
         observed[inner], weight[inner] = pair.observed, pair.weight
         self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
@@ -163,7 +170,7 @@ class Level:
         rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
         self._down = (rows / pair.camera.height - 0.5).astype(np.float32)
 
-    # Only a fit needs these: the misfit without any motion is had without them.
+    # Only a fit needs the next properties. The misfit without any motion is computed without them.
 
     @cached_property
     def median(self) -> float:
@@ -197,7 +204,7 @@ class Level:
         return total / self._total
 
     def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
-        """Return how well a motion explains the pixels that take no part in a fit."""
+        """Return the misfit of a motion on the held-out pixels."""
         misfit = self._still
         if model != "none":
             times = DISC if model == "defocus" else FINE
@@ -205,7 +212,7 @@ class Level:
         return MotionFit(model, motion, misfit, self._still)
 
     def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
-        """What is left on the pixels that fit."""
+        """Return the sum of the differences on the pixels that fit."""
         return self._misfit(motion, times, self._fitting)
 
     def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
@@ -213,7 +220,7 @@ class Level:
         return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
     def fields(self, motion: FrameMotion) -> tuple[ArrayF32, ArrayF32, ArrayF32]:
-        """Offset, sweep and radius: see `DisplacementFields`."""
+        """Return offset, sweep and radius: see `DisplacementFields`."""
 
         def flow(twist: ArrayF64) -> ArrayF32:
             if not twist.any():
@@ -231,7 +238,7 @@ class Level:
         return offset, flow(motion.blur), radius
 
     def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
-        """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
+        """Return matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         offset, sweep, _ = self.fields(motion)
         return self._kernels.normal_equations(
             self._stack,
@@ -248,7 +255,7 @@ class Level:
 
 
 def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
-    """True in every fourth block, no two of which share a side: bool [H, W]."""
+    """Return a mask [H, W] of every fourth block, no two of which share a side."""
     row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
     return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
 

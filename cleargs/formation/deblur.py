@@ -13,22 +13,25 @@ from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.types import ArrayF32
 
 PRIOR = 0.1
-"""Variance of what the model of the exposure leaves unexplained, relative to that of the render's error. What
-the exposure lets through with more than this share of its power is the raw frame's, the rest the render's."""
+"""Variance of the part that the model of the exposure leaves unexplained, over that of the render's error.
+Frequencies that the exposure passes with more than this share of their power come from the raw frame, the
+others from the render."""
 
 OUTLIER = 0.15
-"""Difference in sRGB between raw frame and exposed render from which a pixel counts less: what moved."""
+"""Difference in sRGB between raw frame and exposed render from which a pixel counts less, since it shows a
+thing that moved."""
 
 STEPS = 10
 """Steps of the solver; fifty more change the image by less than 1/255 on average."""
 
 MIN_LINEAR = 0.002
-"""Linear light below which sRGB counts as steep as here."""
+"""Linear light below which the slope of sRGB is taken as here."""
 
 
 def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -> ArrayF32:
-    """The image that looks like ``observed`` under the frame's formation B, and like ``render`` where that
-    leaves it open.
+    """Return the sharp image that explains ``observed`` under the frame's formation B.
+
+    It is that of ``render`` where B leaves it undetermined:
 
         argmin_X  |s (B X - O)|^2 + PRIOR |s (X - R)|^2
 
@@ -39,8 +42,10 @@ def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -
         render: R, [H, W, 3] sRGB in [0, 1], larger than the frame by the warp's margin on every side.
         observed: O, [H, W, 3] sRGB in [0, 1].
         weight: [H, W], 0 where a pixel of ``observed`` does not count.
+        warp: B and its transpose.
 
-    Returns [H, W, 3] sRGB in [0, 1], of the frame's size.
+    Returns:
+        [H, W, 3] sRGB in [0, 1], of the frame's size.
     """
     start, target = padded(linear_from_srgb(render)), padded(linear_from_srgb(observed))
     forward, transpose = _on_arrays(warp.forward, warp), _on_arrays(warp.transpose, warp)
@@ -54,7 +59,7 @@ def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -
     seen = _slope(start)
 
     def normal(change: ArrayF32) -> ArrayF32:
-        """The normal equations of the change in sRGB: dark and bright parts then converge alike."""
+        """Apply the normal equations of the change in sRGB: dark and bright parts then converge alike."""
         return transpose(data * forward(change / seen)) / seen + np.float32(PRIOR) * change
 
     change = _conjugate_gradients(normal, transpose(data * left) / seen)
@@ -64,7 +69,7 @@ def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -
 
 
 def _on_arrays(operator: Callable[[Tensor], Tensor], warp: Warp) -> Callable[[ArrayF32], ArrayF32]:
-    """Half of a warp, wherever its fields lie, as the solver on the CPU calls it."""
+    """Return one direction of a warp as a function of arrays, on whatever device its fields are."""
 
     def called(image: ArrayF32) -> ArrayF32:
         return np.asarray(operator(torch.from_numpy(image).to(warp.samples.device)).cpu())
@@ -93,6 +98,6 @@ def _power(a: ArrayF32, b: ArrayF32) -> float:
 
 
 def _slope(linear: ArrayF32) -> ArrayF32:
-    """The slope of sRGB over linear light."""
+    """Return the slope of sRGB over linear light."""
     light = np.maximum(linear, MIN_LINEAR)
     return np.asarray(np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * light ** (1 / 2.4 - 1)), np.float32)

@@ -1,4 +1,4 @@
-"""Exposure compensation: one affine on sRGB per frame, learned beside the scene where a capture needs it.
+"""Exposure compensation: one affine on sRGB per frame, learned with the scene where a capture needs it.
 
 The affines start from the gains that the sparse points show. Their median, weighted as the frames are, stays
 the identity: scene and affines cannot drift apart together, and a few badly exposed frames do not make the
@@ -40,14 +40,17 @@ class Exposure:
 
     @classmethod
     def identity(cls, frame_ids: Sequence[int]) -> Exposure:
-        """Exposure that changes nothing yet, for these frames."""
+        """Return the exposure that changes nothing, for these frames."""
         unique = np.unique(np.asarray(frame_ids, np.int32))
         return cls(unique, np.tile(IDENTITY, (len(unique), 1, 1)))
 
     @classmethod
     def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
-        """Exposure that brightens each of these distinct frames by its gain (NaN: not at all) over the median
-        one.
+        """Return the exposure that brightens each frame by its gain over the median gain.
+
+        Args:
+            frame_ids: Distinct frames.
+            gains: [F]; NaN for a frame that is not changed.
         """
         known = gains[np.isfinite(gains)]
         relative = gains / np.median(known) if len(known) else gains
@@ -57,18 +60,19 @@ class Exposure:
 
     @property
     def enabled(self) -> bool:
-        """Whether any affine differs from the identity."""
+        """True if any affine differs from the identity."""
         return bool((self.affines != IDENTITY).any())
 
     def of(self, frame_id: int) -> NDArray[np.float64]:
-        """The affine [3, 4] of a frame; the identity where it has none."""
+        """Return the affine [3, 4] of a frame; the identity where it has none."""
         index = np.flatnonzero(self.frame_ids == frame_id)
         return self.affines[index[0]] if len(index) else IDENTITY
 
 
 def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The affines [F, 3, 4] shifted so that the (lower) median of each entry, weighted by ``weights`` [F], is
-    the identity's.
+    """Shift the affines [F, 3, 4] so that the median of each entry is that of the identity.
+
+    It is the lower median, weighted by ``weights`` [F].
     """
     total = weights.sum()
     if total <= 0.0:
@@ -80,10 +84,10 @@ def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArr
 
 
 def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[np.float64]:
-    """How much brighter than average each view shows the sparse points: gains [V], NaN where unknown.
+    """Return the gain of each view, its brightness over the average: [V], NaN where unknown.
 
-    The median, over the points that a view observes, of its pixel at the point's projection over the point's
-    own colour (sums of sRGB).
+    It is the median, over the sparse points that a view observes, of the view's pixel at the projection of
+    the point over the colour of the point (sums of sRGB).
     """
     gains = np.full(len(views), np.nan)
     for index, (view, seen) in enumerate(zip(views, sparse.observed, strict=True)):
@@ -109,7 +113,7 @@ def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[
 
 
 def gain_spread(gains: NDArray[np.float64]) -> float:
-    """Standard deviation of the log gains that are known (0.05: about 5 %); 0 with fewer than two."""
+    """Return the standard deviation of the known log gains (0.05: about 5 %); 0 with fewer than two."""
     known = np.log(np.maximum(gains[np.isfinite(gains)], 1e-3))
     return float(known.std()) if len(known) > 1 else 0.0
 
@@ -121,16 +125,27 @@ def write_exposure(path: Path, exposure: Exposure) -> None:
 
 
 def read_exposure(path: Path) -> Exposure:
-    """Read ``exposure.parquet``. Raises StoreError when it is missing or damaged."""
+    """Read ``exposure.parquet``.
+
+    Raises:
+        StoreError: The file is missing or damaged.
+    """
     table = read_table(path, EXPOSURE)
     affines = np.stack([table.column(name).to_numpy() for name in EXPOSURE.names[1:]], axis=1)
     return Exposure(table.column("frame_id").to_numpy(), affines.reshape(-1, 3, 4))
 
 
 class AffineOptimiser:
-    """Learns the affines; only the frame just seen moves, and the weighted median stays the identity."""
+    """Adam on the affines. Only the frame just seen moves, and the weighted median stays the identity."""
 
     def __init__(self, exposure: Exposure, weights: NDArray[np.float64], rate: float) -> None:
+        """Begin at ``exposure``.
+
+        Args:
+            exposure: Affines of all frames.
+            weights: Weights of the frames in the median, [F].
+            rate: Learning rate.
+        """
         self.frame_ids = exposure.frame_ids
         self.affines = centred(exposure.affines, weights)
         self.first = np.zeros_like(self.affines)
@@ -142,11 +157,11 @@ class AffineOptimiser:
 
     @property
     def exposure(self) -> Exposure:
-        """A snapshot of what is learned."""
+        """A copy of the present affines."""
         return Exposure(self.frame_ids.copy(), self.affines.copy())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that changes, by name, for a checkpoint."""
+        """Return all numbers that change, by name, for a checkpoint."""
         return {"affines": self.affines, "first": self.first, "second": self.second, "steps": self.steps}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -155,11 +170,11 @@ class AffineOptimiser:
         self.second, self.steps = arrays["second"], arrays["steps"]
 
     def affine(self, frame_id: int) -> Tensor:
-        """The affine of a frame [3, 4] float32."""
+        """Return the affine of a frame, [3, 4] float32."""
         return torch.from_numpy(self.affines[self._index[frame_id]].astype(np.float32))
 
     def step(self, frame_id: int, gradient: NDArray[np.float64]) -> None:
-        """One Adam step of a frame's affine along ``gradient`` [3, 4]."""
+        """Do one step of Adam on a frame's affine, along ``gradient`` [3, 4]."""
         i = self._index[frame_id]
         self.steps[i] += 1
         self.first[i] += 0.1 * (gradient - self.first[i])
@@ -171,7 +186,7 @@ class AffineOptimiser:
 
 
 def apply_affine(image: Tensor, affine: Tensor) -> Tensor:
-    """The image [H, W, 3] with every pixel mapped by ``affine`` [3, 4] (matrix and offset), float32."""
+    """Return the image [H, W, 3] with every pixel mapped by ``affine`` [3, 4], float32."""
     return backend_for(image.device).apply_affine(image, affine)
 
 

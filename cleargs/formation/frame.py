@@ -1,4 +1,4 @@
-"""How one frame was taken: what is known of it, and estimating it again in the light of a scene."""
+"""Formation of one frame, and its estimation with a scene."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ MARGIN_SHARE = 0.25
 
 LENS = ("disc_px", "focus", "median_depth")
 MEASURED = ("misfit", "misfit_still", "blur_px", "skew_px", "defocus_px", "reach_px")
-"""Numbers of a frame's motion beyond its twists, and of the frame, as checkpoints and tables hold them."""
+"""Numbers of a frame's motion in addition to its twists, and of the frame, in checkpoints and tables."""
 TWISTS, AXES = ("pose", "blur", "skew"), ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class FrameFormation:
-    """What is known of how one frame was taken."""
+    """The formation of one frame, as far as it is known."""
 
     frame_id: int
     motion: FrameMotion = field(default_factory=FrameMotion)
@@ -63,7 +63,7 @@ class FrameFormation:
     """Share of the misfit that a rolling shutter explains beyond blur and defocus, by the last search; None
     where none was made."""
     draws: int = 0
-    """Steps that were taken on the frame since its formation is looked for."""
+    """Steps on the frame since the first estimate of its formation."""
 
     @property
     def explained(self) -> float:
@@ -72,7 +72,7 @@ class FrameFormation:
 
 
 def described(frame: FrameFormation) -> str:
-    """In a few words: ``blur 5.2 px, skew 1.4 px``."""
+    """Return the formation in a few words: ``blur 5.2 px, skew 1.4 px``."""
     lengths = {"blur": frame.blur_px, "skew": frame.skew_px, "defocus": frame.defocus_px}
     parts = ("blur", "skew") if frame.model == "both" else (frame.model,)
     return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
@@ -93,19 +93,22 @@ def fit_motion(
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
-    A frame is searched only where the test of `pretest` finds blur that its present model does not explain,
-    or where it has to be asked for a rolling shutter. Otherwise what is known is refined.
+    A known formation is refined. The frame is searched only if the test of `pretest` finds blur that the
+    present model does not explain, or if a rolling shutter is asked for.
 
     Args:
-        frame: What is known already. Its model remains a candidate.
-        camera: Of the frame, reduced by ``factor``.
+        frame: The formation so far. Its model remains a candidate.
+        config: Settings.
+        camera: Camera of the frame, reduced by ``factor``.
         affine: The frame's colour, [3, 4].
         target: The frame, [H, W, 3] sRGB.
         mask: Its mask, [H, W].
+        render: Renders the scene with depth.
+        factor: Size of ``camera`` over that of the frame.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
     """
-    # What was found under the other belief about the shutter is searched again.
+    # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
     untested = rolling and _admitted(frame.model, rolling=False) and unmeasured
     margin = margin_for(frame.reach_px * factor, camera)
@@ -167,7 +170,7 @@ def _admitted(model: Model, rolling: bool) -> bool:
 
 
 def _skew_gain(found: list[MotionFit]) -> float:
-    """Share of the misfit that is left without a skew and goes with one."""
+    """Return the share of the misfit that remains without a skew and is gone with one."""
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
@@ -176,7 +179,7 @@ def _skew_gain(found: list[MotionFit]) -> float:
 def frame_pair(
     rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
 ) -> FramePair:
-    """What a search compares: masked pixels of the frame show the render."""
+    """Return the images that a search compares. Masked pixels of the frame show the render."""
     assert rendered.depth is not None
     image = rendered.image if affine is None else apply_affine(rendered.image, affine)
     shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
@@ -196,7 +199,7 @@ def frame_pair(
 def _described(
     frame: FrameFormation, best: MotionFit, factor: float, camera: Camera, rendered: Render, margin: int
 ) -> FrameFormation:
-    """The frame with a new explanation; lengths in pixels of the full image."""
+    """Return the frame with a new fit; lengths are in pixels of the full image."""
     if best.model == "none":
         return FrameFormation(
             frame.frame_id,
@@ -228,7 +231,7 @@ def _described(
 
 
 def reach_of(fields: DisplacementFields) -> float:
-    """See `FrameFormation.reach_px`."""
+    """Return the reach of the pixels, px: see `FrameFormation.reach_px`."""
     displacements = fields.offset.abs() + 0.5 * fields.sweep.abs() + fields.radius
     return float(np.quantile(displacements.amax(dim=0)[::4, ::4].cpu().numpy(), 0.95))
 
@@ -244,13 +247,13 @@ def _scaled(motion: FrameMotion, factor: float) -> FrameMotion:
 
 
 def margin_for(reach: float, camera: Camera) -> int:
-    """The margin that shows what moved in from beyond the border."""
+    """Return the margin, px, that shows the pixels which moved in from outside the border."""
     largest = int(MARGIN_SHARE * min(camera.width, camera.height)) // MARGIN_STEP * MARGIN_STEP
     return min(largest, MARGIN_STEP * math.ceil(reach / MARGIN_STEP)) if reach >= 0.5 else 0
 
 
 def as_row(frame: FrameFormation) -> dict[str, Any]:
-    """The frame by the names that ``formation.parquet`` gives to its numbers."""
+    """Return the numbers of the frame by their names in ``formation.parquet``."""
     motion = frame.motion
     row: dict[str, Any] = {name: getattr(frame, name) for name in ("frame_id", "model", "draws")}
     for name in TWISTS:
@@ -260,7 +263,7 @@ def as_row(frame: FrameFormation) -> dict[str, Any]:
 
 
 def from_row(row: Mapping[str, Any]) -> FrameFormation:
-    """The frame of which `as_row` gave this; without ``draws`` (an older table), as before the first one."""
+    """Return the frame of which `as_row` gave this row; an older table has no ``draws``."""
     vector = np.array([row[f"{name}_{axis}"] for name in TWISTS for axis in AXES])
     return FrameFormation(
         row["frame_id"],
@@ -272,7 +275,7 @@ def from_row(row: Mapping[str, Any]) -> FrameFormation:
 
 
 def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
-    """The frames for a checkpoint, [F, numbers of one]."""
+    """Return the frames for a checkpoint, [F, numbers of one]."""
     rows = []
     for frame in frames:
         gain = -1.0 if frame.skew_gain is None else frame.skew_gain
@@ -282,7 +285,7 @@ def packed(frames: Iterable[FrameFormation]) -> NDArray[np.float64]:
 
 
 def unpacked(numbers: NDArray[np.float64]) -> Iterator[FrameFormation]:
-    """The frames of which `packed` gave these numbers."""
+    """Yield the frames of which `packed` gave these numbers."""
     names = tuple(as_row(FrameFormation(0)))
     for row in (dict(zip(names, values, strict=True)) for values in numbers.tolist()):
         gain = None if row["skew_gain"] < 0.0 else row["skew_gain"]

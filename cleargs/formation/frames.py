@@ -17,7 +17,7 @@ from cleargs.types import AnyImage, MaskBool
 
 
 def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
-    """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
+    """Return the view of a registered frame, whose files are in ``folder`` (the ingest folder)."""
     quaternion = np.array([frame.qw, frame.qx, frame.qy, frame.qz], np.float64)
     translation = np.array([frame.tx, frame.ty, frame.tz], np.float64)
     if not frame.registered or np.isnan([*quaternion, *translation]).any():
@@ -36,7 +36,10 @@ def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
 
 
 def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:
-    """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
+    """Return views of the active frames, by frame_id: registered, not held out, weight above 0.
+
+    No image is decoded.
+    """
     active = [
         frame
         for frame in frames

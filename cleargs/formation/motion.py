@@ -1,4 +1,4 @@
-"""A frame's formation in numbers: how the camera moved and focused while the frame was taken."""
+"""The numbers of a frame's formation: motion and focus of the camera while it took the frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TWIST = 6
 """Numbers of a twist: translation by x, y, z, then rotation about them, in camera axes."""
 
 Model: TypeAlias = Literal["none", "blur", "skew", "both", "defocus"]
-"""What a frame is explained by; ``both`` is blur and skew."""
+"""Model that explains a frame; ``both`` is blur and skew."""
 
 MODELS: tuple[Model, ...] = ("none", "blur", "skew", "both", "defocus")
 
@@ -25,9 +25,10 @@ def _still() -> ArrayF64:
 
 @dataclass(frozen=True, eq=False)
 class FrameMotion:
-    """What happened while a frame was taken.
+    """Motion and focus of the camera while it took a frame.
 
-    Twists [6] say how the scene moved past the camera, in camera axes; the camera moved the other way.
+    Twists [6] give the motion of the scene past the camera, in camera axes; the camera
+    moved the other way.
     They are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
     """
 
@@ -49,13 +50,13 @@ class FrameMotion:
         return np.concatenate([self.pose, self.blur, self.skew])
 
     def with_vector(self, vector: ArrayF64) -> FrameMotion:
-        """This motion with another pose, blur and skew [18]."""
+        """Return this motion with another pose, blur and skew [18]."""
         pose, blur, skew = vector.reshape(3, TWIST)
         return replace(self, pose=pose, blur=blur, skew=skew)
 
 
 def widened(camera: Camera, margin: int) -> Camera:
-    """The camera with ``margin`` more pixels on every side."""
+    """Return the camera with ``margin`` more pixels on every side."""
     if margin == 0:
         return camera
     return replace(
@@ -71,10 +72,11 @@ def flow_basis(
     camera: Camera,
     nearness: ArrayF32,  # [H, W] median depth over depth
 ) -> ArrayF32:
-    """Where a pixel looks in the still image under each component of a twist of the scene past the camera:
-    [6, 2, H, W] pixels per unit. It is the flow that the same motion of the camera gives.
+    """Return the displacement of every pixel under each component of a twist, [6, 2, H, W] pixels per unit.
 
-    The camera may be larger than ``nearness``, in proportion.
+    The twist is of the scene past the camera. A displacement leads to the place in the still image that the
+    pixel sees. It is the flow that the same motion of the camera gives. The camera may be larger than
+    ``nearness``, in proportion.
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
     """
     height, width = nearness.shape

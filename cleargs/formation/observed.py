@@ -32,15 +32,15 @@ from cleargs.splat.types import Render
 from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
 ERROR_CELLS = 24
-"""Cells along the longer side of a frame. Over a cell, detail that is missing or lies a little beside its
-place cancels out; what does not belong to the scene does not."""
+"""Cells along the longer side of a frame. Over a cell, detail that is missing or a little out of place
+cancels out. A thing that does not belong to the scene does not."""
 
 MEDIAN_FACTOR = 5.0
-"""Multiple of the frame's median difference that is an ordinary one still: where all of a frame differs, as
-with an exposure that is not known yet, nothing moves."""
+"""Multiple of the frame's median difference up to which a difference is ordinary. In a frame that differs
+everywhere, as with an unknown exposure, nothing moves."""
 
 EPSILON = 1e-6
-"""Difference, and share of the pixels, that stands for none."""
+"""Difference, and share of the pixels, that replaces zero in a division."""
 
 
 def pixel_weights(
@@ -49,14 +49,12 @@ def pixel_weights(
     mask: Tensor | None,  # [H, W], True counts
     tolerance: float,
 ) -> Tensor:
-    """How much each pixel counts, [H, W] in (0, 1], of a frame taken as ``target``, which ``render`` must
-    explain.
+    """Return weights [H, W] in (0, 1] of the pixels of ``target``, which ``render`` must explain.
 
         w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
 
-    r is the difference of the mean colours of a cell, interpolated between the cells. Where it is below
-    rho, w is 1 to the bit. Differences, in sRGB of [0, 1], are pooled as in Sabour et al., "RobustNeRF"
-    (2023).
+    r is the difference of the mean colours of a cell, in sRGB of [0, 1], interpolated between the cells. If
+    it is below rho, w is exactly 1. Source of the pooling: Sabour et al., "RobustNeRF" (2023).
     """
     height, width = render.shape[:2]
     per_pixel = ERROR_CELLS / max(height, width)
@@ -74,8 +72,8 @@ def pixel_weights(
 class FormedView:
     """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    ``robust_mask`` says how much each pixel [H, W] of a photograph counts (see `pixel_weights`); None: all
-    alike.
+    ``robust_mask`` gives the weight of each pixel [H, W] of a photograph (see `pixel_weights`); None gives
+    all the same weight.
     """
 
     camera: Camera
@@ -88,6 +86,7 @@ class FormedView:
     robust_mask: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
+        """Widen the camera by the margin that the formation needs."""
         self._frame_camera = self.camera
         self._margin = 0
         if self.formation is not None:
@@ -96,6 +95,7 @@ class FormedView:
         self.needs_depth = self.formation is not None
 
     def forward(self, render: Render) -> Tensor:
+        """Return the photograph [H, W, 3] sRGB of a render at ``camera``."""
         image, device = render.image, render.image.device
         if self.affine is not None:
             self._rendered = render.image
@@ -109,7 +109,7 @@ class FormedView:
         return image
 
     def warp(self, render: Render) -> Warp:
-        """B of the frame, from a render at ``camera`` with depth."""
+        """Return B of the frame, from a render at ``camera`` with depth."""
         assert self.formation is not None and render.depth is not None
         fields = displacement_fields(
             self.formation.motion, self._frame_camera, render.depth, render.alpha, self._margin, self.factor
@@ -117,6 +117,7 @@ class FormedView:
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
+        """Return the gradient by the render's image, from that by the photograph."""
         if self.robust_mask is not None:
             gradient = gradient * self._counts[..., None]
         if self.formation is not None:
@@ -127,6 +128,7 @@ class FormedView:
         return gradient
 
     def learn(self) -> None:
+        """Step the colour affine along the gradient of the last `backward`."""
         if self.affines is not None:
             self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
 
@@ -139,10 +141,17 @@ def render_observed(
     *,
     engine: Rasteriser | None = None,
 ) -> Tensor:
-    """What ``scene`` shows at a view: [H, W, 3] sRGB in [0, 1], own memory.
+    """Render ``scene`` as the camera of a view records it.
 
-    Through the frame's colour affine where ``exposure`` is given, and through its motion and defocus where
-    ``formation`` is.
+    Args:
+        scene: The scene.
+        view: Its camera is used.
+        exposure: Colour affines; None leaves the colours as they are.
+        formation: Motion and defocus of the frame; None for a sharp render.
+        engine: Rasteriser of the scene's device.
+
+    Returns:
+        [H, W, 3] sRGB in [0, 1], in new memory.
     """
     engine = engine or rasteriser_for(str(scene.gaussians.device))
     affine = None if exposure is None else torch.from_numpy(exposure.of(view.frame_id).astype(np.float32))
@@ -153,17 +162,17 @@ def render_observed(
 
 
 class Fit(NamedTuple):
-    """How well a scene shows one view, PSNR in dB over the pixels that count."""
+    """PSNR of a scene on one view, dB, over the pixels that count."""
 
     psnr: float
     unseen: float | None
-    """Over those of the `unseen_pixels`; None where there are none."""
+    """PSNR over those that are `unseen_pixels`; None where there are none."""
 
 
 def pooled_unseen(fits: Iterable[Fit]) -> float | None:
-    """PSNR in dB of the pixels that no training saw, of all views together; None where there are none.
+    """Return the PSNR, dB, of the pixels that no training saw, of all views; None where there are none.
 
-    Their errors are averaged, not their PSNRs: a view has so few that some blocks show next to nothing.
+    Errors are averaged and not PSNRs, since some views have so little texture there that they would dominate.
     """
     errors = [10.0 ** (-0.1 * fit.unseen) for fit in fits if fit.unseen is not None]
     error = math.fsum(errors) / len(errors) if errors else 0.0
@@ -178,7 +187,7 @@ def evaluate_views(
     *,
     engine: Rasteriser | None = None,
 ) -> list[Fit]:
-    """How well the scene shows every view as photographed, in their order, at full size."""
+    """Compare the scene with every view as photographed, in their order, at full size."""
     engine = engine or rasteriser_for(str(scene.gaussians.device))
     images = ImageCache(0, scene.gaussians.device)
     formations = formations or {}

@@ -35,7 +35,7 @@ TILE = 32
 MIN_TILE = 4
 
 MIN_VARIANCE = 0.1
-"""Variance below which a blur is no evidence, px^2: that of a sweep of 1.1 px."""
+"""Variance below which a blur does not count as evidence, px^2: that of a sweep of 1.1 px."""
 
 _STILL, _ALL = 4, 7
 """Numbers of the fit without a blur, and of the whole fit."""
@@ -44,7 +44,7 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class BlurEvidence:
-    """How much blurrier than the render a photograph is. Lengths are in pixels of the photograph."""
+    """Blur that a photograph has and a render has not. Lengths are in pixels of the photograph."""
 
     line_gain: float
     """Share of the squared error on unseen tiles that a blur along one direction removes."""

@@ -1,7 +1,7 @@
-"""Finding what happened while a frame was taken: under which numbers the render looks like the raw frame.
+"""Search for the motion or the defocus under which the render looks like the raw frame.
 
-Motions by Levenberg-Marquardt with Huber weights, discs of defocus by a pattern search, both from coarse to
-fine.
+Motions are found by Levenberg-Marquardt with Huber weights, discs of defocus by a pattern search, both from
+coarse to fine.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ WARM_STEPS = 2
 
 LENGTHS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 DIRECTIONS = 8
-"""The blurs that a search begins with, in pixels of the coarsest level. It only goes downhill, and a long
-blur lies behind hills."""
+"""The blurs that a search without a start begins with, in pixels of the coarsest level. A descent only goes
+downhill, and a long blur may be behind a hill."""
 STARTS = 3
-"""The best of them are followed, and so is no motion."""
+"""Number of the best of them that are followed, in addition to no motion."""
 
 RADII = (1.0, 2.0, 3.0, 4.5, 7.0)
 """Mean radii of the discs that a search for defocus begins with, in pixels of the coarsest level."""
@@ -46,7 +46,8 @@ MODEL_PENALTY = 0.005
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
 DAMPING_FLOOR = 1e-4
-"""Damping of every direction, as a share of the stiffest: what the image does not show stays near zero."""
+"""Damping of every direction, as a share of the stiffest: a number that the image does not show stays near
+zero."""
 CONVERGED = 1e-3
 MAX_TRIES = 4
 
@@ -64,11 +65,18 @@ def search(
     pose: bool = False,
     kernels: SearchKernels = cpu,
 ) -> list[MotionFit]:
-    """Every model at its best, from scratch. The first is ``none``.
+    """Fit every model from scratch.
 
-    skew: whether models with a rolling shutter are tried too; without them it takes half the time.
-    pose: whether a correction of the pose is sought beside each motion.
-    kernels: the back end that computes misfits and normal equations.
+    Args:
+        pair: The frame and the render.
+        start: A motion whose blur the descent begins with; None for the best of a grid of blurs.
+        skew: Try models with a rolling shutter, which doubles the time.
+        defocus: Try a disc of defocus, which doubles the time.
+        pose: Correct the pose together with each motion.
+        kernels: Back end that computes misfits and normal equations.
+
+    Returns:
+        The fit of ``none`` first, then one of each model.
     """
     levels = [Level(pair, scale, kernels) for scale in scales(pair)]
     coarse = levels[0]
@@ -116,7 +124,7 @@ def refine(
 
 
 def preferred(found: list[MotionFit]) -> MotionFit:
-    """The model with the least misfit on the pixels that judge, simpler ones at a discount."""
+    """Return the model with the least misfit on the held-out pixels; each further motion has a price."""
     return min(found, key=lambda e: e.misfit * (1.0 + MODEL_PENALTY * _PARTS[e.model]))
 
 
@@ -128,7 +136,7 @@ def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
 
 
 def _best(level: Level, starts: list[FrameMotion], model: Model, steps: int, pose: bool) -> FrameMotion:
-    """The best end of the descents from ``starts``."""
+    """Return the best end of the descents from ``starts``."""
     parts = (POSE, *_ACTIVE[model]) if pose else _ACTIVE[model]
     active = np.concatenate([np.arange(3 * TWIST)[part] for part in parts])
     ends = [_descend(level, start, active, steps) for start in starts]
@@ -136,7 +144,7 @@ def _best(level: Level, starts: list[FrameMotion], model: Model, steps: int, pos
 
 
 def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
-    """The most promising of the rotations about the axes across the view, and none."""
+    """Return the best of a grid of rotations about the axes across the view, and no motion."""
     pixel = 1.0 / level.scale
     motions = [
         replace(still, blur=_rotation(length * pixel, math.pi * k / DIRECTIONS))
@@ -145,20 +153,27 @@ def _starts(level: Level, still: FrameMotion) -> list[FrameMotion]:
     ]
     costs = [level.cost(motion, COARSE) for motion in motions]
     first = [motions[k] for k in np.argsort(costs, kind="stable")[:STARTS]]
-    # Short: at none the slope by the blur vanishes, and the descent would stay there.
-    return [*first, replace(still, blur=_rotation(0.5 * pixel, 0.0)), still]
+    return [*first, _short(level, still), still]
 
 
 def _near(level: Level, still: FrameMotion, start: FrameMotion) -> list[FrameMotion]:
-    """``start``, a short blur of the same direction, and no motion."""
+    """Return ``start``, a short blur and no motion."""
     start = replace(start, median_depth=still.median_depth)
-    length = float(np.linalg.norm(start.blur))
-    short = replace(start, blur=start.blur * (0.5 / level.scale / length)) if length > 0.0 else None
-    return [motion for motion in (start, short, still) if motion is not None]
+    return [*([start] if start.blur.any() else []), _short(level, start), still]
+
+
+def _short(level: Level, motion: FrameMotion) -> FrameMotion:
+    """Return a short blur along that of ``motion``.
+
+    Without any blur the slope by the blur vanishes, and a descent would stay there.
+    """
+    length = float(np.linalg.norm(motion.blur))
+    blur = motion.blur / length if length > 0.0 else _rotation(1.0, 0.0)
+    return replace(motion, blur=0.5 / level.scale * blur)
 
 
 def _sharpest_disc(level: Level, still: FrameMotion) -> FrameMotion:
-    """The best of a grid of discs."""
+    """Return the best of a grid of discs."""
     low, middle, high = (float(q) for q in np.quantile(level.nearness, (0.05, 0.5, 0.95)))
     discs = []
     for focus in (0.0, low, middle, high, 2.0 * high):
@@ -169,7 +184,7 @@ def _sharpest_disc(level: Level, still: FrameMotion) -> FrameMotion:
 
 
 def _narrowed(level: Level, disc: FrameMotion) -> FrameMotion:
-    """The end of a pattern search around ``disc``."""
+    """Return the end of a pattern search around ``disc``."""
     best, cost = disc, level.cost(disc, DISC)
     span = float(np.ptp(np.quantile(level.nearness, (0.05, 0.95)))) + 0.1
     for step in NARROWING:
@@ -186,7 +201,7 @@ def _narrowed(level: Level, disc: FrameMotion) -> FrameMotion:
 
 
 def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps: int) -> FrameMotion:
-    """Levenberg-Marquardt over the ``active`` numbers from ``motion``."""
+    """Run Levenberg-Marquardt over the ``active`` numbers from ``motion``."""
     vector, cost, damping = motion.vector, level.cost(motion), DAMPING
     for _ in range(steps):
         matrix, side = level.normal_equations(motion, active)
@@ -211,10 +226,11 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
 
 
 def blur_along(length: float, angle: float) -> FrameMotion:
-    """Return a straight blur of ``length`` px along a direction of the image, by turns of the camera.
+    """Return a straight blur along a direction of the image, by turns of the camera.
 
     Args:
-        angle: From the x axis towards the y axis, radians.
+        length: Length of the pixels' paths, px.
+        angle: Direction from the x axis towards the y axis, radians.
     """
     return FrameMotion(blur=_rotation(length, math.pi - angle))
 

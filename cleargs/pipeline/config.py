@@ -37,7 +37,7 @@ class Config:
     sections: Mapping[str, BaseModel]
     """Stage -> its settings, defaults filled in."""
     effective: Mapping[str, BaseModel]
-    """The same as the settings of other stages change them: what a stage is run with and what its key holds."""
+    """The same as the settings of other stages change them: the stages run with these, and keys hold them."""
 
     def document(self) -> Document:
         """The full configuration as TOML holds it (settings that are None are left out)."""

@@ -17,7 +17,7 @@ from cleargs.base_model import FrozenModel
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.pipeline.store import writer_is_alive
-from cleargs.progress import PREVIEW, CountedTask, Reporter, Show, Task
+from cleargs.progress import COMPILING, PREVIEW, CountedTask, Reporter, Show, Task
 from cleargs.safe_io import FAULTS, read_json
 
 PROGRESS_FILE = ".at_work.json"
@@ -70,13 +70,13 @@ def preview_of(found: RunningStage, store: Path) -> Preview | None:
 
 
 @contextmanager
-def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[Reporter]:
+def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[RecordingReporter]:
     """A reporter that passes everything on to ``reporter`` and notes in ``run`` the progress of ``stage``.
 
     The note goes when the block ends.
     """
     try:
-        yield _RecordingReporter(
+        yield RecordingReporter(
             reporter, run / PROGRESS_FILE, RunningStage(stage=stage, work=work.name, label=stage)
         )
     finally:
@@ -84,13 +84,15 @@ def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> 
             (run / PROGRESS_FILE).unlink(missing_ok=True)
 
 
-class _RecordingReporter:
+class RecordingReporter:
     """Passes on, and notes the task that advanced last."""
 
     def __init__(self, reporter: Reporter, path: Path, first: RunningStage) -> None:
         self._reporter, self._path, self._first = reporter, path, first
         self.info, self.warn = reporter.info, reporter.warn
         self._write(first)
+        self.compile_seconds = 0.0
+        """Seconds in tasks called `COMPILING`."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
@@ -99,8 +101,11 @@ class _RecordingReporter:
                 now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
                 self._write(self._first.model_copy(update=now))
 
+        begun = time.monotonic()
         with self._reporter.task(label, total) as task:
             yield _RecordingTask(task, total, show)
+        if label == COMPILING:
+            self.compile_seconds += time.monotonic() - begun
 
     def _write(self, state: RunningStage) -> None:
         self._written = time.monotonic()

@@ -213,9 +213,10 @@ class Runner:
         except BaseException:  # an interruption too: what it had done counts when it resumes
             work.note_seconds(earlier + time.monotonic() - clock)
             raise
-        seconds = earlier + time.monotonic() - clock
+        seconds = earlier + time.monotonic() - clock - reporter.compile_seconds
         cost = {
             "seconds": round(seconds, 3),
+            "compile_seconds": round(reporter.compile_seconds, 3),
             "cpu_seconds": round(usage.cpu_seconds, 3),
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
         }

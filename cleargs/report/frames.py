@@ -20,9 +20,10 @@ from cleargs.capture.tables import Frame, load_frames
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
 from cleargs.formation.table import FORMATION
-from cleargs.media.exr import from_layer, read_exr
+from cleargs.media.exr import from_layer
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.parquet import read_any_table, read_table
+from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.camera import Camera
@@ -83,6 +84,11 @@ class FrameRow:
         return self.selection.chosen if kept else None
 
     @property
+    def modelled(self) -> bool:
+        """True where the last scene has a model of what the camera did to the frame."""
+        return self.formation.get("model", "none") != "none" and self.frame.registered
+
+    @property
     def gain_ev(self) -> float | None:
         """Exposure next to the scene's at middle grey, stops; None without compensation."""
         if self.affine is None:
@@ -97,10 +103,20 @@ class FrameRow:
         return found
 
 
+def scene_with_models(rows: Sequence[FrameRow], run: Path, stages: Collection[str]) -> TrainedScene | None:
+    """Return the last scene of ``run`` where it has a model of any of ``rows``, else None.
+
+    Raises:
+        StoreError: A file of the scene is damaged.
+    """
+    last = last_scene(stages)
+    return TrainedScene(run / last) if last and any(row.modelled for row in rows) else None
+
+
 def scores_of(selection: Selection) -> list[tuple[str, dict[str, float]]]:
     """Name of the scorer, and candidate -> score: of the one that decides, then of that for ties."""
     found = []
-    for use in ("primary", "tiebreak"):
+    for use in ("primary", "tiebreak") if selection.exr is not None else ():
         scores = {name: getattr(selection, f"{use}_{name}") for name in CHOICES}
         known = {name: score for name, score in scores.items() if score is not None}
         found.append((getattr(selection, f"{use}_metric"), known))
@@ -190,24 +206,34 @@ FramePictures = tuple[ImageFile, dict[str, ImageFile]]
 
 
 def write_pictures(
-    rows: Sequence[FrameRow], run: Path, report: Path, final: Viewer | None, threads: int
+    rows: Sequence[FrameRow],
+    run: Path,
+    report: Path,
+    final: Viewer | None,
+    scene: TrainedScene | None,
+    threads: int,
 ) -> dict[int, FramePictures]:
-    """Write all pictures below ``report``; ``final`` renders the last scene, where there is one."""
+    """Write all pictures below ``report``.
+
+    Args:
+        final: Renders the last scene, where there is one.
+        scene: The same scene with what its training found of the frames; None without a model of any.
+    """
     (report / FOLDER).mkdir(parents=True)
     placed = [row.frame.frame_id for row in rows if final and row.frame.registered]
     rendered = set(placed[:: -(-len(placed) // RENDERED) or 1])
-    layers = sum(5 if row.selection else 1 for row in rows) + len(rendered)
+    layers = sum(_expected_layers(row) for row in rows) + len(rendered)
     side = side_of(layers, rows[0].frame.height / rows[0].frame.width if rows else 1.0, BYTES)
     # Renders come one after the other, since each uses all threads; the files are read and written meanwhile.
     with ThreadPoolExecutor(threads) as pool:
         futures = {}
         for row in rows:
-            image = None
+            image, formed = None, formed_layers(row, run, scene, side)
             if final and row.frame.frame_id in rendered:
                 camera = camera_of(row.frame)
                 smaller = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
                 image = final.view(smaller, row.affine)
-            futures[row.frame.frame_id] = pool.submit(_write_frame, row, run, report, image, side)
+            futures[row.frame.frame_id] = pool.submit(_write_frame, row, run, report, image, formed, side)
         return {frame_id: future.result() for frame_id, future in futures.items()}
 
 
@@ -220,17 +246,53 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
 
 
+def formed_layers(
+    row: FrameRow, run: Path, scene: TrainedScene | None, side: int | None = None
+) -> dict[str, ImageU8]:
+    """Return the layers of a frame that no EXR holds, computed from its formation; none without a model.
+
+    Args:
+        scene: The last scene.
+        side: Longest side of the layers, px; None for the frame's.
+    """
+    tried = row.selection is not None and row.selection.exr is not None
+    if scene is None or tried or not row.modelled:
+        return {}
+    factor = 1.0 if side is None else min(1.0, side / max(row.frame.width, row.frame.height))
+    layers = scene.formed_layers(view_of(row.frame, run / "ingest", 1.0), factor)
+    return {name: to_uint8(image) for name, image in layers.items()}
+
+
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """The frame as filmed, and the other layers of its latest round. Raises InputError, StoreError."""
+    """Return the frame as filmed, and the other layers of its latest round.
+
+    Raises:
+        InputError: The frame cannot be read.
+        StoreError: Its EXR is damaged.
+    """
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
-    if row.selection is not None:
-        stored = read_exr(run / "rivr" / row.selection.exr).layers
+    if row.selection is not None and row.selection.exr is not None:
+        stored = row.selection.layers(run / "rivr")
         images |= {name: to_uint8(from_layer(layer)) for name, layer in stored.items() if name != "observed"}
     return images
 
 
-def _write_frame(row: FrameRow, run: Path, report: Path, final: ImageU8 | None, side: int) -> FramePictures:
-    images = layers_of(row, run)
+def _expected_layers(row: FrameRow) -> int:
+    """Return how many layers a frame has besides the final scene."""
+    if row.selection is not None and row.selection.exr is not None:
+        return 5
+    return 3 if row.modelled else 1
+
+
+def _write_frame(
+    row: FrameRow,
+    run: Path,
+    report: Path,
+    final: ImageU8 | None,
+    formed: Mapping[str, ImageU8],
+    side: int,
+) -> FramePictures:
+    images = {**layers_of(row, run), **formed}
     if final is not None:
         images["final"] = final
     name = f"{FOLDER}/{row.frame.frame_id:06d}"

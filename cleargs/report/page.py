@@ -36,6 +36,7 @@ from cleargs.report.frames import (
     ImageFile,
     camera_of,
     load_rows,
+    scene_with_models,
     scores_of,
     write_jpeg,
     write_pictures,
@@ -101,7 +102,8 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     trained = [stage for stage in SCENES if stage in manifests]
     with whole_folder(page_of(run).parent, replace=True) as folder:
         scenes, final = _scenes(folder, run, trained, placed) if trained and placed else ([], None)
-        pictures = write_pictures(rows, run, folder, final, planner.threads)
+        models = scene_with_models(rows, run, manifests)
+        pictures = write_pictures(rows, run, folder, final, models, planner.threads)
         viewer, times = viewer_data(placed, scenes) if scenes else (None, {})
         write_page(
             folder,
@@ -235,9 +237,9 @@ def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | No
         words = CHOICES[row.selection.chosen]
         repair = words if row.chosen else f"none: {words} was refused"
         scores = dict(scores_of(row.selection))
-        metric, deciding = scores_of(row.selection)[0]
-        found = ", ".join(f"{name} {score:.1f}" for name, score in deciding.items())
-        why = f"{row.selection.reason}; {metric}: {found}"
+        why = row.selection.reason
+        for metric, deciding in scores_of(row.selection)[:1]:
+            why += f"; {metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in deciding.items())
     fitted = {"blur, px": row.motion("blur_px"), "exposure, stops": row.gain_ev}
     return {
         "id": row.frame.frame_id,

@@ -1,0 +1,1 @@
+"""Render-guided in-video restoration: candidates, choice, gates and distillation."""

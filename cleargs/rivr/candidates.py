@@ -21,33 +21,36 @@ Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
 """A candidate, or the raw frame O_t, which needs none."""
 
 Source: TypeAlias = Literal["observation", "deblurred", "render"]
-"""What D_t was restored from: O_t, O_t without the camera's motion, or R_t."""
+"""Image from which D_t was restored: O_t, O_t without the camera's motion, or R_t."""
 
 CANDIDATES: tuple[CandidateName, ...] = ("render", "restored", "fused")
 """R_t, D_t and F_t; in a perfect tie the earlier one is chosen."""
 
 NEGLIGIBLE = 0.15
-"""Change by the repair, as a share of what the render leaves unexplained, below which there is nothing to
-repair. docs/experiments/rivr.md has the measurement."""
+"""Change by the repair, as a share of the error of the render, below which there is nothing to repair
+(docs/experiments/rivr.md)."""
 
 EXPLAINED = "explained: "
-"""How the reason of a row begins whose frame the formation explains."""
+"""Begin of the reason of a row whose frame the formation explains."""
 
 KEPT = "needs no repair"
 """The reason of a row whose raw frame is kept."""
 
 
 def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
-    """F = clip(R + D - blur_sigma(D)): the render's base with the restored image's fine detail.
+    """Return F = clip(R + D - blur_sigma(D)): the render's base with the restored image's fine detail.
 
-    sigma: standard deviation of the Gaussian in pixels; finer detail comes from ``restored``.
+    Args:
+        render: R.
+        restored: D.
+        sigma: Standard deviation of the Gaussian, px. Finer detail comes from ``restored``.
     """
     detail = restored - gaussian_blur(restored, sigma)  # float64
     return np.clip(render + detail, 0.0, 1.0).astype(np.float32)
 
 
 def gaussian_blur(image: ImageF32, sigma: float) -> NDArray[np.float64]:
-    """``image`` [H, W, 3] under a separable Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
+    """Blur ``image`` [H, W, 3] by a separable Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
     from scipy.ndimage import gaussian_filter
 
     radius = max(1, int(np.ceil(3.0 * sigma)))
@@ -57,7 +60,7 @@ def gaussian_blur(image: ImageF32, sigma: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CandidateChoice:
-    """The chosen candidate and why."""
+    """The chosen candidate and the reason."""
 
     chosen: CandidateName
     reason: str
@@ -66,11 +69,17 @@ class CandidateChoice:
 def choose(
     primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
 ) -> CandidateChoice:
-    """The candidate with the highest primary score, or the tie-break's favourite within ``margin`` of it.
+    """Choose the candidate with the highest primary score; the tie-break decides within ``margin``.
 
-    primary, tiebreak: score of each candidate, higher is better, on a scale of 0-100; both have the same
-    candidates. Equal tie-break scores: the higher primary score wins, then the order of `CANDIDATES`.
-    Raises ValueError when a score is not finite.
+    If tie-break scores are equal, the higher primary score wins, then the order of `CANDIDATES`.
+
+    Args:
+        primary: Score of each candidate, 0-100, higher is better.
+        tiebreak: The same by the tie-break scorer, for the same candidates.
+        margin: Difference of primary scores up to which the tie-break scorer decides.
+
+    Raises:
+        ValueError: A score is not finite.
     """
     if not np.isfinite([*primary.values(), *tiebreak.values()]).all():
         raise ValueError(f"scores must be finite: primary {dict(primary)}, tie-break {dict(tiebreak)}")
@@ -84,19 +93,22 @@ def choose(
 
 
 def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:
-    """Whether no candidate's score is above that of the raw frame by more than ``margin``."""
+    """Return True if no candidate's score exceeds that of the raw frame by more than ``margin``."""
     return max(candidates.values()) - raw <= margin
 
 
 def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:
-    """Whether the repair hardly changes the raw frame: |D - O|^2 < 0.15 |R - O|^2.
+    """Return True if the repair changes little of the raw frame: |D - O|^2 < 0.15 |R - O|^2.
 
-    A frame that is blurred or skewed differs from a good scene's render by just that, and its repair undoes
-    much of it. In a sharp frame what the render leaves unexplained is the scene's own error, and a repair
-    that follows it only carries it into the frame. Scores alone do not tell: sharpening raises them either
-    way.
+    A blurred or skewed frame differs from a good scene's render by the blur or the skew, and its repair
+    removes much of that. In a sharp frame the difference is an error of the scene, and a repair that follows
+    it only carries the error into the frame. Scores do not separate the two, since sharpening raises them in
+    both.
 
-    observed, restored, render: O_t, D_t and R_t [H, W, 3], equal where the frame is masked.
+    Args:
+        observed: O_t [H, W, 3].
+        restored: D_t, equal to O_t where the frame is masked.
+        render: R_t, likewise.
     """
     changed, unexplained = (
         float(np.square(image - observed, dtype=np.float64).sum()) for image in (restored, render)
@@ -105,9 +117,13 @@ def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF3
 
 
 def hide_masked(image: ImageF32, observed: ImageF32, mask: np.ndarray | None) -> ImageF32:
-    """``image`` with the observation in its masked pixels.
+    """Return ``image`` with the observation in its masked pixels.
 
-    All candidates then agree there, so that what is masked cannot decide between them.
-    mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
+    All candidates then agree there, so that masked pixels cannot decide between them.
+
+    Args:
+        image: A candidate [H, W, 3].
+        observed: O_t.
+        mask: [H, W], False where the frame is to be ignored; None if nothing is masked.
     """
     return image if mask is None else np.where(mask[..., None], image, observed)

@@ -1,4 +1,4 @@
-"""Joint distillation of raw frames and repairs into the scene, and what came of it."""
+"""Joint distillation of raw frames and repairs into the scene."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Literal
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import torch
@@ -45,12 +46,12 @@ CHECKPOINT = "checkpoint.safetensors"
 
 @dataclass(frozen=True, eq=False)
 class Deblurred:
-    """A raw frame without what its camera did to it."""
+    """A raw frame without its motion or defocus."""
 
     image: ImageF32
     """[H, W, 3] sRGB in [0, 1], at the frame's pose."""
     formation: FrameFormation
-    """What was undone."""
+    """The formation that was undone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +62,11 @@ class Explained:
     """The render as the frame's camera saw it, [H, W, 3] sRGB in [0, 1]."""
     formation: FrameFormation
     weight: float
-    """The frame's weight at the end of the training: RVA's, or what it has earned by being explained."""
+    """The frame's weight at the end of the training: RVA's, or the weight that it has earned."""
 
 
 def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
-    """O_t as float32 sRGB, and its mask."""
+    """Return O_t as float32 sRGB, and its mask."""
     pixels, mask = view.load()
     if pixels.dtype == np.uint8:
         return pixels.astype(np.float32) / np.float32(255.0), mask
@@ -73,8 +74,12 @@ def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
 
 
 class TrainedScene:
-    """A scene on disk (``scene.ply``, ``exposure.parquet`` and ``formation.parquet`` in ``folder``), ready to
-    be rendered. Raises StoreError without one of them.
+    """A scene on disk, ready to be rendered.
+
+    ``folder`` has ``scene.ply``, ``exposure.parquet`` and ``formation.parquet``.
+
+    Raises:
+        StoreError: One of them is missing or damaged.
     """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
@@ -88,44 +93,40 @@ class TrainedScene:
         self._engine = rasteriser_for(device)
 
     def render(self, view: TrainingView) -> ImageF32:
-        """R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
+        """Return R_t: the scene at a view, through the frame's exposure, [H, W, 3] sRGB in [0, 1]."""
         image: ImageF32 = render_observed(self.scene, view, self.exposure, engine=self._engine).cpu().numpy()
         return image
 
     def _render_observed(self, view: TrainingView) -> Tensor:
-        """The scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
+        """Return the scene as the camera of a raw frame saw it, [H, W, 3] sRGB in [0, 1]."""
         formation = self.formations.get(view.frame_id)
         return render_observed(self.scene, view, self.exposure, formation, engine=self._engine).cpu()
 
     def psnr_unseen(self, views: Sequence[TrainingView]) -> float | None:
-        """PSNR in dB of the pixels of ``views`` that no training saw; None where there are none."""
+        """Return the PSNR, dB, of the pixels of ``views`` that no training saw; None where there are none."""
         return pooled_unseen(
             evaluate_views(self.scene, views, self.exposure, self.formations, engine=self._engine)
         )
 
     def explained(self, view: TrainingView) -> Explained | None:
-        """What the training found of a raw frame's camera; None where that is nothing."""
+        """Return a raw frame as the training explains it; None without a model of the frame."""
         formation = self.formations.get(view.frame_id)
         if formation is None or formation.model == "none":
             return None
         return Explained(self._render_observed(view).numpy(), formation, self._weights[view.frame_id])
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
-        """The raw frame without what the camera did to it, found by comparing it with the scene; None where
-        nothing explains the frame better than the render as it is.
+        """Return the raw frame without its motion or defocus; None where nothing explains the frame.
+
+        A formation that the training has estimated is used as it is. That of a frame that the training has
+        not seen is estimated here.
         """
         observed, mask = observation(view)
-        affine = (
-            None
-            if self.exposure is None
-            else torch.from_numpy(self.exposure.of(view.frame_id).astype(np.float32))
-        )
-        known = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
-        found = (
-            known
-            if known.draws > 0
-            else fit_motion(
-                known,
+        affine = self._affine(view)
+        found = self.formations.get(view.frame_id, FrameFormation(view.frame_id))
+        if found.draws == 0:
+            found = fit_motion(
+                found,
                 FormationConfig(),
                 view.camera,
                 affine,
@@ -134,25 +135,45 @@ class TrainedScene:
                 self._with_depth,
                 rolling=rolls(self.formations.values()),
             )
-        )
         if found.model == "none":
             return None
         formed = FormedView(view.camera, 1.0, affine=affine, formation=found)
+        return Deblurred(_deblurred(formed, self._with_depth(formed.camera), observed, mask), found)
+
+    def formed_layers(self, view: TrainingView, factor: float = 1.0) -> dict[str, ImageF32]:
+        """Return a raw frame, reduced by ``factor``, without its motion and as the scene explains it.
+
+        They are called as in an EXR, ``deblurred`` and ``explained``. Without a model of the frame there are
+        none.
+        """
+        formation = self.formations.get(view.frame_id)
+        if formation is None or formation.model == "none":
+            return {}
+        observed, mask = observation(view)
+        camera = view.camera.scaled(factor)
+        if factor < 1.0:
+            size = camera.width, camera.height
+            observed = np.asarray(cv2.resize(observed, size, interpolation=cv2.INTER_AREA))
+            if mask is not None:
+                mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        formed = FormedView(camera, 1.0, affine=self._affine(view), formation=formation, factor=factor)
         render = self._with_depth(formed.camera)
-        warp = formed.warp(render)
-        shown = render.image if affine is None else apply_affine(render.image, affine)
-        weight = np.ones(observed.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
-        image = deblur(shown.clamp(0.0, 1.0).cpu().numpy(), observed, weight, warp)
-        return Deblurred(image, found)
+        explained = formed.forward(render).clamp(0.0, 1.0).cpu().numpy()
+        return {"deblurred": _deblurred(formed, render, observed, mask), "explained": explained}
+
+    def _affine(self, view: TrainingView) -> Tensor | None:
+        if self.exposure is None:
+            return None
+        return torch.from_numpy(self.exposure.of(view.frame_id).astype(np.float32))
 
     def _with_depth(self, camera: Camera) -> Render:
         return self._engine.view(self.scene, camera, depth=True)
 
     def fidelity(self, holdout: Sequence[TrainingView], scorer: Scorer, threads: int) -> Fidelity | None:
-        """How well the scene explains the held-back frames; None without any.
+        """Return the agreement of the scene with the held-out frames; None without any.
 
-        Raw frames may be blurred and skewed by the camera's motion. A sharp scene is not to be blamed for
-        that: what is compared with a frame is the render with that frame's motion.
+        Raw frames may be blurred and skewed by the camera's motion, and a sharp scene is not wrong because of
+        that. A frame is therefore compared with the render with that frame's motion.
         """
         values, scores = [], []
         for view in holdout:
@@ -176,14 +197,27 @@ class TrainedScene:
         repaired: float = 1.0,
         reporter: Reporter,
     ) -> TrainedScene:
-        """This scene after training on, with Adam's moments, on raw and repaired views, kept in ``folder``.
+        """Continue the training on raw and repaired views, with Adam's moments.
 
-        pseudo_share, pseudo_weight: share of the steps that draw a repair (even: each as often as any raw
-        frame), and the factor on its loss.
-        repaired: of the frames that were to be repaired, the share that has a repair. The turns of the others
-        go to the raw frames: drawn as often as all of them, a few repairs would drown these.
-        A training that is done already is read back; one that was cut off resumes from its checkpoint, which
-        is deleted in the end.
+        A finished training is read back. An interrupted one resumes from its checkpoint, which is deleted at
+        the end.
+
+        Args:
+            views: Raw and repaired views.
+            config: Settings, with the part of the schedule.
+            folder: Folder of the training's results.
+            seed: Source of the training's randomness.
+            label: Name of the task in the progress.
+            round: Round of RIVR, for the log.
+            pseudo_share: Share of the steps that draw a repair; ``even`` draws each as often as any raw
+                frame.
+            pseudo_weight: Factor on the loss of a repair.
+            repaired: Share of the frames that have a repair. The share of the steps is reduced by it, since a
+                few repairs must not be drawn as often as all frames together.
+            reporter: Target of the progress.
+
+        Returns:
+            The scene after the training.
         """
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SCENE).exists():
@@ -213,16 +247,28 @@ class TrainedScene:
             write_exposure(folder / EXPOSURE, formation.exposure or self._written_exposure)
             weights = {view.frame_id: view.weight for view in views if view.kind == "real"}
             write_formation(folder / FORMATION, formation, weights)
-            write_ply(folder / SCENE, result.scene)  # last: it says that the training is done
+            write_ply(folder / SCENE, result.scene)  # last: it marks the training as done
         (folder / CHECKPOINT).unlink(missing_ok=True)
         return TrainedScene(folder, self._device)
 
 
-def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected: TrainedScene | None) -> None:
-    """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all ``trainings`` (the
-    folders they are kept in).
+def _deblurred(formed: FormedView, render: Render, observed: ImageF32, mask: MaskBool | None) -> ImageF32:
+    """Return ``observed`` without its motion; ``render`` is the scene at the camera of ``formed``."""
+    shown = render.image if formed.affine is None else apply_affine(render.image, formed.affine)
+    weight = np.ones(observed.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+    return deblur(shown.clamp(0.0, 1.0).cpu().numpy(), observed, weight, formed.warp(render))
 
-    A rejected scene lies beside it as ``rejected.ply``.
+
+def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected: TrainedScene | None) -> None:
+    """Copy the scene, byte for byte, into the stage folder ``out``, with the log of all trainings.
+
+    A rejected scene is stored next to it as ``rejected.ply``.
+
+    Args:
+        scene: The scene to publish.
+        trainings: Folders of the trainings.
+        out: Folder of the stage.
+        rejected: A scene that did harm.
     """
     logs = [read_table(training / LOG, TRAIN) for training in trainings]
     write_table(out / LOG, pa.concat_tables(logs) if logs else TRAIN.empty_table(), TRAIN)
@@ -233,8 +279,9 @@ def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected:
 
 
 def drop_state(training: Path) -> None:
-    """Drop from the folder of a finished training what only the last one is asked for: its state, which is
-    three times as large as the scene.
+    """Remove the state of a finished training, which only the last training needs.
+
+    It is three times as large as the scene.
     """
     (training / STATE).unlink(missing_ok=True)
 

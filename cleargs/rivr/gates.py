@@ -1,8 +1,8 @@
-"""What keeps a repair from becoming supervision: it must agree with the raw frame or with the render.
+"""Gates that a repair must pass before it supervises: it must agree with the raw frame or with the render.
 
-Blur moves light by a few pixels, but it moves neither what the frame shows nor its mean colour: a repair
-lies, block by block, where the raw frame O_t or the render R_t lies, and has the colours of one of the two.
-The scorers of the selection see one image at a time, so they cannot notice when it does not.
+Blur moves light by a few pixels. It moves neither the content of the frame nor its mean colour. Every block
+of a repair is therefore in the place of the raw frame O_t or of the render R_t, and has the colours of one of
+the two. The scorers of the selection see one image at a time and cannot notice a difference.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from cleargs.types import ArrayF64, ImageF32, MaskBool
 BLOCK = 64
 """Side of the blocks that are compared, px."""
 ALIGNED_EVERY, COLOUR_EVERY = 32, 16
-"""Distance of neighbouring blocks whose place, and whose colour, is compared, px."""
+"""Distance of neighbouring blocks whose places, and whose colours, are compared, px."""
 REACH = 8
-"""Longest shift that is looked for along each axis, px."""
+"""Longest shift that is searched along each axis, px."""
 
 REFUSED = "repair refused: "
-"""How the reason of a choice begins when the repair was not among the candidates."""
+"""Begin of the reason of a choice when the repair was not among the candidates."""
 
 _FLAT = 0.02  # a block of lower standard deviation has too little texture to be aligned
 _AT_REST = 0.8  # see `_lengths`
 
 
 class GateConfig(Settings):
-    """When a repair is refused because it disagrees with both the raw frame and the render.
+    """Limits of the disagreement of a repair with both the raw frame and the render.
 
-    docs/experiments/rivr.md has the measurements behind the thresholds.
+    Source of the thresholds: measurements in docs/experiments/rivr.md.
     """
 
     max_share: float = Field(
@@ -49,7 +49,7 @@ class GateConfig(Settings):
 def rejection_reason(
     repair: ImageF32, observed: ImageF32, render: ImageF32, limits: GateConfig
 ) -> str | None:
-    """Why ``repair`` [H, W, 3] of a frame must not become supervision; None when it may.
+    """Return the reason to refuse ``repair`` [H, W, 3] of a frame; None if it may supervise.
 
     Masked pixels must be the same in all three images (`candidates.hide_masked`).
     """
@@ -65,9 +65,10 @@ def rejection_reason(
 
 
 def all_masked(mask: MaskBool | None) -> str | None:
-    """Why no candidate of a frame may become supervision; None when one may.
+    """Return the reason to refuse every candidate of a frame; None if one may supervise.
 
-    mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
+    Args:
+        mask: [H, W], False where the frame is to be ignored; None if nothing is masked.
     """
     if mask is not None and not mask.any():
         return "every pixel of the frame is masked"
@@ -75,9 +76,9 @@ def all_masked(mask: MaskBool | None) -> str | None:
 
 
 def shifts(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
-    """How far each block is from its place in the nearer of O_t and R_t, px [rows, columns].
+    """Return the distance of each block from its place in the nearer of O_t and R_t, px [rows, columns].
 
-    0 where the block has too little texture to tell.
+    It is 0 for a block with too little texture.
     """
     found = []
     for row in zip(*(_rows(image) for image in (repair, observed, render)), strict=True):
@@ -92,8 +93,9 @@ def shifts(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
 
 
 def colour_differences(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
-    """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
-    farthest, in sRGB [rows, columns].
+    """Return the difference of each block's mean from that of the nearer of O_t and R_t, [rows, columns].
+
+    It is that of the channel with the largest difference, in sRGB.
     """
     means, *references = (_block_means(image) for image in (repair, observed, render))
     nearer: ArrayF64 = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
@@ -101,7 +103,7 @@ def colour_differences(repair: ImageF32, observed: ImageF32, render: ImageF32) -
 
 
 def _block_means(image: ImageF32) -> ArrayF64:
-    """[rows, columns, 3]; taken in linear light, which blur keeps, and given in sRGB."""
+    """Return means in sRGB [rows, columns, 3], computed in linear light, which blur keeps."""
     linear = linear_from_srgb(image).astype(np.float64)
     height, width, _ = linear.shape
     side = min(BLOCK, height, width)
@@ -111,7 +113,7 @@ def _block_means(image: ImageF32) -> ArrayF64:
 
 
 def _rows(image: ImageF32) -> Iterator[ArrayF64]:
-    """The grey blocks of each row of blocks, [N, S, S]: S is `BLOCK`, or the shorter side of the image."""
+    """Yield the grey blocks of each row, [N, S, S]: S is `BLOCK`, or the shorter side of the image."""
     grey = image.mean(axis=2, dtype=np.float64)
     height, width = grey.shape
     side = min(BLOCK, height, width)
@@ -121,7 +123,7 @@ def _rows(image: ImageF32) -> Iterator[ArrayF64]:
 
 
 def _starts(length: int, side: int, step: int) -> list[int]:
-    """Where the blocks along an axis begin; the last one ends with the image."""
+    """Return the first pixels of the blocks along an axis; the last block ends with the image."""
     return sorted({*range(0, length - side + 1, step), length - side})
 
 
@@ -132,7 +134,7 @@ def _spectra(blocks: ArrayF64) -> NDArray[np.complex128]:
 
 
 def _lengths(cross: NDArray[np.complex128], side: int) -> ArrayF64:
-    """Length of each block's shift, px, from its cross-power spectrum [N, S, S // 2 + 1].
+    """Return the length of each block's shift, px, from its cross-power spectrum [N, S, S // 2 + 1].
 
     Phase correlation, half whitened: fully, the noise that blur leaves at high frequencies would drown the
     peak; not at all, the peak would be broad. A symmetric blur of either image leaves it in its place, and
@@ -155,7 +157,7 @@ def _lengths(cross: NDArray[np.complex128], side: int) -> ArrayF64:
 
 
 def _fraction(before: ArrayF64, peak: ArrayF64, after: ArrayF64) -> ArrayF64:
-    """Where the parabola through three samples is highest, from the middle one; at most half a sample off."""
+    """Return the offset of the peak of a parabola through three samples from the middle one, at most 0.5."""
     bend = before - 2.0 * peak + after
     offset = np.divide(0.5 * (before - after), bend, out=np.zeros_like(bend), where=bend < 0.0)
     return np.clip(offset, -0.5, 0.5)

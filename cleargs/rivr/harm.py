@@ -1,4 +1,4 @@
-"""What keeps a scene distilled from repairs from doing harm."""
+"""The check for harm that a scene distilled from repairs must pass."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from cleargs.base_model import Settings
 
 
 class HarmConfig(Settings):
-    """When a distilled scene counts as worse than G0 on the frames held back from repair.
+    """Margins beyond which a distilled scene is worse than G0 on the frames held out from repair.
 
-    These frames stay among the raw supervision, as they were for G0. Kept from it too, G0 would be measured
-    on frames it was trained on and the distilled scene on unseen ones: PSNR then falls by 2 to 3 dB while the
-    scene gains 0.9 dB against the truth (16 frames, 480x270), and no margin tells harm from that.
+    These frames remain in the raw supervision, as for G0. Without them there, G0 would be measured on frames
+    of its training and the distilled scene on unseen ones. PSNR then falls by 2 to 3 dB while the scene gains
+    0.9 dB against the truth (16 frames, 480x270), and no margin can separate harm from that.
     """
 
     held_back: float = Field(
@@ -31,7 +31,7 @@ class HarmConfig(Settings):
 
 
 class Fidelity(NamedTuple):
-    """How well a scene explains the frames that were held back from repair: means over them."""
+    """Agreement of a scene with the frames held out from repair: means over them."""
 
     psnr: float
     """PSNR of a frame's render, with the frame's motion, against its raw observation, dB."""
@@ -41,22 +41,22 @@ class Fidelity(NamedTuple):
 
 @dataclass(frozen=True)
 class HarmVerdict:
-    """Whether a distilled scene may be published, with the figures that decided."""
+    """The decision about a distilled scene, with the figures behind it."""
 
     frames: list[int]
-    """The frames held back; without any, nothing is judged."""
+    """The held-out frames. Without any, every scene is published."""
     psnr_before: float | None
     psnr_after: float | None
     score_before: float | None
     score_after: float | None
     harm: str | None
-    """What became worse by more than its margin; None: the distilled scene is published."""
+    """The figure that fell by more than its margin; None if the distilled scene is published."""
 
 
 def judge_harm(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
 ) -> HarmVerdict:
-    """Compare a distilled scene with G0 on the held-back ``frames``.
+    """Compare a distilled scene with G0 on the held-out ``frames``.
 
     Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
     ``score_margin``: repairs may neither bend the scene away from its best observations nor soften it.

@@ -29,7 +29,7 @@ MIN_SHARE, MIN_TRIED = 1 / 16, 2
 
 @dataclass(frozen=True)
 class Need:
-    """How much one frame needs a repair."""
+    """One frame and the grounds on which it may need a repair."""
 
     assessment: FrameAssessment
     formation: FrameFormation | None
@@ -79,10 +79,12 @@ def frames_to_try(ranked: Sequence[Need]) -> list[int]:
 def frames_to_repair(
     which: Targets, supervision: Supervision, formations: Mapping[int, FrameFormation]
 ) -> list[int]:
-    """Return the frames that every round repairs, by frame_id; never a held-back one.
+    """Return the frames that every round repairs, by frame_id; never a held-out one.
 
     Args:
         which: ``all``; ``degraded``, those whose role is not ``strong``; or ``auto``, those in need.
+        supervision: The frames.
+        formations: Formations from the training before, by frame_id.
     """
     frames = supervision.candidates
     if which == "auto":

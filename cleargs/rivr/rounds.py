@@ -40,7 +40,7 @@ from cleargs.splat.views import TrainingView
 from cleargs.types import ImageF32, MaskBool
 
 PREFIX = "cleargs:"
-"""How the names of the attributes in the EXR begin."""
+"""Prefix of the names of the attributes in the EXR."""
 
 _OPTIONAL = (
     *("primary_fused", "primary_observed", "tiebreak_fused", "tiebreak_observed", "blur_px", "skew_px"),
@@ -53,16 +53,16 @@ TRUSTED = 0.5
 
 @dataclass(frozen=True)
 class Rules:
-    """How a frame is restored, how its candidates are made, and how one of them is chosen.
+    """Rules for restoring a frame, making its candidates and choosing one of them.
 
-    But for the objects and the threads these are fields of the stage's settings.
+    Except for the objects and the threads these are fields of the stage's settings.
     """
 
     expert: Expert
     primary: Scorer
     tiebreak: Scorer
     cache: Path
-    """Folder for the restorations of raw frames, each of which is made when it is first asked for."""
+    """Folder for the restorations of raw frames, each of which is made when it is first needed."""
     threads: int
     use_observation: bool
     undo_motion: bool
@@ -75,9 +75,15 @@ class Rules:
     def restored(
         self, view: TrainingView, render: ImageF32, scene: TrainedScene
     ) -> tuple[ImageF32, Source, Deblurred | None]:
-        """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
+        """Restore a frame.
 
-        What ``scene`` says of the frame's camera is undone.
+        Args:
+            view: The frame.
+            render: R_t.
+            scene: The motion that it knows of the frame is undone first.
+
+        Returns:
+            D_t, the kind of image that it was made from, and the deblurred frame if it was made from that.
         """
         if not self.use_observation:
             return self._restored(render), "render", None
@@ -90,11 +96,11 @@ class Rules:
         return self.expert.restore(image, threads=self.threads)
 
     def _restored_observation(self, view: TrainingView) -> ImageF32:
-        """As the cache gives it back, so that every round and every resumed run has the same bits."""
+        """Return D_t of a raw frame as read from the cache: every round and resumed run has the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
             return from_layer(read_exr(path).layers["restored"])
-        except StoreError:  # not made yet, or not whole
+        except StoreError:  # missing or incomplete
             self.cache.mkdir(exist_ok=True)
             restored = to_layer(self._restored(observation(view)[0]))
             write_exr(path, LayeredImage({"restored": restored}, {}))
@@ -112,8 +118,8 @@ def run_round(
 ) -> list[Selection]:
     """Repair every target frame in the light of ``scene``; EXRs go to ``out/round_NN/``.
 
-    Frames that have theirs are left alone; an EXR that is damaged, or of another frame or round, is made
-    again, with a warning.
+    Frames with an EXR are skipped. An EXR that is damaged, or of another frame or round, is replaced, with a
+    warning.
     """
     folder = f"round_{number:02d}"
     (out / folder).mkdir(exist_ok=True)
@@ -124,7 +130,7 @@ def run_round(
             row = read_row(out, exr)
             if row is None or (row.round, row.frame_id) != (number, view.frame_id):
                 if (out / exr).exists():
-                    reporter.warn(f"{exr}: what an earlier try left cannot be used and is made again")
+                    reporter.warn(f"{exr}: what an earlier run left cannot be used and is replaced")
                 row, image = repair(number, view, exr, scene, rules)
                 write_exr(out / exr, image, shown=row.chosen)
             rows.append(row)
@@ -138,8 +144,8 @@ def repair(
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
-    All work is on the images as the EXR will give them back (half floats, scene-linear), so that
-    whoever resumes from the file sees what was scored.
+    All work is on the images as read back from the EXR (half floats, scene-linear), so that a run which
+    resumes from the file has the images that were scored.
     """
     rendered = scene.render(view)
     restored, source, deblurred = rules.restored(view, rendered, scene)
@@ -173,7 +179,7 @@ def repair(
     choice = (
         choose(primary, tiebreak, rules.margin)
         if refused is None
-        else CandidateChoice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
+        else CandidateChoice("render", f"{REFUSED}{refused}")  # the fusion contains the refused repair
     )
     masked = all_masked(mask)
     row = Selection(
@@ -206,7 +212,7 @@ def repair(
 
 
 def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
-    """Remove what would be published beside the EXRs of ``targets`` in rounds 1 to ``rounds``."""
+    """Remove files that do not belong to the EXRs of ``targets`` in rounds 1 to ``rounds``."""
     ours = {
         f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets
     }
@@ -216,7 +222,7 @@ def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> No
 
 
 def read_row(out: Path, exr: str) -> Selection | None:
-    """The row that the EXR at ``out/exr`` carries; None where there is no whole EXR."""
+    """Return the row in the attributes of the EXR at ``out/exr``; None where there is no complete EXR."""
     if not (out / exr).exists():
         return None
     try:
@@ -238,13 +244,13 @@ def _attributes(row: Selection) -> dict[str, int | float | str]:
 
 
 def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:
-    """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
+    """Return the chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
     @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
     def mask() -> MaskBool | None:
         return target.load()[1]
 
-    assert row.exr is not None  # what is accepted has been made
+    assert row.exr is not None  # every accepted row has one
     exr = out / row.exr
 
     def load() -> tuple[ImageF32, MaskBool | None]:
@@ -254,5 +260,5 @@ def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView
 
 
 def _score(scorer: Scorer, image: ImageF32, threads: int) -> float:
-    """In single precision, as the EXR holds it."""
+    """Return the score in single precision, as stored in the EXR."""
     return float(np.float32(scorer.score(image, threads=threads)))

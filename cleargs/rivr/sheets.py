@@ -18,8 +18,9 @@ SHEET_FRAMES = 6
 
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
-    """One line a row: the observation, the same without its motion, and its candidates, with both scores, the
-    chosen one marked.
+    """Write one line per row: the observation, the same without its motion, and its candidates.
+
+    Candidates have both scores, and the chosen one is marked.
     """
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
@@ -32,8 +33,9 @@ def write_before_after_sheet(
     repairs: Mapping[int, Selection],
     rivr: Path,
 ) -> None:
-    """One line a view: G0's render, the final render, the observation, and, where any of the views has one,
-    the repair that was distilled.
+    """Write one line per view: G0's render, the final render and the observation.
+
+    If any of the views has a repair that was distilled, there is a column for it.
     """
     repaired = any(view.frame_id in repairs for view in views)
     lines = []

@@ -48,13 +48,13 @@ class Selection:
     tiebreak_fused: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_FUSED}"]
     tiebreak_observed: Annotated[float | None, pa.float32(), f"tiebreak {_SCORE} {_OBSERVED}"]
     restored_from: Annotated[
-        Source | None, "what the expert restored to D_t: observation, deblurred or render"
+        Source | None, "image that the expert restored to D_t: observation, deblurred or render"
     ]
     blur_px: Annotated[float | None, pa.float32(), "mean way of the pixels while exposed, as undone"]
     skew_px: Annotated[float | None, pa.float32(), "their mean way from the first to the last row"]
     chosen: Annotated[Chosen, "render, restored or fused; observed: the raw frame needs no repair"]
-    accepted: Annotated[bool, "whether the chosen candidate became a pseudo observation"]
-    reason: Annotated[str, "why it was chosen, or why there is no pseudo observation"]
+    accepted: Annotated[bool, "true if the chosen candidate became a pseudo observation"]
+    reason: Annotated[str, "reason of the choice, or of the lack of a pseudo observation"]
 
     def layers(self, rivr: Path) -> Mapping[str, Layer]:
         """Return the layers of the frame's EXR, which is below the rivr folder.
@@ -88,7 +88,7 @@ class Repair:
 
 
 CHOICES: tuple[Chosen, ...] = (*CANDIDATES, "observed")
-"""What a row may name as chosen."""
+"""Values of ``chosen`` in a row."""
 
 SELECTION, REPAIRS = schema_of(Selection), schema_of(Repair)
 
@@ -99,28 +99,32 @@ def write_selection(path: Path, rows: list[Selection]) -> None:
 
 
 def read_selection(path: Path) -> list[Selection]:
-    """Read the rows in their order. Raises StoreError."""
+    """Read the rows in their order.
+
+    Raises:
+        StoreError: The table is missing or damaged.
+    """
     return [Selection(**row) for row in read_table(path, SELECTION).to_pylist()]
 
 
 def latest_accepted(rows: Sequence[Selection]) -> list[Selection]:
-    """The accepted row of the latest round of every frame that has one and is not kept raw, by frame_id."""
+    """Return the latest accepted row of every frame that is not kept raw, by frame_id."""
     kept = kept_raw(rows)
     latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round) if row.accepted}
     return [latest[frame_id] for frame_id in sorted(latest.keys() - kept)]
 
 
 def kept_raw(rows: Sequence[Selection]) -> set[int]:
-    """The frames whose latest row says that they need no repair.
+    """Return the frames whose latest row says that they need no repair.
 
-    The latest scene is the best judge, so this takes back an earlier repair, as a later repair does.
+    The latest scene is the best reference, so this revokes an earlier repair, as a later repair does.
     """
     latest = {row.frame_id: row for row in sorted(rows, key=lambda row: row.round)}
     return {frame_id for frame_id, row in latest.items() if row.chosen == "observed"}
 
 
 def repaired_share(rows: Sequence[Selection]) -> float:
-    """Of the frames that have a repair or are kept raw, the share of the former; 0 without either."""
+    """Return the share of repaired frames among those that are repaired or kept raw; 0 without either."""
     repaired, kept = len(latest_accepted(rows)), len(kept_raw(rows))
     return repaired / max(repaired + kept, 1)
 
@@ -132,7 +136,7 @@ def write_repairs(path: Path, repairs: list[Selection]) -> None:
 
 
 def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
-    """What round ``number`` chose, for the manifest."""
+    """Return the figures of round ``number`` for the manifest."""
     rows = [row for row in rows if row.round == number]
     tried = [row for row in rows if row.exr is not None]
     refused = [row for row in rows if not row.accepted and row.chosen != "observed"]
@@ -158,10 +162,10 @@ def round_figures(number: int, rows: Sequence[Selection]) -> dict[str, Any]:
 
 
 def refused_repairs(rows: Sequence[Selection]) -> int:
-    """How many repairs the gate kept out of the choice."""
+    """Return the number of repairs that a gate refused."""
     return sum(row.reason.startswith(REFUSED) for row in rows)
 
 
 def chosen_counts(rows: Sequence[Selection]) -> dict[Chosen, int]:
-    """How often each was chosen."""
+    """Return the number of rows per choice."""
     return {name: sum(row.chosen == name for row in rows) for name in CHOICES}

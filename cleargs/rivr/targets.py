@@ -1,5 +1,6 @@
-"""The frames of a capture as RIVR and the consolidation see them: those that are repaired, in groups along
-the trajectory, and those that are held back to measure whether repairing does harm.
+"""The frames of a capture in RIVR and the consolidation.
+
+Those that are repaired are in groups along the trajectory. Others are held out to measure harm by repairs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from cleargs.splat.views import TrainingView
 
 @dataclass(frozen=True)
 class FrameAssessment:
-    """What RVA says about a frame."""
+    """RVA's scores and role of a frame."""
 
     frame_id: int
     R: float
@@ -32,16 +33,16 @@ class FrameAssessment:
     stand_in: bool
     """No frame is reliable, and this one is among the best by R - B."""
     weight: float = 1.0
-    """Of the frame's raw supervision; 0: it is never loaded."""
+    """Weight of the frame's raw supervision; a frame of weight 0 is never loaded."""
 
 
 def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
-    """A share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many equal
-    parts of the trajectory (ties: the one nearest to the part's middle); in order.
+    """Select frames that get no repairs and measure harm by the repairs of the others, in order.
 
-    Where no frame is reliable, the stand-in set takes their place. These frames get no repairs, and judge
-    the scene distilled from those of the others: a frame that is itself a little soft would call every gain
-    in sharpness a loss. Empty when RVA names neither.
+    They are a share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many
+    equal parts of the trajectory, or among equals the nearest to the middle of the part. If no frame is
+    reliable, the stand-in set is used. If RVA names neither, there are none. Soft frames are not selected,
+    since they would count every gain in sharpness as a loss.
     """
     references = [frame for frame in frames if frame.reliable] or [
         frame for frame in frames if frame.stand_in
@@ -53,7 +54,7 @@ def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> l
 
 
 def _parts(count: int, parts: int) -> Iterator[tuple[int, int]]:
-    """Start and end of each of so many nearly equal parts of ``count`` things in a row."""
+    """Yield start and end of each of ``parts`` nearly equal parts of ``count`` things in a row."""
     return pairwise(k * count // parts for k in range(parts + 1))
 
 
@@ -73,13 +74,17 @@ class FrameGroup:
 
 
 def trajectory_groups(targets: Sequence[TrainingView], size: int | None, steps: int) -> list[FrameGroup]:
-    """``targets`` in their order, in as few groups of at most ``size`` frames as hold them, all in one for
-    None; sizes differ by one at most. ``steps`` is shared in proportion to the frames and adds up exactly.
+    """Divide ``targets``, in their order, into the fewest groups of at most ``size`` frames.
 
-    The paper repairs along the trajectory: what is accepted early is distilled before later frames are
-    rendered, and may fade while theirs are. That is what the consolidation is for. Each group's distillation
-    is a training of its own, in its part of the schedule: over one of two rounds the means' rate falls by a
-    fifth, so that the end of the trajectory gets its geometry too.
+    The paper repairs along the trajectory. Repairs of early frames are distilled before later frames are
+    rendered, and may fade while the later ones are distilled, which the consolidation corrects. The
+    distillation of a group is a separate training, in its part of the schedule. Over one of two rounds the
+    rate of the means falls by a fifth, so that the end of the trajectory gets its geometry too.
+
+    Args:
+        targets: Frames to repair.
+        size: Most frames of a group; None for one group. Sizes differ by one at most.
+        steps: Steps of the round, which are shared in proportion to the frames and add up exactly.
     """
     frames = len(targets)
     count = 1 if size is None else max(1, -(-frames // size))
@@ -96,17 +101,16 @@ class Supervision:
     views: dict[int, TrainingView]
     assessments: list[FrameAssessment]
     holdout_ids: list[int]
-    """Frames that get no repairs, to measure whether those of the others do harm; none where the settings
-    hold none back."""
+    """Frames that get no repairs and measure harm by those of the others."""
 
     @property
     def real(self) -> list[TrainingView]:
-        """The active raw frames: D_real, the held-back ones among them, as for G0."""
+        """The active raw frames D_real, including the held-out ones, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
     def holdout_views(self) -> list[TrainingView]:
-        """The held-back frames."""
+        """The held-out frames."""
         return [self.views[frame_id] for frame_id in self.holdout_ids]
 
     @property
@@ -115,19 +119,25 @@ class Supervision:
         return [frame for frame in self.assessments if frame.frame_id not in self.holdout_ids]
 
     def worst(self, frame_ids: Sequence[int], count: int) -> list[TrainingView]:
-        """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""
+        """Return the ``count`` views of lowest R - B among ``frame_ids``, worst first."""
         wanted = set(frame_ids)
         ranked = sorted(self.assessments, key=lambda frame: (frame.R - frame.B, frame.frame_id))
         return [self.views[frame.frame_id] for frame in ranked if frame.frame_id in wanted][:count]
 
 
 def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervision:
-    """Read the finished folders of ingest and rva; frames that RVA could not score stay out. Decodes no
-    image.
+    """Read the finished folders of ingest and rva, without frames that RVA could not score.
 
-    holdout_share: share of the reliable frames that judge the result.
+    No image is decoded.
 
-    Raises StoreError when a table is damaged, StageError when no frame can judge the result.
+    Args:
+        ingest: Folder of ingest.
+        rva: Folder of rva.
+        holdout_share: Share of the reliable frames that measure harm.
+
+    Raises:
+        StoreError: A table is damaged.
+        StageError: No frame can measure harm.
     """
     frames = {f.frame_id: f for f in load_frames(ingest) if f.registered and f.split == "train"}
     columns = pa.schema([FRAMES.field(field.name) for field in fields(FrameAssessment)])

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ import torch
 from torch import Tensor
 
 from cleargs.errors import InputError, StageError
-from cleargs.progress import PREVIEW, Rate, Reporter, Task
+from cleargs.progress import COMPILING, PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
 from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
 from cleargs.splat.budget import resolve_config, seconds_by_step
@@ -28,6 +29,7 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.kernels.cpu.jit import compiled_mark
 from cleargs.splat.kernels.cuda import support
 from cleargs.splat.scene import Scene
 from cleargs.splat.schedule import Schedule
@@ -132,7 +134,7 @@ class Trainer:
         elif saved is not None:
             self.restore(saved)
             reporter.info(f"{label}: resuming from step {self.done} of {self.length}")
-        self._backend.warm_up()  # before the bar, or half a minute of compiling would count as pace
+        self._warm_up(reporter)
         with (
             support.memory_errors(),
             deferred_sigterm() as terminated,
@@ -158,6 +160,17 @@ class Trainer:
             self._show(task, shares, rate)
         state = {name: tensor.cpu() for name, tensor in self.state().items()}
         return Trained(self.scene.to("cpu"), self.rows(round), state)
+
+    def _warm_up(self, reporter: Reporter) -> None:
+        """Compile the kernels before the first step, in a task of its own where it takes its time."""
+        compiled = compiled_mark(self._device.type)
+        if compiled.exists():
+            self._backend.warm_up()
+            return
+        with reporter.task(COMPILING):
+            self._backend.warm_up()
+        with suppress(OSError):
+            compiled.touch()
 
     @property
     def scene(self) -> Scene:

@@ -14,8 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 from OpenImageIO import HALF, ImageBuf
 from tiny_capture import (
+    HEIGHT,
     MASKED_FRAME,
     ROLES,
+    WIDTH,
     Capture,
     Contrast,
     Darkness,
@@ -35,6 +37,7 @@ from cleargs.formation.table import write_formation
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.progress import SilentReporter
 from cleargs.rivr.candidates import fuse
+from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import (
     REPAIRS,
     SELECTION,
@@ -45,6 +48,7 @@ from cleargs.rivr.tables import (
     repaired_share,
     write_selection,
 )
+from cleargs.rivr.targets import load_supervision
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.views import TrainingView
 from cleargs.stages import consolidate, rivr
@@ -235,6 +239,30 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     assert np.abs(explained - seen).mean() < 0.8 * np.abs(render - seen).mean()
     log = pq.read_table(context.out / "train.parquet").to_pydict()
     assert (blurred, "pseudo") not in set(zip(log["frame_id"], log["kind"], strict=True))
+
+
+def test_layers_of_a_frame_without_an_exr_are_computed(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From what the training has found: nothing is estimated again."""
+    capture.use_good_scene()
+    motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
+    found = FrameFormation(2, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0, draws=30)
+    supervision = load_supervision(capture.root / "ingest", capture.root / "rva", 0.125)
+    view = supervision.views[2]
+    formation = CaptureFormation([view], FormationConfig(), known={2: found})
+    write_formation(capture.root / "g0" / "formation.parquet", formation, {2: view.weight})
+    scene = TrainedScene(capture.root / "g0")
+    monkeypatch.setattr("cleargs.rivr.distillation.fit_motion", None)
+    undone = scene.deblur(view)
+    assert undone is not None and undone.formation.blur_px == 6.0
+    whole, half = scene.formed_layers(view), scene.formed_layers(view, 0.5)
+    np.testing.assert_array_equal(whole["deblurred"], undone.image)
+    explained = scene.explained(view)
+    assert explained is not None
+    np.testing.assert_array_equal(whole["explained"], explained.image)
+    assert {image.shape for image in half.values()} == {(HEIGHT // 2, WIDTH // 2, 3)}
+    assert scene.formed_layers(supervision.views[0]) == {}
 
 
 def test_a_sharp_frame_keeps_its_raw_image(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

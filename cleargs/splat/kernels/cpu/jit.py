@@ -48,6 +48,11 @@ def kernel_digest() -> str:
     return digest.hexdigest()[:16]
 
 
+def compiled_mark(device: str) -> Path:
+    """Return the file that says that all kernels for ``device`` have been compiled once on this machine."""
+    return kernel_cache.cache_folder(f"kernels-{kernel_digest()}") / f"compiled-{device}"
+
+
 def configure_numba() -> None:
     """Give the kernels a folder of the cache and a threading layer; to be called before one is defined."""
     kernel_cache.configure_numba(f"kernels-{kernel_digest()}")
