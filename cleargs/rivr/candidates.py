@@ -50,7 +50,7 @@ def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
 
 
 def gaussian_blur(image: ImageF32, sigma: float) -> NDArray[np.float64]:
-    """Blur ``image`` [H, W, 3] by a separable Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
+    """Blur ``image`` [H, W, 3] by a Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
     from scipy.ndimage import gaussian_filter
 
     radius = max(1, int(np.ceil(3.0 * sigma)))

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 # Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
-# And a megapixel of a frame that is asked what its camera did: the first time, and again.
-SEARCH_S, SEARCH_AGAIN_S = 4.0, 1.0
+# And per megapixel of a frame whose formation is estimated: the first time, where half of the frames are
+# assumed to be searched, and again.
+SEARCH_S, SEARCH_AGAIN_S = 0.6, 0.3
 
 Settings = TypeVar("Settings", bound=TrainConfig)
 
@@ -44,7 +45,7 @@ def seconds_by_step(config: TrainConfig, frames: int, megapixels: float, start: 
     seconds = STEP_S + STEP_S_PER_MEGAPIXEL * megapixels * reduced
     seconds += STEP_S_PER_GAUSSIAN * gaussians_by_step(config, start)
     if config.formation.enabled:
-        since = step - max(config.first, config.formation.start * config.planned)
+        since = step - config.formation.start * config.planned
         again = SEARCH_AGAIN_S / config.formation.every
         seconds += megapixels * np.where(since < 0, 0.0, np.where(since < frames, SEARCH_S, again))
     return seconds
