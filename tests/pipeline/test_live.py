@@ -14,7 +14,7 @@ from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
 from cleargs.pipeline import live
 from cleargs.pipeline.live import PROGRESS_FILE, RunningStage, preview_of, recorded_progress, running_stage
-from cleargs.progress import SilentReporter
+from cleargs.progress import COMPILING, SilentReporter
 
 
 def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
@@ -103,6 +103,16 @@ def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: py
             outer.advance()
             assert (note()["label"], note()["done"]) == ("G0", 21)
     assert not (tmp_path / PROGRESS_FILE).exists()
+
+
+def test_the_seconds_of_compiling_are_counted_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
+        for label, seconds in (("G0", 5.0), (COMPILING, 30.0), ("G0", 7.0)):
+            with reporter.task(label):
+                now[0] += seconds
+        assert reporter.compile_seconds == 30.0
 
 
 def test_a_note_that_cannot_be_written_stops_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
