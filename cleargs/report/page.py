@@ -129,7 +129,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "layers": LAYERS,
                 "opening": {"left": "observed", "right": "final"},
                 "frames": [
-                    _frame_data(row, pictures[number][1], times.get(number))
+                    frame_data(row, pictures[number][1], times.get(number))
                     for number, row in zip(pictures, rows, strict=True)
                 ],
                 "viewer": viewer,
@@ -226,8 +226,8 @@ def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return found
 
 
-def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
-    """All that the page says of a frame."""
+def frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
+    """Return all that the page says of a frame."""
     lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
     cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}
     harms = {name.replace("_", " "): row.judged.get(f"b_{name}") for name in B_CUES}

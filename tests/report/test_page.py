@@ -27,10 +27,19 @@ from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.charts import weight_colour
 from cleargs.report.frames import FrameRow
-from cleargs.report.page import changed_settings, command, json_in_html, write_report
+from cleargs.report.page import changed_settings, command, frame_data, json_in_html, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
+from cleargs.rivr.tables import Selection
+
+
+def test_a_frame_that_was_not_tried_says_why() -> None:
+    frame: Any = SimpleNamespace(frame_id=3, name="c.png", registered=True, split="train")
+    reason = "not tried: explained: blur 5.2 px"
+    row = FrameRow(frame, rounds=(Selection.not_tried(3, reason),))
+    data = frame_data(row, {}, None)
+    assert (data["repair"], data["why"], data["scores"]) == ("none: the raw frame is kept", reason, {})
 
 
 @pytest.fixture(scope="module")
