@@ -26,7 +26,7 @@ from cleargs.report.frames import (
 from cleargs.rivr.gates import REFUSED
 from cleargs.rivr.tables import REPAIRS
 from cleargs.splat.ply import read_ply
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 
 MAX_NAME_LENGTH = 14
 """Characters of a frame's name in a table."""

@@ -19,8 +19,8 @@ from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.progress import Task
 from cleargs.splat.camera import Camera, cameras_json
+from cleargs.splat.render import Viewer
 from cleargs.splat.scene import Scene
-from cleargs.splat.viewer import Viewer
 
 Kind = Literal["film", "still", "folder"]
 Picture = NDArray[np.uint8]  # [H, W, 3] sRGB

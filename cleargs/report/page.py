@@ -46,7 +46,7 @@ from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 
 _STILL = 960  # px, long side of the pictures that stand for the viewers
 
