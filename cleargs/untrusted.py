@@ -116,14 +116,8 @@ def printable(text: str, keep: str = "") -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(
-        character if character in keep or not _acts(character) else f"\\u{ord(character):04x}"
-        for character in text
-    )
-
-
-def _acts(character: str) -> bool:
-    return unicodedata.category(character) in _HARMFUL or character in _BIDI
+    acting = {c for c in text if unicodedata.category(c) in _HARMFUL or c in _BIDI}.difference(keep)
+    return "".join(f"\\u{ord(character):04x}" if character in acting else character for character in text)
 
 
 def require_utf8(path: Path | str) -> None:

@@ -20,7 +20,6 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -69,7 +68,7 @@ def batch(
     wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -82,7 +81,7 @@ def batch(
     reporter = make_reporter(quiet)
     looks_only = dry_run or summary  # at the results of a cluster, from a machine without its device
     options = (
-        *([] if looks_only else ["--threads", str(threads_or_all(threads))]),
+        *([] if looks_only else ["--threads", str(threads)]),
         *(["--allow-partial"] if allow_partial else []),
         *([] if wants_report else ["--no-report"]),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -11,53 +10,26 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.progress import CountedTask, Reporter, SilentReporter, Task
+from cleargs.progress import CountedTask, LineReporter, Reporter, Task
 from cleargs.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-LINE_EVERY = 10.0
-"""Seconds between two lines of one task where there is no terminal."""
-
 
 def make_reporter(quiet: bool = False) -> Reporter:
     """The reporter that suits stderr; ``quiet`` leaves the warnings only."""
-    if quiet:
-        return QuietReporter()
-    return BarReporter() if sys.stderr.isatty() else LineReporter()
+    if sys.stderr.isatty() and not quiet:
+        return BarReporter()
 
-
-class QuietReporter(SilentReporter):
-    """Warnings only."""
-
-    def warn(self, text: str) -> None:
-        click.echo(f"warning: {printable(text)}", err=True)
-
-
-class LineReporter(QuietReporter):
-    """Plain lines for a log."""
-
-    @contextmanager
-    def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        label, begin = printable(label), time.monotonic()
-        last = begin
-
-        def show(done: int, note: str, left: float | None) -> None:
-            nonlocal last
-            if time.monotonic() - last >= LINE_EVERY:
-                last = time.monotonic()
-                count = f"{label}: {done}" + (f"/{total}" if total else "")
-                rest = "" if left is None else f"{left:.0f} s left"
-                click.echo(", ".join(filter(None, (count, note, rest))), err=True)
-
-        task = CountedTask(total, show)
-        yield task
-        note = f", {task.note}" if task.note else ""
-        click.echo(f"{label}: done in {time.monotonic() - begin:.1f} s{note}", err=True)
-
-    def info(self, text: str) -> None:
+    def echo(text: str) -> None:
         click.echo(printable(text), err=True)
+
+    def no_echo(text: str) -> None:
+        """Print nothing."""
+
+    say = no_echo if quiet else echo
+    return LineReporter(say, lambda text: echo(f"warning: {text}"), say)
 
 
 class BarReporter:

@@ -44,10 +44,14 @@ def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
     with ExitStack() as stack:
         held = stack.enter_context(file_lock(path, wait=False))
         if held is False:
-            reporter.info(f"{what}: {_holder(path)} works on it; waiting")
+            holder = ""
+            with suppress(OSError, UnicodeDecodeError):
+                holder = path.read_text(encoding="utf-8")
+            reporter.info(f"{what}: {holder or 'another process'} works on it; waiting")
             held = stack.enter_context(file_lock(path))
+        job = f" (Slurm job {os.environ['SLURM_JOB_ID']})" if os.environ.get("SLURM_JOB_ID") else ""
         with suppress(OSError):  # the note only serves messages
-            path.write_text(_this_process(), encoding="utf-8")
+            path.write_text(f"process {os.getpid()} on {socket.gethostname()}{job}", encoding="utf-8")
         yield held is not None
 
 
@@ -61,18 +65,6 @@ def is_locked(path: Path) -> bool:
         return _acquire(handle, fcntl.LOCK_SH | fcntl.LOCK_NB) is not True
     finally:
         os.close(handle)
-
-
-def _this_process() -> str:
-    job = os.environ.get("SLURM_JOB_ID", "")
-    return f"process {os.getpid()} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
-
-
-def _holder(path: Path) -> str:
-    """The process that took the lock file ``path`` last."""
-    with suppress(OSError, UnicodeDecodeError):
-        return path.read_text(encoding="utf-8") or "another process"
-    return "another process"
 
 
 def _acquire(handle: int, kind: int) -> bool | None:

@@ -13,7 +13,6 @@ from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import Setting
 from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
 
@@ -47,18 +46,15 @@ class Run:
 
 def write_run_file(run: Run) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
-    path, text = run.folder / RUN_FILE, _text(run).encode()
+    document: Document = {"input": str(run.source), "device": run.device}
+    if run.store != run.folder / STORE_FOLDER:
+        document["store"] = str(run.store)
+    document["seed"] = run.config.seed
+    path, text = run.folder / RUN_FILE, (HEADER + tomli_w.dumps(document) + _commented(run.config)).encode()
     with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:
             write_bytes(path, text)
-
-
-def _text(run: Run) -> str:
-    document: Document = {"input": str(run.source), "device": run.device}
-    if run.store != run.folder / STORE_FOLDER:
-        document["store"] = str(run.store)
-    return HEADER + tomli_w.dumps({**document, "seed": run.config.seed}) + _commented(run.config)
 
 
 def _commented(config: Config) -> str:
@@ -66,14 +62,11 @@ def _commented(config: Config) -> str:
     tables: dict[str, list[str]] = {}
     for setting, value in config.settings():
         lines = tables.setdefault(setting.table, [])
-        lines += wrap(_comment(setting), WIDTH, initial_indent="# ", subsequent_indent="# ")
+        facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
+        comment = f"{setting.meaning} ({facts})" if setting.meaning else facts
+        lines += wrap(comment, WIDTH, initial_indent="# ", subsequent_indent="# ")
         lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
-
-
-def _comment(setting: Setting) -> str:
-    facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
-    return f"{setting.meaning} ({facts})" if setting.meaning else facts
 
 
 def _toml_line(name: str, value: Any) -> str:

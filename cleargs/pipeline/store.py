@@ -372,12 +372,9 @@ def _link_files(source: Path, target: Path) -> None:
     """
     beside = target.with_name(f"{target.name}.carried")
     shutil.rmtree(beside, ignore_errors=True)
-    shutil.copytree(source, beside, copy_function=_link_or_copy)
-    beside.rename(target)
-
-
-def _link_or_copy(source: str, target: str) -> None:
     try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
+        shutil.copytree(source, beside, copy_function=os.link)
+    except OSError:  # shutil.Error is one
+        shutil.rmtree(beside)
+        shutil.copytree(source, beside)
+    beside.rename(target)

@@ -19,7 +19,7 @@ from rich.filesize import decimal
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder
-from cleargs.manifest import Manifest, plain_json
+from cleargs.manifest import plain_json
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
@@ -99,6 +99,9 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
     trained = [stage for stage in SCENES if stage in manifests]
+    versions: dict[str, str] = {}
+    for manifest in manifests.values():
+        versions |= {**manifest.versions, **manifest.parts.libraries}
     with whole_folder(page_of(run).parent, replace=True) as folder:
         scenes, final = _scenes(folder, run, trained, placed) if trained and placed else ([], None)
         pictures = write_pictures(rows, run, folder, final, planner.threads)
@@ -120,7 +123,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             plans=_plans(planner),
             last=last,
             settings=changed_settings(planner.run.config),
-            versions=_versions(manifests),
+            versions=versions,
             command=command(planner.run, planner.dag),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
@@ -214,14 +217,6 @@ def _toml(value: Any) -> str:
     if value is None:
         return "unset"
     return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
-
-
-def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
-    """Program or library -> version, of all stages together."""
-    found: dict[str, str] = {}
-    for manifest in manifests.values():
-        found |= {**manifest.versions, **{name: str(v) for name, v in manifest.parts.libraries.items()}}
-    return found
 
 
 def _frame_data(row: FrameRow, layers: Mapping[str, Picture], time: float | None) -> dict[str, Any]:

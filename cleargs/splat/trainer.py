@@ -380,17 +380,15 @@ def _all_finite(tensors: Collection[Tensor]) -> bool:
     return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
 
 
-def _numbers(camera: Camera) -> list[float]:
-    size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return [*size, *camera.world_to_camera.ravel().tolist()]
-
-
 def _fingerprint(
     scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
-    seen = [(view.frame_id, view.kind, view.weight, _numbers(view.camera)) for view in views]
+    seen = []
+    for view in views:
+        *lens, pose = vars(view.camera).values()
+        seen.append((view.frame_id, view.kind, view.weight, [*lens, *pose.ravel().tolist()]))
     parts = [settings, seen, scene.antialias, scene.background, list(starts)]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
