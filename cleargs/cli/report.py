@@ -117,15 +117,11 @@ def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None
     from cleargs.report.serve import Server
 
     with Server(dag, read_run_file(run, dag, store=store), host, port) as server:
-        if not _is_loopback(host):
+        loopback = host == "localhost"
+        with suppress(ValueError):
+            loopback = ip_address(host).is_loopback
+        if not loopback:
             click.echo(f"warning: whoever reaches {host} can read the report of this run", err=True)
         click.echo(f"{server.address}  (Ctrl-C ends it)")
         with suppress(KeyboardInterrupt):
             server.serve_forever()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -27,7 +27,10 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
-            if held and not _still_there(path, handle):
+            there = None
+            with suppress(FileNotFoundError):
+                there = path.stat().st_ino
+            if held and there != os.fstat(handle).st_ino:
                 continue  # its last holder removed the file while we waited: lock the new one
             yield held
             return
@@ -75,10 +78,3 @@ def _acquire(handle: int, kind: int) -> bool | None:
     except OSError:
         return None
     return True
-
-
-def _still_there(path: Path, handle: int) -> bool:
-    try:
-        return path.stat().st_ino == os.fstat(handle).st_ino
-    except FileNotFoundError:
-        return False
