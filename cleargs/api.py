@@ -196,8 +196,7 @@ def score_frames(
     import pyarrow as pa
 
     from cleargs.rva.allocation import appearance_scores
-    from cleargs.rva.evaluator import View
-    from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.evaluator import View, make_evaluator
     from cleargs.rva.tables import CUE_COLUMNS
 
     config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]

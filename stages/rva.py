@@ -37,7 +37,7 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
 def preflight(config: RvaConfig) -> None:
     """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
     holds none that can be loaded."""
-    from cleargs.rva.evaluators import check_evaluator
+    from cleargs.rva.evaluator import check_evaluator
 
     check_evaluator(config)
 
@@ -69,8 +69,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
-    from cleargs.rva.evaluator import View, label
-    from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.evaluator import View, label, make_evaluator
     from cleargs.rva.tables import BINS, FRAMES
 
     config, ingest = context.config, context.inputs["ingest"]

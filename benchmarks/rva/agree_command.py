@@ -175,8 +175,7 @@ def _cues_of(
 ) -> EvaluatorCues:
     """Score the frames, or take what RUN/agree keeps of an earlier call."""
     from benchmarks.rva.agreement import EvaluatorCues
-    from cleargs.rva.evaluator import View, label
-    from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.evaluator import View, label, make_evaluator
 
     evaluator = make_evaluator(config, seed=seed, device=device, cache=run / FOLDER / "scores")
     views = [

@@ -9,7 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Collection, Sequence
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -35,7 +38,6 @@ from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, View, require_views
-from cleargs.termination import deferred_sigterm
 
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
@@ -394,3 +396,24 @@ def _fingerprint(
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
+
+
+@contextmanager
+def deferred_sigterm() -> Iterator[Callable[[], bool]]:
+    """Hold SIGTERM back for the block, and yield a function that returns True once it came.
+
+    The block is expected to save its state and to raise KeyboardInterrupt then. A cluster sends SIGTERM
+    before a time limit, so that a job can save. Nothing is held back outside the main thread, where Python
+    runs no signal handlers, nor in a program that does not answer SIGTERM itself.
+    """
+    asked = threading.Event()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM)
+    if not in_main_thread or not callable(before):
+        yield asked.is_set
+        return
+    signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGTERM, before)

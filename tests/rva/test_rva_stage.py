@@ -134,8 +134,7 @@ def test_equal_bytes_for_any_number_of_threads(ingest_dir: Path, tmp_path: Path)
 
 def test_a_broken_image_is_named(ingest_dir: Path, tmp_path: Path) -> None:
     from cleargs.errors import StoreError
-    from cleargs.rva.evaluator import View
-    from cleargs.rva.evaluators import make_evaluator
+    from cleargs.rva.evaluator import View, make_evaluator
 
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no image")
