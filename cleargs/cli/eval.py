@@ -247,11 +247,14 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from cleargs.evaluate.eval_report import LOWER_IS_BETTER
+
     first = report.evaluations[0]
     metrics = [name for name in first.options.metrics if name not in first.unavailable]
     table = Table("subject", "image", box=None, header_style="bold")
     for metric in metrics:
-        table.add_column(_label(metric), justify="right")
+        arrow = "↓" if metric in LOWER_IS_BETTER else "↑"
+        table.add_column(f"{_LABELS.get(metric, Path(metric).stem)} {arrow}", justify="right")
     for evaluation in report.evaluations:
         shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
         for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
@@ -290,12 +293,6 @@ def _regions(evaluation: Evaluation) -> str:
         if part is not None
     )
     return f"{evaluation.subject}: {'; '.join(words)}"
-
-
-def _label(metric: str) -> str:
-    from cleargs.evaluate.eval_report import LOWER_IS_BETTER
-
-    return f"{_LABELS.get(metric, Path(metric).stem)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
 
 
 def _figure(metric: str, value: float | None) -> str:

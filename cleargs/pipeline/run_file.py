@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
 
 import tomli_w
 
@@ -65,16 +64,14 @@ def _commented(config: Config) -> str:
         facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
         comment = f"{setting.meaning} ({facts})" if setting.meaning else facts
         lines += wrap(comment, WIDTH, initial_indent="# ", subsequent_indent="# ")
-        lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
+        if value is None:
+            lines.append(f"# {setting.field} =")
+        elif isinstance(value, list):  # tomli_w spreads lists over lines
+            items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
+            lines.append(f"{setting.field} = [{', '.join(items)}]")
+        else:
+            lines.append(tomli_w.dumps({setting.field: value}).rstrip())
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
-
-
-def _toml_line(name: str, value: Any) -> str:
-    # tomli_w spreads lists over lines.
-    if isinstance(value, list):
-        items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
-        return f"{name} = [{', '.join(items)}]"
-    return tomli_w.dumps({name: value}).rstrip()
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,11 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
     trained = [stage for stage in SCENES if stage in manifests]
+    plans: dict[str, StagePlan] = {}
+    try:
+        plans = {plan.stage: plan for plan in planner.plan()}
+    except InputError as error:  # the capture has gone
+        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
     versions: dict[str, str] = {}
     for manifest in manifests.values():
         versions |= {**manifest.versions, **manifest.parts.libraries}
@@ -120,7 +125,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             bars=charts.fitted_bars(rows),
             stages=planner.dag.names,
             manifests=manifests,
-            plans=_plans(planner),
+            plans=plans,
             last=last,
             settings=changed_settings(planner.run.config),
             versions=versions,
@@ -174,15 +179,6 @@ def _scenes(
             }
         )
     return views, renderer
-
-
-def _plans(planner: Planner) -> dict[str, StagePlan]:
-    """The state of every stage; empty when the capture has gone."""
-    try:
-        return {plan.stage: plan for plan in planner.plan()}
-    except InputError as error:
-        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
-        return {}
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:

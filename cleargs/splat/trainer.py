@@ -11,7 +11,7 @@ import json
 import math
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -182,7 +182,10 @@ class Trainer:
         config, view, at = self._config, self._view(self.done), self._at
         factor = self._schedule.image_factor(at)
         target, mask = self._cache.get(view, factor)
-        formed = self._formed(view, factor, target, mask)
+        formed, render_with_depth = None, partial(self._render, depth=True)
+        if self._formation is not None:
+            progress = at / config.planned
+            formed = self._formation.form(view, factor, progress, target, mask, render_with_depth)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
@@ -287,12 +290,6 @@ class Trainer:
         order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
-    def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
-        if self._formation is None:
-            return None
-        progress = self._at / self._config.planned
-        return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
-
     def _render(self, camera: Camera, *, depth: bool) -> Render:
         return self._rasteriser.view(self.scene, camera, depth=depth, sh_degree=self._sh_degree())
 
@@ -366,20 +363,17 @@ class Trainer:
 def _fault(gaussians: Gaussians) -> str | None:
     """The first parameter that holds NaN or infinity, and in how many Gaussians; None where none does."""
     tensors = gaussians.tensors()
-    if _all_finite(tensors.values()):
+    if gaussians.device.type == "cpu":  # which NumPy tests far sooner
+        finite = all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors.values())
+    else:  # waits for the GPU once
+        finite = bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all())
+    if finite:
         return None
     for name, tensor in tensors.items():
         sound = int(torch.isfinite(tensor).reshape(gaussians.num, -1).all(1).sum())
         if sound < gaussians.num:
             return f"{name} is not finite in {gaussians.num - sound} of {gaussians.num} Gaussians"
     return None
-
-
-def _all_finite(tensors: Collection[Tensor]) -> bool:
-    """Whether no number is NaN or infinite. Waits for a GPU once; a CPU's numbers NumPy tests far sooner."""
-    if not any(tensor.is_cuda for tensor in tensors):
-        return all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors)
-    return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
 
 
 def _fingerprint(

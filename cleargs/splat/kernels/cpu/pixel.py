@@ -1,8 +1,8 @@
 """A pixel's four float32 numbers (RGB and one of padding) as one SIMD value, and a pair of pixels.
 
 Where every pixel reads from another place, `simd`'s lanes would have to be gathered; the channels of a pixel
-lie side by side, and so do two pixels of a row, between which a place lies. Images are [H, W, 4]; offsets
-count elements of the whole array and are not checked.
+lie side by side, and so do two pixels of a row, between which a place lies. + - * / work as between lanes.
+Images are [H, W, 4]; offsets count elements of the whole array and are not checked.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from cleargs.splat.kernels.cpu.simd import (
     _intrinsic,
     _load,
     _operation,
+    _register_arithmetic,
     _register_type,
 )
 from cleargs.splat.kernels.warp_layout import CHANNELS
@@ -40,18 +41,12 @@ pixel = _PixelType("pixel")
 pair = _PairType("pixel pair")
 _register_type(_PixelType, _PIXEL)
 _register_type(_PairType, _PAIR)
+_register_arithmetic(pixel)
+_register_arithmetic(pair)
 
 # Numba's constructor is not annotated.
 _new_tuple: Any = types.UniTuple
 _SHARES = _new_tuple(types.float32, 2)
-
-
-def _scaled(builder: Any, value: Any, factor: Any) -> Any:
-    return builder.fmul(value, _broadcast_to(builder, factor, value.type), flags=_FLAGS)
-
-
-def _plus(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fadd(x, y, flags=_FLAGS)
 
 
 @_operation(pixel)
@@ -78,34 +73,13 @@ def load_pair(typing_context: Any, array: Any, offset: Any) -> Any:
     return pair(array, offset), _load(_PAIR)
 
 
-@_intrinsic
-def scaled(typing_context: Any, value: Any, factor: Any) -> Any:
-    """A pixel or a pair times a float32 ``factor``."""
-    return value(value, types.float32), lambda context, builder, sig, args: _scaled(builder, *args)
-
-
-@_intrinsic
-def plus_scaled(typing_context: Any, total: Any, value: Any, factor: Any) -> Any:
-    """``total + value * factor`` for pixels or pairs and a float32 ``factor``."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _plus(builder, args[0], _scaled(builder, *args[1:]))
-
-    return total(total, value, types.float32), generate
-
-
-@_operation(pair, pair, pair, pair)
-def plus_product(builder: Any, total: Any, x: Any, y: Any) -> Any:
-    """``total + x * y`` for pairs, number by number."""
-    return _plus(builder, total, builder.fmul(x, y, flags=_FLAGS))
-
-
 @_operation(pair, types.float32)
 def shares(builder: Any, second: Any) -> Any:
     """How much each of a pair counts: 1 - ``second``, then ``second``, float32."""
     base = ir.Constant(_PAIR, [1.0] * CHANNELS + [0.0] * CHANNELS)
     rise = ir.Constant(_PAIR, [-1.0] * CHANNELS + [1.0] * CHANNELS)
-    return _plus(builder, base, _scaled(builder, rise, second))
+    change = builder.fmul(rise, _broadcast_to(builder, second, _PAIR), flags=_FLAGS)
+    return builder.fadd(base, change, flags=_FLAGS)
 
 
 @_operation(pair, pixel)
@@ -122,7 +96,7 @@ def sum_of(builder: Any, value: Any) -> Any:
         builder.shuffle_vector(value, value, ir.Constant(_WHOLE, [*range(start, start + CHANNELS)]))
         for start in (0, CHANNELS)
     )
-    return _plus(builder, left, right)
+    return builder.fadd(left, right, flags=_FLAGS)
 
 
 # -- places in an image, x and y in the first two of a pixel's numbers ---------------------------------------

@@ -93,10 +93,6 @@ def _broadcast_to(builder: Any, scalar: Any, vector: Any) -> Any:
     return builder.shuffle_vector(first, undefined, zeros)
 
 
-def _broadcast(builder: Any, scalar: Any) -> Any:
-    return _broadcast_to(builder, scalar, _VECTOR)
-
-
 def _register_operator(
     function: Callable[..., Any], cases: list[Any], emit: Callable[[Any, Any, Any], Any]
 ) -> None:
@@ -104,30 +100,27 @@ def _register_operator(
     for case in cases:
 
         def lower(context: Any, builder: Any, case: Any, values: Any) -> Any:
-            wide = [
-                value if numba_type != types.float32 else _broadcast(builder, value)
-                for value, numba_type in zip(values, case.args, strict=True)
-            ]
+            vector = next(x.type for x in values if isinstance(x.type, ir.VectorType))
+            wide = (x if x.type == vector else _broadcast_to(builder, x, vector) for x in values)
             return emit(builder, *wide)
 
         _lower_builtin(function, *case.args)(lower)
 
 
-def _register_operators() -> None:
-    pairs = [(lanes, lanes), (lanes, types.float32), (types.float32, lanes)]
-    arithmetic = {
-        operator.add: "fadd",
-        operator.sub: "fsub",
-        operator.mul: "fmul",
-        operator.truediv: "fdiv",
-    }
-    for function, name in arithmetic.items():
+def _register_arithmetic(kind: Any) -> None:
+    """Let + - * / work between values of ``kind``, and with float32 scalars on either side."""
+    pairs = [(kind, kind), (kind, types.float32), (types.float32, kind)]
+    operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+    for function, name in operators.items():
 
         def calculate(builder: Any, x: Any, y: Any, name: str = name) -> Any:
             return getattr(builder, name)(x, y, flags=_FLAGS)
 
-        _register_operator(function, [_signature(lanes, *pair) for pair in pairs], calculate)
+        _register_operator(function, [_signature(kind, *pair) for pair in pairs], calculate)
 
+
+def _register_comparisons() -> None:
+    pairs = [(lanes, lanes), (lanes, types.float32), (types.float32, lanes)]
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, symbol in comparisons.items():
 
@@ -137,7 +130,8 @@ def _register_operators() -> None:
         _register_operator(function, [_signature(mask, *pair) for pair in pairs], compare)
 
 
-_register_operators()
+_register_arithmetic(lanes)
+_register_comparisons()
 
 
 def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -218,7 +212,7 @@ def prefetch_to_write(typing_context: Any, array: Any, offset: Any) -> Any:
 @_operation(lanes, types.float32)
 def broadcast(builder: Any, scalar: Any) -> Any:
     """The same float32 in every lane."""
-    return _broadcast(builder, scalar)
+    return _broadcast_to(builder, scalar, _VECTOR)
 
 
 @_operation(lanes)
