@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -44,35 +44,30 @@ class BarReporter:
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        if self._progress is not None:
-            yield from self._bar(self._progress, label, total)
-            return
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.fields[note]}", markup=False),
-            console=self._console,
-        )
-        try:
-            with self._progress:
-                yield from self._bar(self._progress, label, total)
-        finally:
-            self._progress = None
+        with ExitStack() as stack:
+            if self._progress is None:
+                self._progress = Progress(
+                    TextColumn("{task.description}", markup=False),
+                    BarColumn(bar_width=24),
+                    MofNCompleteColumn(),
+                    TimeElapsedColumn(),
+                    TextColumn("{task.fields[left]}"),
+                    TextColumn("{task.fields[note]}", markup=False),
+                    console=self._console,
+                )
+                stack.callback(setattr, self, "_progress", None)
+                stack.enter_context(self._progress)
+            progress = self._progress
+            bar = progress.add_task(printable(label), total=total, left="", note="")
 
-    def _bar(self, progress: Progress, label: str, total: int | None) -> Iterator[Task]:
-        bar = progress.add_task(printable(label), total=total, left="", note="")
+            def show(done: int, note: str, left: float | None) -> None:
+                time_left = f"{timedelta(seconds=round(left))} left" if left else ""
+                progress.update(bar, completed=done, note=note, left=time_left)
 
-        def show(done: int, note: str, left: float | None) -> None:
-            time_left = f"{timedelta(seconds=round(left))} left" if left else ""
-            progress.update(bar, completed=done, note=note, left=time_left)
-
-        yield CountedTask(total, show)
-        progress.stop_task(bar)
+            yield CountedTask(total, show)
+            progress.stop_task(bar)
 
     def info(self, text: str) -> None:
         self._console.print(printable(text), markup=False, highlight=False)

@@ -114,7 +114,6 @@ class SearchKernels(Protocol):
         limit: float,
     ) -> float:
         """Return the sum of weight * min(|observed - exposed image|, limit)."""
-        ...
 
     def normal_equations(
         self,
@@ -130,7 +129,6 @@ class SearchKernels(Protocol):
         active: NDArray[np.int64],
     ) -> tuple[Vector, Vector]:
         """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
-        ...
 
 
 class Level:

@@ -76,11 +76,9 @@ class World(Protocol):
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
         """The mean over the samples in linear light, [H, W, 3]; 1 is sensor white."""
-        ...
 
     def depth(self, pose: Array, lens: Lens) -> Array:
         """Distance along the optical axis through the pixel centres, [H, W]; 0 where there is nothing."""
-        ...
 
 
 def low_discrepancy(count: int) -> Array:

@@ -26,11 +26,9 @@ class Course(Protocol):
 
     def poses(self, shares: Array) -> Array:
         """Poses [T, 3, 4] at ``shares`` [T] of the way; a little beyond 0 and 1 is allowed."""
-        ...
 
     def novel(self, share: float, rng: np.random.Generator) -> Array:
         """A pose [3, 4] off the course, near ``share``, that looks at what the course looks at."""
-        ...
 
 
 @dataclass(frozen=True)
