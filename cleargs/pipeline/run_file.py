@@ -60,17 +60,18 @@ def _commented(config: Config) -> str:
     """All settings as TOML, each below its meaning, range and default; unset ones as a comment."""
     tables: dict[str, list[str]] = {}
     for setting, value in config.settings():
-        lines = tables.setdefault(setting.table, [])
+        table, _, field = setting.name.rpartition(".")
+        lines = tables.setdefault(table, [])
         facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
         comment = f"{setting.meaning} ({facts})" if setting.meaning else facts
         lines += wrap(comment, WIDTH, initial_indent="# ", subsequent_indent="# ")
         if value is None:
-            lines.append(f"# {setting.field} =")
+            lines.append(f"# {field} =")
         elif isinstance(value, list):  # tomli_w spreads lists over lines
             items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
-            lines.append(f"{setting.field} = [{', '.join(items)}]")
+            lines.append(f"{field} = [{', '.join(items)}]")
         else:
-            lines.append(tomli_w.dumps({setting.field: value}).rstrip())
+            lines.append(tomli_w.dumps({field: value}).rstrip())
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
 
 

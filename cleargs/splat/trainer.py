@@ -35,7 +35,7 @@ from cleargs.splat.kernels.cuda import support
 from cleargs.splat.scene import Scene
 from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
+from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, View, require_views
 
@@ -216,7 +216,8 @@ class Trainer:
     def preview(self) -> Tensor:
         """The scene so far [H, W, 3], at the view that counts most, reduced; valid until the next step."""
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
-        return self._render(preview_camera(view.camera), depth=False).image
+        camera = view.camera.scaled(min(1.0, PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
+        return self._render(camera, depth=False).image
 
     def shares_of_work(self) -> list[float]:
         """For 0 to ``length`` steps done, the share of the work that is behind us: growth makes later steps
