@@ -180,6 +180,17 @@ def backpropagate_one(
         grad_means[g, axis] = turned + (towards[axis] - radial * direction[axis]) / distance
 
 
+@device
+def clear_gradients(g: int, outputs: Parameters) -> None:
+    """Zero gradient for a Gaussian that touches no tile."""
+    grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
+    grad_means[g, :] = ZERO
+    grad_log_scales[g, :] = ZERO
+    grad_rotations[g, :] = ZERO
+    grad_logits[g] = ZERO
+    grad_sh[g, :, :] = ZERO
+
+
 @kernel
 def backpropagate(
     parameters: Parameters,
@@ -204,12 +215,7 @@ def backpropagate(
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             begin, end = pair_offsets[g], pair_offsets[g + 1]
             if begin == end:
-                grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
-                grad_means[g, :] = ZERO
-                grad_log_scales[g, :] = ZERO
-                grad_rotations[g, :] = ZERO
-                grad_logits[g] = ZERO
-                grad_sh[g, :, :] = ZERO
+                clear_gradients(g, outputs)
                 continue
             sums[:] = 0.0
             for pair in range(begin, end):
