@@ -38,7 +38,7 @@ def preflight(config: RvaConfig) -> None:
     """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
     holds none that can be loaded.
     """
-    from cleargs.rva.evaluator import check_evaluator
+    from cleargs.rva.evaluators import check_evaluator
 
     check_evaluator(config)
 
