@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cleargs.progress import CountedTask, LineReporter, Reporter, Task
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -14,7 +14,7 @@ from torch import Tensor
 from cleargs.files import write_bytes
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.types import Reading
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 _ROW = np.dtype(
     [
@@ -39,7 +39,7 @@ class TrainLog:
         self._rows = np.zeros(steps, _ROW)
 
     def seen(
-        self, step: int, view: View, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
+        self, step: int, view: TrainingView, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
     ) -> None:
         """Write what a step trains on; `measured` fills in the rest."""
         self._rows[step] = (

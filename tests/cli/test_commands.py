@@ -21,7 +21,7 @@ from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
-from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import usable_cores
 
 
@@ -399,7 +399,9 @@ def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
 
 
 def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def outcome(stage: str, how: Literal["found", "made"], files: list[str], **summary: object) -> Outcome:
+    def outcome(
+        stage: str, how: Literal["found", "made"], files: list[str], **summary: object
+    ) -> StageOutcome:
         parts = KeyParts(
             stage=stage, version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
         )
@@ -419,7 +421,7 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
             device="cpu",
             summary=summary,
         )
-        return Outcome(stage, how, manifest, tmp_path)
+        return StageOutcome(stage, how, manifest, tmp_path)
 
     held_back = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
     outcomes = [

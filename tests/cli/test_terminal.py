@@ -17,7 +17,7 @@ from cleargs.cli.main import explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 CLIPBOARD = "\x1b]52;c;ZXZpbA==\x07"
 CLEAR = "\x1b[2J\x1b[H"
