@@ -27,7 +27,7 @@ from cleargs.rivr.distillation import TrainedScene
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.camera import Camera
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8
 
 HELD_OUT, UNPLACED = "held out", "not placed"
