@@ -37,6 +37,8 @@ ROLLING_START = 0.1
 """Share of the schedule from which frames are tested for a rolling shutter. A scene learns to look like
 skewed frames. At a place that few frames see, it hides a skew before `FormationConfig.start`
 (docs/experiments/formation.md)."""
+DOUBTED = 0.5
+"""Weight by RVA below which a frame is doubted."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -144,6 +146,7 @@ class CaptureFormation:
                 mask,
                 render,
                 factor=factor,
+                doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
             )

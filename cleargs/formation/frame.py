@@ -24,9 +24,9 @@ from cleargs.splat.formation import Renderer
 from cleargs.splat.kernels.warp_layout import CHANNELS, DisplacementFields
 from cleargs.splat.types import Render
 
-EVIDENCE = 0.03
-"""Share of the squared error on unseen tiles that further blur must explain before a frame is searched. It is
-from tuning captures (docs/experiments/formation.md)."""
+EVIDENCE, DOUBTED_EVIDENCE = 0.015, 0.005
+"""Share of the squared error on unseen tiles that further blur must explain before a frame is searched; the
+second holds for frames that RVA doubts. Both are from tuning captures (docs/experiments/formation.md)."""
 SEARCHED_SHARE = 0.05
 """Margin of a search, as a share of the longer side."""
 
@@ -88,6 +88,7 @@ def fit_motion(
     render: Renderer,
     *,
     factor: float = 1.0,
+    doubted: bool = False,
     rolling: bool = False,
     test_rolling: bool = False,
 ) -> FrameFormation:
@@ -105,6 +106,7 @@ def fit_motion(
         mask: Its mask, [H, W].
         render: Renders the scene with depth.
         factor: Size of ``camera`` over that of the frame.
+        doubted: RVA doubts the frame, so less evidence is needed for a search.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
     """
@@ -118,7 +120,8 @@ def fit_motion(
     best = _accepted(found[-1], found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     asked = untested or test_rolling or not _admitted(frame.model, rolling)
-    if asked or (evidence.gain > EVIDENCE and best.misfit > MIN_MISFIT):
+    enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
+    if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
         if wide > margin:
             margin, rendered = wide, render(widened(camera, wide))

@@ -133,6 +133,7 @@ class TrainedScene:
                 torch.from_numpy(observed),
                 None if mask is None else torch.from_numpy(mask),
                 self._with_depth,
+                doubted=True,
                 rolling=rolls(self.formations.values()),
             )
         if found.model == "none":
