@@ -5,7 +5,8 @@ the scene of that time. A test of a few milliseconds (`pretest`) says if blur is
 nothing explains; only then the frame is searched. Sharp frames are therefore tested and not searched. The
 sharper the scene becomes, the more of their blur the test finds.
 
-Later trainings continue with the formations of the first one, and count on.
+Later trainings continue with the formations of the first one, and count on. If the shutter rolls, every frame
+is searched at the first look of a training and at every fourth one, since the test cannot see a skew.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ skewed frames. At a place that few frames see, it hides a skew before `Formation
 (docs/experiments/formation.md)."""
 DOUBTED = 0.5
 """Weight by RVA below which a frame is doubted."""
+SEARCH_EVERY = 4
+"""Looks at a frame from one search to the next where the shutter rolls."""
 MIN_TESTED_FRAMES, MAX_TESTED_FRAMES = 4, 16
 """Fewest and most frames that are tested for a rolling shutter. Between the two, half of the capture's frames
 are tested."""
@@ -92,6 +95,8 @@ class CaptureFormation:
         real = sorted(view.frame_id for view in weighted if view.kind == "real")
         known = known or {}
         self._frames = {frame_id: known.get(frame_id, FrameFormation(frame_id)) for frame_id in real}
+        if self._rolls():  # a training begins with a search
+            self._frames = {k: replace(frame, draws=0) for k, frame in self._frames.items()}
         self._tested = {real[k] for k in _tested_frames(len(real))}
         self._weights = {view.frame_id: view.weight for view in weighted if view.kind == "real"}
 
@@ -148,6 +153,7 @@ class CaptureFormation:
                 factor=factor,
                 doubted=self._weights[frame_id] < DOUBTED,
                 rolling=self._rolls(),
+                again=(frame.draws // self._config.every) % SEARCH_EVERY == 0,
                 test_rolling=frame_id in self._tested and frame.skew_gain is None,
             )
 

@@ -91,11 +91,12 @@ def fit_motion(
     doubted: bool = False,
     rolling: bool = False,
     test_rolling: bool = False,
+    again: bool = False,
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
     A known formation is refined. The frame is searched only if the test of `pretest` finds blur that the
-    present model does not explain, or if a rolling shutter is asked for.
+    present model does not explain, or if a rolling shutter is asked for: the test cannot see a skew.
 
     Args:
         frame: The formation so far. Its model remains a candidate.
@@ -109,6 +110,7 @@ def fit_motion(
         doubted: RVA doubts the frame, so less evidence is needed for a search.
         rolling: Admit models with a skew.
         test_rolling: Measure how much such a model would explain (`skew_gain`) even where none is admitted.
+        again: Search a frame of a rolling shutter again.
     """
     # A formation that was found under the other assumption about the shutter is searched again.
     unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
@@ -119,7 +121,8 @@ def fit_motion(
     found = refine(pair, frame.model, _scaled(frame.motion, factor), pose=config.pose)
     best = _accepted(found[-1], found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
-    asked = untested or test_rolling or not _admitted(frame.model, rolling)
+    skews = rolling or test_rolling
+    asked = untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
     enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
@@ -127,17 +130,15 @@ def fit_motion(
             margin, rendered = wide, render(widened(camera, wide))
             pair = frame_pair(rendered, affine, target, mask, camera, margin)
         whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
-        known, found = (
-            found[-1],
-            search(
-                pair,
-                start=blur_along(whole.length, whole.angle),
-                skew=rolling or test_rolling,
-                defocus=whole.disc_gain > whole.line_gain,
-                pose=config.pose,
-            ),
+        known = found[-1]
+        found = search(
+            pair,
+            start=None if skews else blur_along(whole.length, whole.angle),
+            skew=skews,
+            defocus=skews or whole.disc_gain > whole.line_gain,
+            pose=config.pose,
         )
-        if rolling or test_rolling:
+        if skews:
             frame = replace(frame, skew_gain=_skew_gain(found))
         if known.model != "none":
             found += refine(pair, known.model, known.motion, pose=config.pose)[1:]

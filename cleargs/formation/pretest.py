@@ -34,8 +34,8 @@ TILE = 32
 """Side of a tile at the largest size, px. It stays the same part of the image at smaller sizes."""
 MIN_TILE = 4
 
-MIN_VARIANCE = 0.1
-"""Variance below which a blur does not count as evidence, px^2: that of a sweep of 1.1 px."""
+MIN_VARIANCE = 0.05
+"""Variance below which a blur does not count as evidence, px^2: that of a sweep of 0.8 px."""
 
 _STILL, _ALL = 4, 7
 """Numbers of the fit without a blur, and of the whole fit."""
