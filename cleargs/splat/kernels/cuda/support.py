@@ -51,3 +51,23 @@ def memory_errors() -> Iterator[None]:
             f"the GPU's memory is full: {str(error).splitlines()[0]}",
             hint="lower g0.budget, cache_mb or ingest.max_size and run again: the last checkpoint is kept",
         ) from error
+
+
+def gpu_fault(error: BaseException | None) -> str | None:
+    """Return in one line what the GPU, its driver or Triton reported; None for any other error.
+
+    The causes of ``error`` are searched too.
+    """
+    while error is not None:
+        line = (str(error).strip().splitlines() or [""])[0]
+        if isinstance(error, torch.cuda.OutOfMemoryError):
+            return f"the GPU's memory is full: {line}"
+        if "driver" in line and "too old" in line:
+            return f"the NVIDIA driver is too old for this PyTorch (CUDA {torch.version.cuda})"
+        if "no NVIDIA driver" in line:
+            return "PyTorch finds no NVIDIA driver"
+        from_triton = type(error).__module__.split(".")[0] == "triton"
+        if from_triton or (isinstance(error, RuntimeError) and "CUDA" in line):
+            return f"{type(error).__name__}: {line}"
+        error = error.__cause__ or error.__context__
+    return None
