@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -157,3 +158,28 @@ def test_obstacles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "CPU only" in str(gpu.cuda_obstacle(tmp_path))
     monkeypatch.setattr(gpu, "version", lambda name: "2.13.0")
     assert gpu.cuda_obstacle(tmp_path) is None
+
+
+def test_the_self_test_needs_neither_pycolmap_nor_pydantic() -> None:
+    """A machine that is lent for a test has PyTorch, Triton and Numba only."""
+    pytest.importorskip("triton")
+    absent = (
+        "pycolmap",
+        "OpenImageIO",
+        "pydantic",
+        "pyarrow",
+        "cv2",
+        "safetensors",
+        "click",
+        "rich",
+        "scipy",
+    )
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({absent}))
+import cleargs.gpu
+import cleargs.splat.kernels.cuda.self_test
+import cleargs.splat.kernels.cuda.backend
+import cleargs.splat.kernels.cpu.backend
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
