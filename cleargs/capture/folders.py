@@ -35,11 +35,11 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
         for path in found
         if path.suffix.lower() in IMAGE_SUFFIXES
         and path.is_file()
-        and lies_below(path.relative_to(folder).as_posix())
+        and is_inside(path.relative_to(folder).as_posix())
     ]
 
 
-def lies_below(name: str) -> bool:
+def is_inside(name: str) -> bool:
     """Return True if a listed ``name`` stays in its folder and is not hidden.
 
     Only such files are part of a folder's digest.

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera
+from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
 from cleargs.media.image import image_size, read_alpha, read_mask, read_rgb, write_mask, write_rgb
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
+from cleargs.types import ImageU8, MaskU8
 
 _COARSEST_MASK = 8
 """Most pixels of a working image that one of its mask may stand for, along a side."""
@@ -32,7 +32,7 @@ class WorkFrame:
     width: int
     height: int
     masked: bool
-    camera: Camera | None
+    camera: Intrinsics | None
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
@@ -90,12 +90,12 @@ def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = 
         return False
 
 
-def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W] or [H, W, 3]
+def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
     """The image with a long side of at most ``long_side`` px, by area averaging."""
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:
         return image
-    smaller: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    smaller: ImageU8 = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     return smaller
 
 
@@ -105,14 +105,14 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decoded(video: Path, frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+def _decoded(video: Path, frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
     """The names and pictures of these frames of a video, in its order."""
     names = {frame.pts: name for name, frame in frames.items() if frame.pts is not None}
     if names:
         yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, names))
 
 
-def read_image(frame: SourceFrame) -> NDArray[np.uint8]:  # [H, W, 3]
+def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
     """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
     return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
@@ -155,7 +155,7 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
     return WorkFrame(frame, image.name, width, height, stencil is not None, camera)
 
 
-def read_stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
+def read_stencil(frame: SourceFrame) -> MaskU8 | None:
     """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
     if frame.mask is not None:
         return read_mask(frame.mask)

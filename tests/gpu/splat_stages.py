@@ -25,7 +25,7 @@ from pack_run import unpack
 from cleargs.capture.tables import load_frames
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
-from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.observed import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.splat.ply import read_ply
@@ -60,7 +60,7 @@ def train(run: Path, out: Path, config: g0.G0Config, device: Any) -> dict[str, A
             externals={},
             out=folders["g0"],
             checkpoints=folders["checkpoints"],
-            kept=folders["kept"],
+            cache=folders["kept"],
             seed=0,
             device=device,
             threads=torch.get_num_threads(),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
-from cleargs.capture.folders import chosen, frame_key, image_files, lies_below, mask_externals
+from cleargs.capture.folders import chosen, frame_key, image_files, is_inside, mask_externals
 from cleargs.errors import InputError
 
 
@@ -34,7 +34,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     if not root.is_dir():
         raise InputError(f"{source} has a sparse model but no images/", hint="put the images into images/")
     posed = {image.name: image for image in model.images.values()}
-    outside = [name for name in posed if not lies_below(name)]
+    outside = [name for name in posed if not is_inside(name)]
     if outside:
         raise InputError(
             f"the COLMAP model lists images outside images/ or hidden in it, such as {outside[0]}",
