@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cleargs
-from cleargs.children import module_command
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.kernel_cache import cache_folder
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
+from cleargs.subprocesses import module_command
 
 SELF_TEST = "cleargs.splat.kernels.cuda.self_test"
 
@@ -74,8 +74,8 @@ class SelfTest(NamedTuple):
     gpu_ms: float = 0.0
     """Duration of a training step on the GPU; 0 where it was not measured."""
     cpu_ms: float = 0.0
-    full: bool = False
-    """True: the GPU's memory was full, which says nothing about the kernels."""
+    keep: bool = True
+    """False: the GPU's memory was full, or no GPU was visible. The next test may pass."""
 
     @property
     def fault(self) -> str | None:
@@ -147,7 +147,7 @@ def _kernel_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def remembered_test(facts: dict[str, str]) -> SelfTest | None:
+def cached_test(facts: dict[str, str]) -> SelfTest | None:
     """Return the result of an earlier self-test with the same facts; None if there is none."""
     with suppress(*FAULTS):
         return read_result(facts, str(read_json(_cached(facts))["output"]))
@@ -180,9 +180,9 @@ def self_test(
         # bytes, in spite of text=True
         output, end = (expired.stdout or b"").decode(), f"not done after {limit_s:.0f} s"
     if end:
-        output += "\n" + json.dumps({"stopped": end, "full": False})
+        output += "\n" + json.dumps({"stopped": end, "keep": True})
     result = read_result(facts, output)
-    if not result.full:  # another program takes the memory, and may have ended next time
+    if result.keep:
         with suppress(StoreError):
             write_json(_cached(facts), {"facts": facts, "output": output})
     return result
@@ -199,7 +199,7 @@ def read_result(facts: dict[str, str], output: str) -> SelfTest:
                 result.checks.append(Check(found["check"], list(found["faults"]), float(found["seconds"])))
             elif "stopped" in found:
                 result.checks.append(Check(running, [str(found["stopped"])]))
-                result = result._replace(full=found["full"] is True)
+                result = result._replace(keep=found["keep"] is True)
             elif "gpu_ms" in found:
                 result = result._replace(gpu_ms=float(found["gpu_ms"]), cpu_ms=float(found["cpu_ms"]))
     if not result.gpu_ms and result.fault is None:

@@ -38,7 +38,7 @@ def test_a_fast_gpu_that_passes_is_taken() -> None:
     assert result.reason == (
         "NVIDIA A1 passed its self-test; a training step takes 2 ms on the GPU, 50 ms on the CPU"
     )
-    assert gpu.remembered_test(FACTS) == result
+    assert gpu.cached_test(FACTS) == result
     assert result.lines()[-2:] == [
         "Adam: passed, 0.5 s",
         "a training step takes 2 ms on the GPU, 50 ms on the CPU",
@@ -55,7 +55,7 @@ def test_a_slow_gpu_is_not() -> None:
 @pytest.mark.parametrize("fact", FACTS)
 def test_a_result_belongs_to_all_of_its_facts(fact: str) -> None:
     run_child(prints(CHECKS + FAST))
-    assert gpu.remembered_test({**FACTS, fact: "another"}) is None
+    assert gpu.cached_test({**FACTS, fact: "another"}) is None
 
 
 def test_a_failed_check_keeps_the_gpu_out() -> None:
@@ -66,7 +66,7 @@ def test_a_failed_check_keeps_the_gpu_out() -> None:
         "the GPU failed its self-test (Adam: means: differs by 1); cleargs doctor --gpu repeats it"
     )
     assert result.lines()[-4:-1] == ["Adam: failed, 0.5 s", "  means: differs by 1", "  sh: differs by 2"]
-    assert gpu.remembered_test(FACTS) == result
+    assert gpu.cached_test(FACTS) == result
 
 
 @pytest.mark.parametrize(
@@ -86,16 +86,16 @@ def test_a_child_that_breaks_off(code: str, fault: str) -> None:
 
 
 def test_a_full_memory_is_tested_again() -> None:
-    stopped = json.dumps({"stopped": "the GPU's memory is full: 1 of 24 GiB free", "full": True})
-    assert run_child(prints(CHECKS + stopped)).full
-    assert gpu.remembered_test(FACTS) is None
+    stopped = json.dumps({"stopped": "the GPU's memory is full: 1 of 24 GiB free", "keep": False})
+    assert not run_child(prints(CHECKS + stopped)).keep
+    assert gpu.cached_test(FACTS) is None
 
 
 def test_a_damaged_result_counts_as_none(cache: Path) -> None:
     run_child(prints(CHECKS + FAST))
     (file,) = cache.iterdir()
     file.write_text("{")
-    assert gpu.remembered_test(FACTS) is None
+    assert gpu.cached_test(FACTS) is None
 
 
 # -- what the machine has ----------------------------------------------------------------------------------

@@ -34,8 +34,8 @@ def test_the_interpreter_passes(cache: Path) -> None:
     assert tested.fault is None, tested.lines()
     assert len(tested.checks) == 8
     assert all(check.seconds for check in tested.checks)
-    assert gpu.remembered_test(FACTS) == tested
-    assert gpu.remembered_test({**FACTS, "driver": "another"}) is None
+    assert gpu.cached_test(FACTS) == tested
+    assert gpu.cached_test({**FACTS, "driver": "another"}) is None
     # It is no fast device.
     assert tested.device == "cpu"
     assert "Triton's interpreter passed its self-test; a training step takes" in tested.reason
@@ -49,7 +49,7 @@ def test_a_kernel_that_ends_nothing_or_all(fault: str, sentence: str) -> None:
     tested = in_child(fault, limit_s=25.0)
     assert tested.fault == sentence
     assert tested.device == "cpu"
-    assert gpu.remembered_test(FACTS) == tested
+    assert gpu.cached_test(FACTS) == tested
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_a_full_memory_is_not_kept(run: Callable[..., SelfTest], monkeypatch: py
     tested = run()
     expected = "loss and colour: the GPU's memory is full: CUDA out of memory. Tried to allocate 2 GiB."
     assert tested.fault == expected
-    assert tested.full
+    assert not tested.keep
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_launch_that_fails(
     plant(monkeypatch, error)
     tested = run()
     assert tested.fault == f"loss and colour: {sentence}"
-    assert not tested.full
+    assert tested.keep
 
 
 def test_a_kernel_that_asks_for_too_much(
@@ -181,4 +181,6 @@ def test_a_driver_that_is_missing_or_too_old(
         raise RuntimeError(words)
 
     monkeypatch.setattr(torch.cuda, "init", fail)
-    assert str(run("cuda").fault).startswith(f"the start of CUDA: {sentence}")
+    tested = run("cuda")
+    assert str(tested.fault).startswith(f"the start of CUDA: {sentence}")
+    assert not tested.keep

@@ -286,9 +286,11 @@ def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
         print(json.dumps(facts), flush=True)
 
     say(starts="the start of CUDA")
+    started = False
     try:
         if device == "cuda":
             torch.cuda.init()
+        started = True
         from cleargs.splat.kernels.cpu import backend as cpu
         from cleargs.splat.kernels.cuda import backend as gpu
 
@@ -307,7 +309,8 @@ def main(device: str = "cuda", sizes: Sizes = FULL) -> None:
     except Exception as error:
         line = (str(error).strip().splitlines() or [""])[0]
         full = isinstance(error.__cause__ or error, torch.cuda.OutOfMemoryError)
-        say(stopped=gpu_fault(error) or f"{type(error).__name__}: {line}", full=full)
+        # A GPU that is busy, or not visible to this job, may pass next time.
+        say(stopped=gpu_fault(error) or f"{type(error).__name__}: {line}", keep=started and not full)
 
 
 if __name__ == "__main__":
