@@ -188,7 +188,8 @@ def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
 
 def minutes(sections: Iterable[Section], context: EvidenceContext) -> list[float]:
     """Rough time of each section on two quiet cores, everything still to be made; what a section before it
-    has made takes no time."""
+    has made takes no time.
+    """
     made: set[object] = set()
 
     def first(*what: object) -> bool:

@@ -58,7 +58,8 @@ def save_section(folder: Path, found: SectionOutcome, version: str, machine: str
 
 def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[SavedSection]:
     """Those of ``sections`` that ``folder`` has, as they are listed now; what was made from another list, or
-    cannot be read, is left out with a warning."""
+    cannot be read, is left out with a warning.
+    """
     found = []
     for section in sections:
         path = _file(folder, section)

@@ -74,7 +74,8 @@ def observation(view: TrainingView) -> tuple[ImageF32, MaskBool | None]:
 
 class TrainedScene:
     """A scene on disk (``scene.ply``, ``exposure.parquet`` and ``formation.parquet`` in ``folder``), ready to
-    be rendered. Raises StoreError without one of them."""
+    be rendered. Raises StoreError without one of them.
+    """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         self.folder = folder
@@ -111,7 +112,8 @@ class TrainedScene:
 
     def deblur(self, view: TrainingView) -> Deblurred | None:
         """The raw frame without what the camera did to it, found by comparing it with the scene; None where
-        nothing explains the frame better than the render as it is."""
+        nothing explains the frame better than the render as it is.
+        """
         observed, mask = observation(view)
         affine = (
             None
@@ -227,7 +229,8 @@ def publish(scene: TrainedScene, trainings: Sequence[Path], out: Path, rejected:
 
 def drop_state(training: Path) -> None:
     """Drop from the folder of a finished training what only the last one is asked for: its state, which is
-    three times as large as the scene."""
+    three times as large as the scene.
+    """
     (training / STATE).unlink(missing_ok=True)
 
 

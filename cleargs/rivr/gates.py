@@ -93,7 +93,8 @@ def shifts(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
 
 def colour_differences(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
     """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
-    farthest, in sRGB [rows, columns]."""
+    farthest, in sRGB [rows, columns].
+    """
     means, *references = (_block_means(image) for image in (repair, observed, render))
     nearer: ArrayF64 = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
     return nearer

@@ -163,7 +163,8 @@ def blocks(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 def rendered(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
-    front."""
+    front.
+    """
     out = splat(image, rng, _log_uniform(rng, 2.2, 7.0), rng.uniform(1.5, 8.0))
     if rng.random() < 0.5:
         share = patches(image.shape[0], image.shape[1], rng)
@@ -274,7 +275,8 @@ def _footprint(
     width: int,
 ) -> tuple[tuple[slice, slice], NDArray[np.float64]]:
     """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the
-    centre."""
+    centre.
+    """
     x, y, angle, major, minor = gaussian
     c, s = np.cos(angle), np.sin(angle)
     reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)

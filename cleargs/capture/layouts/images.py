@@ -36,6 +36,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
 
 def _images_of(root: Path) -> Path:
     """The first folder that holds any image of ``images/``, ``root`` itself, and the reductions, the largest
-    first; ``root`` where none does."""
+    first; ``root`` where none does.
+    """
     folders = [root / "images", root, *image_folders(root)]
     return next((folder for folder in folders if folder.is_dir() and image_files(folder)), root)

@@ -44,7 +44,8 @@ def video_frame(source: Path, timeline: Timeline, index: int) -> SourceFrame:
 
 def choose_times(timeline: Timeline, fps: float | None, at_most: int) -> list[int]:
     """Frame numbers evenly in time (not in number: the frame rate may vary): every 1 / fps seconds if given,
-    and at most so many from first to last."""
+    and at most so many from first to last.
+    """
     import numpy as np
 
     times = np.array([timeline.seconds(index) for index in range(len(timeline.pts))])
