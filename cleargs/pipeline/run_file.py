@@ -45,7 +45,7 @@ class RunSpec:
     device: Device
     on_cpu: tuple[str, ...] = ()
     """Stages that run on the CPU although `device` is the GPU: its kernels failed there."""
-    falls_back: bool = False
+    falls_back: bool = field(default=False, compare=False)
     """True: a stage runs again on the CPU if the kernels of the GPU fail. ``run.toml`` does not hold this."""
 
     def device_of(self, stage: str) -> Device:
