@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from toy import Bench, Square, make_bench
 
+from cleargs.batch.loop import Batch
+from cleargs.batch.sheet import SceneJob
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError, StageError
 from cleargs.gpu import NO_GPU, Check, SelfTest
@@ -143,14 +145,22 @@ def breaking(bench: Bench, gpu: Callable[[SelfTest | None], None]) -> Bench:
     return replace(bench, dag=Dag(bench.dag.names, stages.__getitem__, gpu_fault=gpu_fault))
 
 
-def run_on(bench: Bench, device: DeviceChoice, *, stage: str | None = None) -> list[StageOutcome]:
+def run_on(
+    bench: Bench,
+    device: DeviceChoice,
+    *,
+    stage: str | None = None,
+    folder: Path | None = None,
+    store: Path | None = None,
+) -> list[StageOutcome]:
     """``cleargs run --device DEVICE``, or ``cleargs stage``."""
     (recipe := bench.root / "toy.toml").write_text("seed = 0\n")
     settings = resolve_run(
         bench.dag,
         bench.capture,
-        bench.folder,
+        folder or bench.folder,
         workflow=str(recipe),
+        store=store,
         device=device,
         say=bench.remarks.info,
     )
@@ -225,3 +235,14 @@ def test_a_damaged_list_of_stages_is_told(breaking: Bench) -> None:
     path.write_text(path.read_text().replace('"square",', "1,"))
     with pytest.raises(ConfigError, match="damaged"):
         read_run_file(breaking.folder, breaking.dag)
+
+
+def test_a_batch_finds_a_scene_that_left_the_gpu(breaking: Bench) -> None:
+    scene = SceneJob("barn", breaking.capture, str(breaking.root / "toy.toml"), (), "line 1")
+    batch = Batch(breaking.dag, breaking.root / "batch", [scene], "cuda", falls_back=True)
+    assert "--device auto" in " ".join(batch.arguments(scene))
+    run_on(breaking, "auto", folder=batch.run_folder(scene), store=batch.folder / "store")
+    assert batch.result(scene).state == "done"
+    named = replace(batch, falls_back=False)
+    assert "--device cuda" in " ".join(named.arguments(scene))
+    assert named.result(scene).state == "waiting"
