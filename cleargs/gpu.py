@@ -98,7 +98,7 @@ class SelfTest(NamedTuple):
         return f"a training step takes {self.gpu_ms:.3g} ms on the GPU, {self.cpu_ms:.3g} ms on the CPU"
 
     def lines(self) -> list[str]:
-        """The whole result as text for an issue."""
+        """Return the whole result as text for an issue."""
         lines = [f"cleargs {cleargs.__version__}, Python {platform.python_version()}"]
         lines += [f"{name}: {value}" for name, value in self.facts.items()]
         for check in self.checks:

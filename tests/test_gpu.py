@@ -18,7 +18,7 @@ FACTS = {"gpu": "NVIDIA A1", "driver": "550.54.15", "torch": "2.11.0", "triton":
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Results are kept here."""
+    """Return the folder of cached results."""
     monkeypatch.setattr(gpu, "cache_folder", lambda name: tmp_path)
     return tmp_path
 
@@ -98,7 +98,7 @@ def test_a_damaged_result_counts_as_none(cache: Path) -> None:
     assert gpu.cached_test(FACTS) is None
 
 
-# -- what the machine has ----------------------------------------------------------------------------------
+# -- this machine ------------------------------------------------------------------------------------------
 
 
 def test_facts_of_linux(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""``cleargs doctor``: what this machine offers, and what stands in the way."""
+"""``cleargs doctor``: a check of this machine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MIN_DISK_GB = 5.0
 
 
 class Finding(NamedTuple):
-    """One thing looked at."""
+    """The result of one check."""
 
     what: str
     state: Literal["ok", "note", "bad"]
@@ -50,7 +50,7 @@ class Finding(NamedTuple):
 def doctor(folder: Path, wants_test: bool, as_json: bool) -> int:
     """Check this machine: versions, cores, memory, disk, device, caches.
 
-    FOLDER is where runs would be kept. Exit code 1 when something would keep a run from working.
+    FOLDER is the folder for runs. The exit code is 1 if a run would fail on this machine.
     """
     pace = cached_pace()
     device, report = _device(wants_test)
@@ -111,7 +111,7 @@ def _library(name: str) -> Finding:
 
 
 def _room(what: str, free: float, least_gb: float, place: str, advice: str) -> Finding:
-    """How many bytes are ``free``, with ``advice`` where they are few."""
+    """Return a finding about ``free`` bytes, with ``advice`` if there are too few."""
     words = f"{free / 1e9:.1f} GB free{place}"
     enough = free / 1e9 >= least_gb
     return Finding(what, "ok" if enough else "note", words if enough else f"{words}; {advice}")

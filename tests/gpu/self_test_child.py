@@ -32,12 +32,12 @@ ONE_CHECK = SMALL._replace(views={}, refined=40)
 
 
 def hang(*given: object, **options: object) -> None:
-    """Never return, as a kernel that waits for itself."""
+    """Never return, as a kernel that hangs."""
     time.sleep(3600)
 
 
 def crash(*given: object, **options: object) -> None:
-    """End the process, as a driver that fails."""
+    """End the process, as a driver that crashes."""
     os.kill(os.getpid(), signal.SIGSEGV)
 
 

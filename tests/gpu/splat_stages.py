@@ -5,8 +5,8 @@
 RUN holds the finished folders ``ingest`` and ``rva``, made by ``cleargs run CAPTURE -o RUN --until rva`` on
 any machine, with ``--set ingest.holdout=every:8`` for held-out frames, and ``--set ingest.max_size=...``
 where images are larger than 960 px. It may be packed, see ``pack_run.py``. OUT gets the scene, its log and
-``stages.json``: time, PSNR of the frames trained on and of those held out, and memory. What a time limit cuts
-off resumes from its checkpoint when the same command is given again.
+``stages.json``: time, PSNR of training and held-out frames, and memory. After a time limit, the same command
+resumes from the checkpoint.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from stages import g0
 
 
 class Lines(SilentReporter):
-    """Remarks and warnings as lines."""
+    """Print remarks and warnings."""
 
     def info(self, text: str) -> None:
         print(text, flush=True)
@@ -45,7 +45,7 @@ class Lines(SilentReporter):
 
 
 def train(run: Path, out: Path, config: g0.G0Config, device: Any) -> dict[str, Any]:
-    """The stage, timed; its summary and what else is asked of it."""
+    """Run the stage and return its summary, duration and memory."""
     inputs = {name: (run / name).resolve(strict=True) for name in ("ingest", "rva")}
     folders = {name: out / name for name in ("g0", "checkpoints", "kept")}
     for folder in folders.values():
@@ -69,7 +69,7 @@ def train(run: Path, out: Path, config: g0.G0Config, device: Any) -> dict[str, A
     )
     seconds = time.perf_counter() - start
     return {
-        "seconds": None if going_on else round(seconds, 1),  # of the whole, decoding and evaluation included
+        "seconds": None if going_on else round(seconds, 1),  # with decoding and evaluation
         **result.summary,
         "psnr_held_out": held_out(inputs["ingest"], folders["g0"], device),
         "peak_memory_gb": round(torch.cuda.max_memory_allocated() / 1e9, 2) if device == "cuda" else None,
@@ -77,7 +77,7 @@ def train(run: Path, out: Path, config: g0.G0Config, device: Any) -> dict[str, A
 
 
 def held_out(ingest: Path, scene_folder: Path, device: Any) -> float | None:
-    """Mean PSNR in dB of the frames kept from training; None where there are none."""
+    """Return the mean PSNR in dB of held-out frames; None if there are none."""
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "test"]
     views = [view_of(frame, ingest, 1.0) for frame in frames]
     scene = read_ply(scene_folder / "scene.ply").to(device)

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU at toy size: its tables, and its errors, which do not depend on where it runs."""
+"""The benchmark of a GPU at toy size: its tables, and its errors, which are the same on every machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALL, LARGE = BenchmarkCase(6, 15, 12), BenchmarkCase(9, 16, 14)
 
 @pytest.fixture
 def bench(device):
-    """The modules, imported late, since they import Triton."""
+    """Return the modules. They import Triton, so this is late."""
     return importlib.import_module("benchmarks.speed.device")
 
 

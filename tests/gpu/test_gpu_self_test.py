@@ -1,4 +1,4 @@
-"""The self-test of a GPU: the interpreter is a device that passes, planted faults are devices that fail."""
+"""The self-test of a GPU. The interpreter stands in for a GPU that passes, planted faults for others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FACTS = {"gpu": "Triton's interpreter", "driver": "none"}
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Results are kept here."""
+    """Return the folder of cached results."""
     monkeypatch.setattr("cleargs.gpu.cache_folder", lambda name: tmp_path)
     return tmp_path
 
@@ -36,7 +36,7 @@ def test_the_interpreter_passes(cache: Path) -> None:
     assert all(check.seconds for check in tested.checks)
     assert gpu.cached_test(FACTS) == tested
     assert gpu.cached_test({**FACTS, "driver": "another"}) is None
-    # It is no fast device.
+    # The interpreter is slow.
     assert tested.device == "cpu"
     assert "Triton's interpreter passed its self-test; a training step takes" in tested.reason
 
@@ -56,7 +56,7 @@ def test_a_kernel_that_ends_nothing_or_all(fault: str, sentence: str) -> None:
 def run(
     device: torch.device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., SelfTest]:
-    """Runs the self-test here, small."""
+    """Return a function that runs a small self-test in this process."""
     monkeypatch.syspath_prepend(str(CHILD.parent))
     import self_test_child
 

@@ -34,7 +34,7 @@ ILLEGAL = RuntimeError("CUDA error: an illegal memory access was encountered\nmo
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Callable[[SelfTest | None], None]:
-    """Sets the result of the self-test that is known of the machine's GPU."""
+    """Return a function that sets the cached result of the self-test."""
 
     def known(tested: SelfTest | None) -> None:
         monkeypatch.setattr(session, "cuda_obstacle", lambda: None)
@@ -138,7 +138,7 @@ class Breaking(Square):
 
 @pytest.fixture
 def breaking(bench: Bench, gpu: Callable[[SelfTest | None], None]) -> Bench:
-    """A toy run on a machine with a GPU that passed its self-test."""
+    """Return a toy run on a machine whose GPU passed its self-test."""
     gpu(PASSED)
     stages = {name: bench.dag.load(name) for name in bench.dag.names}
     stages["square"] = Breaking(bench.journal)

@@ -1,4 +1,4 @@
-"""Whether the GPU back end can run here, and what its failures mean."""
+"""Requirements of the GPU back end, and the errors of a GPU."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from cleargs.splat.kernels import memory
 
 
 def on_gpu(device: torch.device) -> bool:
-    """Whether the GPU kernels serve tensors on ``device``; the one question that every dispatch asks."""
+    """Return True if the GPU kernels serve tensors on ``device``. Every dispatch calls this function."""
     return device.type == "cuda"
 
 
 def require(device: torch.device) -> None:
-    """Raise InputError when the kernels cannot run on ``device``."""
+    """Raise InputError if the kernels cannot run on ``device``."""
     if importlib.util.find_spec("triton") is None:
         raise InputError(
             "the GPU kernels need Triton, which is not installed",
@@ -33,8 +33,8 @@ def require(device: torch.device) -> None:
 
 
 def available_memory(device: torch.device) -> int:
-    """Bytes that tensors on ``device`` may still take: what is free there and what torch keeps for later."""
-    if device.type != "cuda":  # the interpreter's tensors
+    """Return the free bytes on ``device``, with those that torch reserves and does not use."""
+    if device.type != "cuda":  # tensors of the interpreter
         return memory.available_memory()
     free, _ = torch.cuda.mem_get_info(device)
     kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -43,7 +43,7 @@ def available_memory(device: torch.device) -> int:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn an exhausted device memory into a StageError that says what to change."""
+    """Turn an error about full GPU memory into a StageError that says what to change."""
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
