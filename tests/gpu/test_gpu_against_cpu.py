@@ -35,7 +35,7 @@ def test_the_gpu_agrees_with_the_cpu(count, size_px, aspect, antialias, device):
     (image, gradients, visible), (other_image, other_gradients, other_visible) = results
     assert torch.equal(visible, other_visible)
     assert visible.double().mean() > 0.5
-    # A pixel whose alpha is on the cut may be on either side of it: 1/255 of one splat's colour, in few pixels.
+    # A pixel whose alpha is on the cut may be on either side: 1/255 of one splat's colour, in few pixels.
     apart = (image - other_image).abs().amax(dim=2)
     assert (apart > 1e-5).double().mean() < 1e-3
     assert apart.max() < 0.05

@@ -1,4 +1,4 @@
-"""The self-test of a GPU. The interpreter stands in for a GPU that passes, planted faults for others."""
+"""The self-test of a GPU. The interpreter replaces a GPU that passes, planted faults replace others."""
 
 from __future__ import annotations
 
