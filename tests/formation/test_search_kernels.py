@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -31,8 +32,7 @@ def test_a_fit_uses_the_back_end_of_the_device(monkeypatch: pytest.MonkeyPatch) 
         return Render(shown[..., :3], 0.9 + 0.1 * shown[..., 3], 2.0 + shown[..., 4])
 
     monkeypatch.setattr("cleargs.formation.frame.backend_for", backend_for)
-    origin = torch.zeros(3).double().numpy()
-    pose = look_at(origin, origin + [0.0, 0.0, 1.0], origin + [0.0, -1.0, 0.0])
+    pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
     camera = Camera(48, 40, 50.0, 50.0, 24.0, 20.0, pose)
     target = torch.rand(40, 48, 3, generator=torch.Generator().manual_seed(2))
     fit_motion(FrameFormation(0), FormationConfig(), camera, None, target, None, render)
