@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
-from cleargs.errors import InputError, StageError, StoreError
+from cleargs.errors import CleargsError, InputError, StageError, StoreError
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -168,9 +168,14 @@ class Runner:
         try:
             return self._find_or_make_on_device(name, done, forced=forced)
         except Exception as error:
-            fault = self.dag.gpu_fault(error) if self.run.falls_back else None
-            if fault is None or self.run.device_of(name) == "cpu":
+            fault = self.dag.gpu_fault(error) if self.run.device_of(name) == "cuda" else None
+            if fault is None or (isinstance(error, CleargsError) and not self.run.falls_back):
                 raise
+            if not self.run.falls_back:
+                raise StageError(
+                    f"{name}: the GPU failed ({fault})",
+                    hint="cleargs doctor --gpu tests it; --device cpu runs on the CPU",
+                ) from error
         # Outside the except block, so that the traceback holds no memory of the GPU.
         self._leave_gpu(name, fault)
         return self._find_or_make_on_device(name, done, forced=forced)

@@ -6,6 +6,7 @@ import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import CalledProcessError
 from typing import Any
 
 import pytest
@@ -137,6 +138,15 @@ def test_a_full_memory_is_not_kept(run: Callable[..., SelfTest], monkeypatch: py
             "RuntimeError: Triton Error [CUDA]: an illegal memory access was encountered",
         ),
         (ValueError("no such thing\nmore"), "ValueError: no such thing"),
+        # The two of triton/runtime/build.py.
+        (
+            RuntimeError("Failed to find C compiler. Please specify via CC environment variable or set ..."),
+            "Triton needs a C compiler: install gcc or clang",
+        ),
+        (
+            CalledProcessError(1, ["/usr/bin/gcc", "/tmp/tmpabc/cuda_utils.c", "-O3", "-shared"]),
+            "Triton's C compiler failed: the headers of Python (python3-dev) may be missing",
+        ),
     ],
 )
 def test_a_launch_that_fails(

@@ -127,11 +127,14 @@ class Breaking(Square):
     """Fails on the GPU behind its third number."""
 
     error: Exception | None = ILLEGAL
+    bare: bool = False
 
     def run(self, context: StageContext[Any]) -> StageResult:
         if context.device == "cuda" and self.error is not None:
             (context.out / "powers").mkdir(exist_ok=True)
             (context.out / "powers" / "000.txt").write_text("half a result of the GPU")
+            if self.bare:
+                raise self.error
             raise StageError("square stopped", hint="no idea") from self.error
         return super().run(context)
 
@@ -213,6 +216,15 @@ def test_the_gpu_is_tried_again_when_it_is_named(breaking: Bench, monkeypatch: p
     assert devices(run_on(breaking, "cuda")) == dict.fromkeys(breaking.dag.names, "cuda")
     assert "on_cpu" not in (breaking.folder / "run.toml").read_text()
     assert devices(run_on(breaking, "auto")) == dict.fromkeys(breaking.dag.names, "cuda")
+
+
+def test_a_gpu_that_is_named_ends_the_run_with_a_cause(
+    breaking: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Breaking, "bare", True)
+    with pytest.raises(StageError, match=r"square: the GPU failed \(RuntimeError: CUDA error") as caught:
+        run_on(breaking, "cuda")
+    assert "--device cpu" in caught.value.hint
 
 
 def test_other_errors_stop_the_run(breaking: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

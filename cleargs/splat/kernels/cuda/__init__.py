@@ -1,4 +1,4 @@
-"""GPU back end in Triton. Users need no compiler.
+"""GPU back end in Triton, which needs a C compiler on the user's machine, and no CUDA toolkit.
 
 The modules follow the data, as in the CPU back end: ``projection`` (parameters to packed splats), ``binning``
 (splats to tiles), ``rasterise`` (tiles to pixels and back), ``gradients`` (back to the parameters), ``loss``,

@@ -202,7 +202,7 @@ def refinement(count: int, backend: Backend, device: torch.device) -> Results:
             Moments.zeros(gaussians),
             errors=errors,
             rate=0.5,
-            budget=int(1.45 * number),
+            budget=number + number * 17 // 40,
             min_opacity=0.01,
             seed=(1,),
         )

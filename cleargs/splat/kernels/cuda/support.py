@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
+from subprocess import CalledProcessError
 
 import torch
 
@@ -66,6 +67,11 @@ def gpu_fault(error: BaseException | None) -> str | None:
             return f"the NVIDIA driver is too old for this PyTorch (CUDA {torch.version.cuda})"
         if "no NVIDIA driver" in line:
             return "PyTorch finds no NVIDIA driver"
+        # Triton compiles a small library in C when it first sees a GPU.
+        if "find C compiler" in line:
+            return "Triton needs a C compiler: install gcc or clang"
+        if isinstance(error, CalledProcessError) and "cuda_utils" in line:
+            return "Triton's C compiler failed: the headers of Python (python3-dev) may be missing"
         from_triton = type(error).__module__.split(".")[0] == "triton"
         if from_triton or (isinstance(error, RuntimeError) and "CUDA" in line):
             return f"{type(error).__name__}: {line}"
