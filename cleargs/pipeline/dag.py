@@ -12,24 +12,16 @@ from cleargs.pipeline.stage import Stage
 from cleargs.progress import Say
 
 
-def _same_pace(say: Say | None) -> float:
-    return 1.0
-
-
-def _no_gpu(error: BaseException) -> str | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Dag:
     """Stages in an order in which each comes after all that it reads, and how to load one by name."""
 
     names: tuple[str, ...]
     load: Callable[[str], Stage]
-    pace: Callable[[Say | None], float] = _same_pace
+    pace: Callable[[Say | None], float] = lambda say: 1.0
     """This machine's time over what the stages' estimates were made for. It may take seconds to measure, and
     is measured only where somebody is told (``say``)."""
-    gpu_fault: Callable[[BaseException], str | None] = _no_gpu
+    gpu_fault: Callable[[BaseException], str | None] = lambda error: None
     """Return in one line what failed on the GPU if that is the cause of an error, else None."""
 
     def check(self, name: str) -> str:
