@@ -14,7 +14,7 @@
 # (python3). Triton compiles during the first step, which takes a minute longer.
 #
 # Needs PyTorch with CUDA, Triton, pytest, hypothesis, numba, pydantic, pyarrow, scipy, OpenCV, safetensors, click, rich
-# and tomli-w; neither pycolmap nor OpenImageIO. The self-test needs PyTorch, Triton and numba only. gsplat is timed in turn
+# and tomli-w; neither pycolmap nor OpenImageIO. The self-test needs PyTorch, Triton, numba and SciPy only. gsplat is timed in turn
 # with our kernels if it can be imported: it is built for this machine's architecture only, while the tests run.
 set -uo pipefail
 cd "$(dirname "$0")/../.."
