@@ -172,7 +172,6 @@ def test_the_self_test_needs_neither_pycolmap_nor_pydantic() -> None:
         "safetensors",
         "click",
         "rich",
-        "scipy",
     )
     code = f"""
 import sys
