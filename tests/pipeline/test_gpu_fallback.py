@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from onnxruntime.capi.onnxruntime_pybind11_state import Fail as OnnxFault
 from toy import Bench, Square, make_bench
 
 from cleargs.batch.loop import Batch
@@ -195,6 +197,24 @@ def test_a_stage_whose_kernels_fail_starts_again_on_the_cpu(breaking: Bench, tmp
         )
     assert outcomes[0].manifest.key != elsewhere[0].manifest.key
     assert outcomes[0].manifest.digest == elsewhere[0].manifest.digest
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (
+            torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB."),
+            "the GPU's memory is full",
+        ),
+        (OnnxFault("[ONNXRuntimeError] : 1 : FAIL : CUDA failure 700"), "Fail: [ONNXRuntimeError]"),
+    ],
+)
+def test_errors_of_the_gpu(
+    error: Exception, words: str, breaking: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Breaking, "error", error)
+    assert devices(run_on(breaking, "auto"))["square"] == "cpu"
+    assert f"the GPU failed ({words}" in breaking.remarks.warnings[0]
 
 
 def test_later_calls_find_all_of_it(breaking: Bench) -> None:

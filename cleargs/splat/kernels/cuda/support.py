@@ -55,7 +55,7 @@ def memory_errors() -> Iterator[None]:
 
 
 def gpu_fault(error: BaseException | None) -> str | None:
-    """Return in one line what the GPU, its driver or Triton reported; None for any other error.
+    """Return in one line what the GPU, its driver or a library on it reported; None for any other error.
 
     The causes of ``error`` are searched too.
     """
@@ -72,8 +72,9 @@ def gpu_fault(error: BaseException | None) -> str | None:
             return "Triton needs a C compiler: install gcc or clang"
         if isinstance(error, CalledProcessError) and "cuda_utils" in line:
             return "Triton's C compiler failed: the headers of Python (python3-dev) may be missing"
-        from_triton = type(error).__module__.split(".")[0] == "triton"
-        if from_triton or (isinstance(error, RuntimeError) and "CUDA" in line):
+        library = type(error).__module__.split(".")[0]
+        from_cuda = "CUDA" in str(error) and (library == "onnxruntime" or isinstance(error, RuntimeError))
+        if library == "triton" or from_cuda:
             return f"{type(error).__name__}: {line}"
         error = error.__cause__ or error.__context__
     return None
