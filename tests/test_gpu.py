@@ -161,7 +161,7 @@ def test_obstacles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_self_test_needs_neither_pycolmap_nor_pydantic() -> None:
-    """A machine that is lent for a test has PyTorch, Triton, Numba and SciPy only."""
+    """A machine for a test may have PyTorch, Triton, Numba and SciPy only."""
     pytest.importorskip("triton")
     absent = (
         "pycolmap",

@@ -9,7 +9,7 @@
 # finished ingest/ and rva/ of a capture, made on another machine: see splat_stages.py and pack_run.py. A step that fails is
 # named at the end; the others run.
 #
-# STEPS chooses among "selftest tests agreement sanitizer bench g0" (default: all), for machines that are lent for minutes:
+# STEPS chooses among "selftest tests agreement sanitizer bench g0" (default: all), for machines that are rented by the minute:
 # each step ends within ten. QUICK=1 makes the bench and the training small, to try the script. PYTHON names the interpreter
 # (python3). Triton compiles during the first step, which takes a minute longer.
 #
