@@ -24,6 +24,7 @@ import cleargs
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.kernel_cache import cache_folder
+from cleargs.plugins import installed_version
 from cleargs.safe_io import FAULTS, read_json
 from cleargs.subprocesses import module_command
 
@@ -124,7 +125,7 @@ def current_facts(root: Path = Path("/")) -> dict[str, str]:
         gpu, number = _from_nvidia_smi()
     if visible := os.environ.get("CUDA_VISIBLE_DEVICES"):
         gpu += f" (CUDA_VISIBLE_DEVICES={visible})"
-    versions = {name: version(name) for name in ("torch", "triton")}
+    versions = {name: installed_version(name) for name in ("torch", "triton")}
     return {"gpu": gpu, "driver": number, **versions, "kernels": _kernel_digest()}
 
 

@@ -110,7 +110,7 @@ def test_facts_of_linux(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5 22:23:56 UTC 2024\n"
         "GCC version:  gcc version 12.2.0 (Debian 12.2.0-14)\n"
     )
-    monkeypatch.setattr(gpu, "version", {"torch": "2.11.0", "triton": "3.6.0"}.__getitem__)
+    monkeypatch.setattr(gpu, "installed_version", {"torch": "2.11.0", "triton": "3.6.0"}.__getitem__)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     facts = gpu.current_facts(tmp_path)
     assert (facts["gpu"], facts["driver"]) == ("NVIDIA A1, NVIDIA B2", "550.54.15")
@@ -134,7 +134,7 @@ def test_facts_where_linux_does_not_tell(
         (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{script}\n")
         (tmp_path / "nvidia-smi").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(gpu, "version", {"torch": "2.11.0", "triton": "3.6.0"}.__getitem__)
+    monkeypatch.setattr(gpu, "installed_version", {"torch": "2.11.0", "triton": "3.6.0"}.__getitem__)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     facts = gpu.current_facts(tmp_path)
     assert (facts["gpu"], facts["driver"]) == expected
