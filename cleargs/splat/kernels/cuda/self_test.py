@@ -35,7 +35,7 @@ class View(NamedTuple):
     faint: bool = False
     """True: opacities near 0.02, so that a ray passes hundreds of Gaussians."""
     all_outputs: bool = False
-    """True: with anti-aliasing, alpha and depth."""
+    """True: with anti-aliasing, alpha, depth, and spherical harmonics of degree 1 instead of 3."""
 
     def scene(self, device: torch.device) -> tuple[Gaussians, Camera]:
         """Return the Gaussians on ``device``, and the camera."""
@@ -116,7 +116,10 @@ def render(view: View, backend: Backend, device: torch.device) -> Results:
     """Run a forward and a backward pass."""
     gaussians, camera = view.scene(device)
     engine = backend.rasteriser(device)
-    shown = engine.forward(gaussians, camera, antialias=view.all_outputs, depth=view.all_outputs)
+    degree = 1 if view.all_outputs else None
+    shown = engine.forward(
+        gaussians, camera, sh_degree=degree, antialias=view.all_outputs, depth=view.all_outputs
+    )
     results: Results = {name: (getattr(shown, name).clone(), as_image) for name in ("image", "alpha")}
     if shown.depth is not None:
         results["depth"] = (shown.depth / 10.0, as_image)  # the scene ends at a depth of 10
@@ -173,6 +176,7 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
     curve = torch.linspace(0.0, 1.0, warp_layout.CURVE_STEPS + 1).square().to(device)
     linear, slope = backend.through_curve(image, curve, 4)
     exposed = backend.expose(image, fields, samples, margin=margin)
+    still = backend.expose(image, fields, samples[3:4], margin=margin)  # by cubic interpolation
     returned = backend.expose_backward(exposed, fields, samples, margin=margin)
     # A position of up to 1,283 px in float32 has an error of 1e-4 px; a hundred pixels add to one sum.
     return {
@@ -180,6 +184,7 @@ def warp(size: tuple[int, int], backend: Backend, device: torch.device) -> Resul
         "sweep": (fields.sweep, within(1e-4)),
         "discs": (fields.radius, within(1e-4)),
         "exposed image": (exposed[..., :3], within(6e-4)),
+        "image of one sample": (still[..., :3], within(6e-4)),
         "transpose": (returned[..., :3], within(2e-3)),
         "curve": (linear[..., :3], within(1e-6)),
         "slope": (slope, within(1e-4)),
