@@ -38,6 +38,8 @@ NO_GPU = "there is no NVIDIA GPU"
 
 def cuda_obstacle(root: Path = Path("/")) -> str | None:
     """Return why work cannot run on an NVIDIA GPU here, or None. ``root`` holds ``dev`` and ``sys``."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES", "0") in ("", "-1"):  # hidden on purpose
+        return NO_GPU
     if not any((root / node).exists() for node in ("dev/nvidiactl", "dev/dxg")):
         return "there is an NVIDIA GPU, but its driver is not loaded" if _on_pci_bus(root) else NO_GPU
     if find_spec("triton") is None:

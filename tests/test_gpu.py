@@ -141,6 +141,7 @@ def test_facts_where_linux_does_not_tell(
 
 
 def test_obstacles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     assert gpu.cuda_obstacle(tmp_path) == gpu.NO_GPU
     device = tmp_path / "sys/bus/pci/devices/0000:01:00.0"
     device.mkdir(parents=True)
@@ -158,6 +159,8 @@ def test_obstacles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "CPU only" in str(gpu.cuda_obstacle(tmp_path))
     monkeypatch.setattr(gpu, "version", lambda name: "2.13.0")
     assert gpu.cuda_obstacle(tmp_path) is None
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
+    assert gpu.cuda_obstacle(tmp_path) == gpu.NO_GPU
 
 
 def test_the_self_test_needs_neither_pycolmap_nor_pydantic() -> None:
