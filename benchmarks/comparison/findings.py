@@ -54,7 +54,7 @@ class Comparison:
         self.failures += other.failures
 
     def in_columns(self, suffix: str) -> Comparison:
-        """Return a copy with ``suffix`` on the name of each column, to compare comparisons."""
+        """Return a copy with ``suffix`` on the name of each column, to put comparisons into one table."""
 
         def renamed(items: Sequence[T]) -> list[T]:
             return [item.model_copy(update={"column": f"{item.column} {suffix}"}) for item in items]
@@ -77,13 +77,13 @@ class Comparison:
 
 
 def compare_scenes(
-    out: Path, made: Iterable[FinishedScene | str], recipe: SceneRecipe, store: Store, reporter: Reporter
+    out: Path, scenes: Iterable[FinishedScene | str], recipe: SceneRecipe, store: Store, reporter: Reporter
 ) -> Comparison:
     """Evaluate scenes.
 
     Args:
         out: Folder of the comparison.
-        made: Scenes, or a line with the reason for each missing one.
+        scenes: Scenes, or a line with the reason for each missing one.
         recipe: Settings that all scenes share.
         store: The store of the runs.
         reporter: Receives progress and warnings.
@@ -95,7 +95,7 @@ def compare_scenes(
         InputError: No scene could be evaluated.
     """
     found = Comparison()
-    for scene in made:
+    for scene in scenes:
         if isinstance(scene, str):
             reporter.warn(scene)
             found.failures.append(scene)

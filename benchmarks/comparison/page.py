@@ -250,7 +250,7 @@ def _evenly_spaced(views: Sequence[ReferenceView], wanted: int) -> list[Referenc
 def _write_pose(
     pose: _PoseInput, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]
 ) -> PageView:
-    """Write the pictures of a pose; ``pictures`` is the number of pictures on the page."""
+    """Write the pictures of a pose; the page has at most ``pictures`` pictures."""
     reference = pose.view.load()[0]
     height, width = reference.shape[:2]
     side = side_of(pictures, height / width, MAX_BYTES)

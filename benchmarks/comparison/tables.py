@@ -110,10 +110,9 @@ def note_on(cells: Cells, views: ViewSet) -> str:
 
 
 def training_lines(cells: Cells, labels: Mapping[str, str]) -> list[str]:
-    """Return a line for each scene that is evaluated on frames of its training without saying so."""
+    """Return a note for each scene that is evaluated on frames of its training, unless the views imply it."""
     return [
-        f"note: {labels[cell.variant]} was trained on the frames of {cell.trained_on} of these "
-        f"{cell.images} views"
+        f"note: {cell.trained_on} of {cell.images} views of {labels[cell.variant]} show its training frames"
         for cell in cells.cells
         if cell.views in ("held-out", "reference") and cell.trained_on
     ]

@@ -40,11 +40,16 @@ _PLAIN_G0 = ("g0.formation.enabled=false",)
 VARIANTS: tuple[Variant, ...] = (
     Variant("all-view", "all-view G0", "g0", ("rva.enabled=false", *_PLAIN_G0)),
     Variant("drop-blurry", "drop-blurry G0", "g0", ("rva.weighting=binary", *_PLAIN_G0)),
-    Variant("rva-paper", "RVA G0, the paper's", "g0", (*_PAPER_RVA, *_PLAIN_G0)),
+    Variant("rva-paper", "RVA G0 of the paper", "g0", (*_PAPER_RVA, *_PLAIN_G0)),
     Variant(
-        "rva-no-coverage", "the same w/o coverage", "g0", (*_PAPER_RVA, *_PLAIN_G0, "rva.coverage=false")
+        "rva-no-coverage",
+        "RVA G0 of the paper w/o coverage",
+        "g0",
+        (*_PAPER_RVA, *_PLAIN_G0, "rva.coverage=false"),
     ),
-    Variant("rva-binary", "the same, weights 0 and 1", "g0", (*_PAPER_RVA, *_PLAIN_G0, *_WEIGHT_ONE)),
+    Variant(
+        "rva-binary", "RVA G0 of the paper, weights 0 and 1", "g0", (*_PAPER_RVA, *_PLAIN_G0, *_WEIGHT_ONE)
+    ),
     Variant("rva", "RVA G0", "g0", _PLAIN_G0),
     Variant("formation", "RVA G0 with formation", "g0"),
     Variant("all-view-formation", "all-view G0 with formation", "g0", ("rva.enabled=false",)),
@@ -59,7 +64,9 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("rivr", "ClearGS w/o consolidation", "rivr"),
     Variant("full", "ClearGS", "consolidate"),
     Variant("paper-open", "paper's method, open models", "consolidate", workflow="paper-open"),
-    Variant("no-fused", "the same w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"),
+    Variant(
+        "no-fused", "paper's method w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"
+    ),
 )
 """Variants from the simplest to the whole method, then those of the paper's recipe. Stages that have equal
 settings are shared; all variants share the ingest."""
