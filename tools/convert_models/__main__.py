@@ -2,8 +2,8 @@
 
 Run it in the environment of ``make convert-env``::
 
-.venv-convert/bin/python -m tools.convert_models restormer-motion motion_deblurring.pth --accept-licence
-.venv-convert/bin/python -m tools.convert_models mine.onnx FILE.pth
+    .venv-convert/bin/python -m tools.convert_models restormer-motion motion_deblurring.pth --accept-licence
+    .venv-convert/bin/python -m tools.convert_models mine.onnx FILE.pth
 """
 
 from __future__ import annotations
