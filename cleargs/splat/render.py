@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.media.image import to_uint8
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
+from cleargs.types import ArrayF64, ImageU8
 
 
 def render(
@@ -87,10 +86,10 @@ class Viewer:
         self._scene = scene.to(device)
         self._engine = rasteriser_for(device)
 
-    def view(
-        self, camera: Camera, affine: NDArray[np.float64] | None = None
-    ) -> NDArray[np.uint8]:  # [H, W, 3] sRGB
-        """Render an 8-bit image; ``affine`` [3, 4], if given, transforms its sRGB colours."""
+    def view(self, camera: Camera, affine: ArrayF64 | None = None) -> ImageU8:
+        """Render an 8-bit image [H, W, 3]; ``affine`` [3, 4], if given, transforms its sRGB colours."""
+        from cleargs.media.image import to_uint8  # imports OpenCV, which `render` does not need
+
         image = self.render(camera, self._scene.background).image.cpu().numpy()
         if affine is not None:
             image = image @ affine[:, :3].T.astype(np.float32) + affine[:, 3].astype(np.float32)
