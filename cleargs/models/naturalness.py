@@ -29,8 +29,10 @@ _TILE = 128  # px; side of the patches to which the quadratic was fitted
 _SCALES = 2
 _WINDOW_SIGMA = 7.0 / 6.0  # px, as in BRISQUE
 _STABILISER = 1.0 / 255.0  # keeps the division finite in areas without contrast
-_LIMIT = 4.0  # features are clipped at this many standard deviations, as a quadratic must not extrapolate
-_ERROR = 0.07  # logistic scale of the error of the predicted LPIPS; see ``weights/README.md``
+_MAX_DEVIATIONS = (
+    4.0  # features are clipped at this many standard deviations, as a quadratic must not extrapolate
+)
+_ERROR_SCALE = 0.07  # logistic scale of the error of the predicted LPIPS; see ``weights/README.md``
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -64,18 +66,18 @@ class StatisticsScorer:
                 image,
                 (_TILE, _TILE),
             )
-        return 100.0 * expected(1.0 - predicted)
+        return 100.0 * expected_value(1.0 - predicted)
 
 
-def expected(estimate: float) -> float:
+def expected_value(estimate: float) -> float:
     """Return the expected value of a quantity in [0, 1] from an unbounded estimate with logistic error.
 
     It is E[clip(estimate + error, 0, 1)]: a strictly rising curve between 0 and 1, close to ``estimate``
     except near the ends. The quadratic is unbounded: for images crisper than its training patches it predicts
     a negative LPIPS. A clipped prediction would give all of these images the same score.
     """
-    below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR)
-    return float(_ERROR * (below - above))
+    below, above = np.logaddexp(0.0, np.array([estimate, estimate - 1.0]) / _ERROR_SCALE)
+    return float(_ERROR_SCALE * (below - above))
 
 
 def features(image: ImageF32) -> NDArray[np.float64]:
@@ -105,7 +107,7 @@ def terms(
     deviation: NDArray[np.float64],  # [F]
 ) -> NDArray[np.float64]:
     """Return the terms of the quadratic, [..., 1 + F + F (F + 1) / 2]: 1, features, products of two."""
-    z = np.clip((features - mean) / deviation, -_LIMIT, _LIMIT)
+    z = np.clip((features - mean) / deviation, -_MAX_DEVIATIONS, _MAX_DEVIATIONS)
     i, j = np.triu_indices(z.shape[-1])
     return np.concatenate([np.ones_like(z[..., :1]), z, z[..., i] * z[..., j]], axis=-1)
 

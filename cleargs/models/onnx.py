@@ -32,7 +32,7 @@ CUDA_PROVIDER = "CUDAExecutionProvider"
 BATCH_PIXELS = 8 * 512 * 512
 """Maximum number of pixels in a batch."""
 
-_EXHAUSTED = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
+_MEMORY_ERRORS = ("bad_alloc", "allocate memory", "out of memory", "alloc_failed")
 """Texts of onnxruntime, CUDA and cuDNN for exhausted memory; onnxruntime has no exception class for it."""
 
 _FATAL = 4
@@ -222,7 +222,7 @@ def in_batches(
 
 def _raise_exhausted(path: Path, error: Exception) -> None:
     """Raise MemoryError if onnxruntime reports exhausted memory."""
-    if any(words in str(error).lower() for words in _EXHAUSTED):
+    if any(words in str(error).lower() for words in _MEMORY_ERRORS):
         raise MemoryError(f"{path.name}: {_reason(error)}") from error
 
 

@@ -29,14 +29,14 @@ CLARITY = "clarity-net"
 NATURALNESS = "naturalness-stats"
 """The embedded image statistics, for the tie-break role."""
 
-_TRAINED_ON = 128  # px; side of clarity-net's training patches
+_PATCH_SIDE = 128  # px; side of clarity-net's training patches
 
 BLOCK = 16
 """Side of the blocks whose information is measured, px."""
 _STEPS = 255.0
 """Number of steps of an 8-bit image between 0 and 1."""
 _CLIPPED = 2.0  # values less than this many steps from black or white count as partly clipped
-_ENOUGH = 0.5  # share of unclipped values with which a block counts fully, as highlights are normal
+_MIN_UNCLIPPED = 0.5  # share of unclipped values with which a block counts fully, as highlights are normal
 _FLAT, _TEXTURED = 0.5, 0.75  # standard deviation in a block, in steps; rounding alone causes up to 0.5
 
 PATCH = 32
@@ -111,7 +111,7 @@ def information(image: ImageF32) -> float:
     unclipped = np.clip(to_the_end, 0.0, 1.0).mean(axis=(1, 3, 4))
     deviation = _STEPS * np.sqrt(blocks.var(axis=(1, 3)).mean(axis=2))
     texture = np.clip((deviation - _FLAT) / (_TEXTURED - _FLAT), 0.0, 1.0)
-    return float((np.minimum(unclipped / _ENOUGH, 1.0) * texture).mean())
+    return float((np.minimum(unclipped / _MIN_UNCLIPPED, 1.0) * texture).mean())
 
 
 class LearnedScorer:
@@ -208,10 +208,10 @@ def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], ND
         extent = (round(height * ratio), round(width * ratio))
         sizes.append(interpolate(planes, extent, mode="bicubic", align_corners=False))
     cut = [_cut(resized[0].numpy()) for resized in (*sizes, planes)]
-    scales = [np.full(len(places), number) for number, (_, places) in enumerate(cut)]
+    scales = [np.full(len(cells), number) for number, (_, cells) in enumerate(cut)]
     return (
         np.concatenate([tiles for tiles, _ in cut]),
-        np.concatenate([places for _, places in cut]),
+        np.concatenate([cells for _, cells in cut]),
         np.concatenate(scales),
     )
 
@@ -226,8 +226,8 @@ def _cut(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.i
     missing = (rows * PATCH - height, columns * PATCH - width)
     padded = np.pad(planes, ((0, 0), *((n // 2, n - n // 2) for n in missing)))
     grid = padded.reshape(3, rows, PATCH, columns, PATCH).transpose(1, 3, 0, 2, 4)
-    places = _cells(rows)[:, None] * _GRID + _cells(columns)[None, :]
-    return np.ascontiguousarray(grid.reshape(-1, 3, PATCH, PATCH)), places.ravel()
+    cells = _cells(rows)[:, None] * _GRID + _cells(columns)[None, :]
+    return np.ascontiguousarray(grid.reshape(-1, 3, PATCH, PATCH)), cells.ravel()
 
 
 def _cells(count: int) -> NDArray[np.int64]:
@@ -255,6 +255,6 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
             return StatisticsScorer()
         if model.converter == "musiq":
             return MusiqScorer(path, device)
-        return LearnedScorer(path, spec, _TRAINED_ON if spec == CLARITY else None, device)
+        return LearnedScorer(path, spec, _PATCH_SIDE if spec == CLARITY else None, device)
 
     return InformedScorer(load_network(spec, "scorer", device, from_file))

@@ -30,7 +30,7 @@ MULTIPLE = 64
 MIN_SIDE = 32
 """Minimum side of an image that is scored, px. Below it AlexNet's third block has almost no pixels."""
 
-_OUTSIDE = 1e-3
+_RANGE_TOLERANCE = 1e-3
 """Tolerance for values outside [0, 1]: the spacing of float16 values near 1."""
 
 
@@ -138,7 +138,7 @@ def require_scorable(image: AnyImage) -> None:
             hint="give float32 sRGB in [0, 1]; divide 8-bit values by 255",
         )
     low, high = float(image.min()), float(image.max())
-    if not (low >= -_OUTSIDE and high <= 1.0 + _OUTSIDE):  # NaN fails both
+    if not (low >= -_RANGE_TOLERANCE and high <= 1.0 + _RANGE_TOLERANCE):  # NaN fails both
         raise InputError(
             f"an image with values from {low:g} to {high:g} cannot be scored",
             hint="give finite sRGB values in [0, 1]",

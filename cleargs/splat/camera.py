@@ -74,20 +74,20 @@ class Camera:
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
 
-def look_at(place: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
+def look_at(position: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
     """Return the pose of a camera without roll (OpenCV axes).
 
     Args:
-        place: Position of the camera, [3].
+        position: Position of the camera, [3].
         target: Point on the optical axis, [3].
         up: Direction that is up in the image, [3].
     """
-    forward = (target - place) / np.linalg.norm(target - place)
+    forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, up)
     right /= max(float(np.linalg.norm(right)), 1e-12)
     pose = np.eye(4)
     pose[:3, :3] = [right, np.cross(forward, right), forward]
-    pose[:3, 3] = -pose[:3, :3] @ place
+    pose[:3, 3] = -pose[:3, :3] @ position
     return pose
 
 

@@ -99,16 +99,16 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
     rows = np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0))
     colours = gaussians.sh.numpy()[:, 0] * np.float32(SH_C0) + np.float32(0.5)
     scales = gaussians.log_scales.numpy().clip(-LOG_SCALE_MAX, LOG_SCALE_MAX)
-    ranges, places = [], []
+    ranges, relative = [], []
     for values in (gaussians.means.numpy(), scales, colours):
         chunked = values[rows].reshape(chunks, CHUNK, 3)
         low, high = chunked.min(axis=1), chunked.max(axis=1)
         ranges += [low, high]
         width = np.where(high > low, high - low, 1.0)[:, None]
-        places.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
-    position, scale, colour = places
+        relative.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
+    position, scale, colour = relative
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()
-    largest, smaller = smaller_parts(gaussians.rotations.numpy())
+    largest, smaller = smallest_three(gaussians.rotations.numpy())
     rotation = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
     packed = [
         _pack(position, (11, 10, 11)),
@@ -129,7 +129,7 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
     return packed
 
 
-def smaller_parts(
+def smallest_three(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return three components of each quaternion, from which a decoder can compute the fourth.

@@ -72,24 +72,24 @@ def refine(
         weights, dead = np.where(alive, errors, 0.0), np.flatnonzero(~alive)
         count = len(opacity)
         room = max(0, start + growth * done // ROUNDS - count)
-        cut = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
-        others = _halves(arrays, cut, opacity[cut], min_opacity)
-        errors = np.concatenate([errors, np.zeros(max(0, len(cut) - len(dead)))])
-        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(cut)]
-        errors[cut] /= 2
-        errors[places] = errors[cut]
-        arrays = {name: _placed(array, places, others[name]) for name, array in arrays.items()}
+        chosen = sample_once(weights, min(len(dead) + room, int((weights > 0.0).sum())), rng)
+        others = _split(arrays, chosen, opacity[chosen], min_opacity)
+        errors = np.concatenate([errors, np.zeros(max(0, len(chosen) - len(dead)))])
+        places = np.concatenate([dead, np.arange(count, len(errors))])[: len(chosen)]
+        errors[chosen] /= 2
+        errors[places] = errors[chosen]
+        arrays = {name: _write_rows(array, places, others[name]) for name, array in arrays.items()}
         for moment in running:
             for array in moment.values():
-                array[cut] = 0
+                array[chosen] = 0
         running = [
-            {name: _placed(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
+            {name: _write_rows(array, places, np.zeros_like(others[name])) for name, array in moment.items()}
             for moment in running
         ]
     return arrays, running
 
 
-def _placed(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
+def _write_rows(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
     """Write ``rows`` at ``places`` of ``array``, extended if places are beyond its end."""
     longer = max(len(array), 1 + int(places.max(initial=-1)))
     if longer > len(array):
@@ -110,19 +110,19 @@ def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDAr
     return first
 
 
-def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
-    """Replace the Gaussians ``cut`` by their first halves in place, and return the second halves.
+def _split(arrays: Arrays, chosen: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
+    """Replace the Gaussians ``chosen`` by their first halves in place, and return the second halves.
 
     The opacity of the halves preserves the optical depth, summed along the axis.
     """
-    longest = arrays["log_scales"][cut].argmax(axis=1)
-    axes = rotation_matrices(arrays["rotations"][cut])[np.arange(len(cut)), :, longest]
-    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][cut, longest]))[:, None]
+    longest = arrays["log_scales"][chosen].argmax(axis=1)
+    axes = rotation_matrices(arrays["rotations"][chosen])[np.arange(len(chosen)), :, longest]
+    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][chosen, longest]))[:, None]
     faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
-    arrays["log_scales"][cut, longest] += np.float32(math.log(SPLIT_FRACTION))
-    arrays["logit_opacities"][cut] = np.log(faint) - np.log1p(-faint)
-    others = {name: array[cut] for name, array in arrays.items()}
-    arrays["means"][cut] -= away
+    arrays["log_scales"][chosen, longest] += np.float32(math.log(SPLIT_FRACTION))
+    arrays["logit_opacities"][chosen] = np.log(faint) - np.log1p(-faint)
+    others = {name: array[chosen] for name, array in arrays.items()}
+    arrays["means"][chosen] -= away
     others["means"] += away
     return others
 

@@ -29,7 +29,7 @@ class Formed(Protocol):
         """Return the observed image [H, W, 3] sRGB of a render."""
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Map the gradient by the observed image [H, W, 3] to the gradient by the render's image."""
+        """Return the gradient of the render's image, given that of the observed image [H, W, 3]."""
 
     def learn(self) -> None:
         """Update the parameters that follow the gradient of the last `backward`."""

@@ -17,7 +17,7 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.views import TrainingView
 
 NEIGHBOURS = 3
-"""Number of neighbours whose mean distance sets the initial scale (Inria) and the depth of added points."""
+"""Number of neighbours that set the initial scale (mean distance, Inria) and the depth of added points."""
 
 DEPTH_JITTER = 0.05
 """Standard deviation of the noise on the log depth of added points."""

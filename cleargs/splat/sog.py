@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smaller_parts
+from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smallest_three
 from cleargs.splat.scene import Scene
 from cleargs.types import ImageU8
 
@@ -48,7 +48,7 @@ def sog(scene: Scene) -> bytes:
     images["means_l"] = _image((steps & 255).astype(np.uint8))
     images["means_u"] = _image((steps >> 8).astype(np.uint8))
 
-    largest, smaller = smaller_parts(gaussians.rotations.numpy())
+    largest, smaller = smallest_three(gaussians.rotations.numpy())
     parts = np.rint((smaller * np.sqrt(2.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
     images["quats"] = _image(parts, (252 + largest).astype(np.uint8))
 
@@ -152,16 +152,16 @@ def palette(
         Palette of K <= ``size`` vectors [K, D], and the index of its vector for each of the N vectors [N].
     """
     groups = [np.arange(len(vectors))]
-    waiting = [_spread(vectors, groups[0], 0)]
-    while len(groups) < size and waiting[0][0] < 0.0:
-        _, index, axis = heapq.heappop(waiting)
+    heap = [_spread(vectors, groups[0], 0)]
+    while len(groups) < size and heap[0][0] < 0.0:
+        _, index, axis = heapq.heappop(heap)
         members = groups[index]
         along = vectors[members, axis]
         above = along > along.mean(dtype=np.float64)
         groups[index] = members[~above]
         groups.append(members[above])
         for changed in (index, len(groups) - 1):
-            heapq.heappush(waiting, _spread(vectors, groups[changed], changed))
+            heapq.heappush(heap, _spread(vectors, groups[changed], changed))
     labels = np.empty(len(vectors), np.int64)
     for index, members in enumerate(groups):
         labels[members] = index

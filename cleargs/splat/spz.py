@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.splat.compressed_ply import smaller_parts
+from cleargs.splat.compressed_ply import smallest_three
 from cleargs.splat.scene import Scene
 
 _MAGIC = 0x5053474E
@@ -81,7 +81,7 @@ def _byte(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 def _rotations(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] w x y z -> [N]
     """Pack the index of the largest of x, y, z, w, then sign and magnitude * sqrt(2) of the others."""
     # + 0.0 turns -0.0 into 0.0.
-    largest, smaller = smaller_parts(quaternions[:, [1, 2, 3, 0]].astype(np.float64) + 0.0)
+    largest, smaller = smallest_three(quaternions[:, [1, 2, 3, 0]].astype(np.float64) + 0.0)
     packed: NDArray[np.uint32] = largest.astype(np.uint32)
     for part in smaller.T:
         magnitude = np.clip(np.floor(511.0 * np.sqrt(2.0) * np.abs(part) + 0.5), 0, 511).astype(np.uint32)

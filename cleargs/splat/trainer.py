@@ -117,14 +117,14 @@ class Trainer:
         self._losses = LossAccumulator(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._image_gradients: dict[tuple[int, int], Tensor] = {}
-        starts: list[float | str] = [
+        arguments: list[float | str] = [
             *self._seed,
             self._earlier_steps,
             self._pseudo_share,
             pseudo_weight,
             "" if formation is None else formation.digest(),
         ]
-        self._fingerprint = _fingerprint(scene, weighted, config, starts)
+        self._fingerprint = _fingerprint(scene, weighted, config, arguments)
         self.done = 0
 
     def run(
@@ -132,18 +132,18 @@ class Trainer:
     ) -> Trained:
         """Train to the end.
 
-        A SIGTERM that the program handles ends the training after the next checkpoint.
+        After a SIGTERM, if the program has a handler for it, the training saves a checkpoint and stops.
 
         Args:
             checkpoint: File of the checkpoints, each with a preview next to it. If the file belongs to this
                 training, the training resumes from it; the result is the same bit for bit.
-            reporter: Receives progress and messages.
+            reporter: Receiver of progress and messages.
             label: Name of the training in messages.
             round: Round of the stage, a column of the log.
 
         Raises:
             StageError: A parameter or the loss is not finite.
-            KeyboardInterrupt: The process received SIGTERM. A checkpoint is saved.
+            KeyboardInterrupt: The process received SIGTERM.
         """
         saved = load_state(checkpoint, reporter)
         if saved is not None and not self.matches(saved):
@@ -180,7 +180,7 @@ class Trainer:
 
     @property
     def scene(self) -> Scene:
-        """The scene as trained so far (shares memory with the trainer)."""
+        """Current scene; it shares memory with the trainer."""
         return replace(self._scene, gaussians=self._gaussians)
 
     @property
@@ -224,7 +224,7 @@ class Trainer:
             self._schedule.rates(schedule_step),
             step=self._earlier_steps + self.done + 1,
         )
-        if formed is not None:  # last, since it may have to wait for the device
+        if formed is not None:  # last, because it may wait for the device
             formed.learn()
         self.done += 1
         if config.densify:
@@ -260,9 +260,9 @@ class Trainer:
     def check_finite(self) -> None:
         """Raise StageError with the step and the parameter if a value is NaN or infinite."""
         if fault := _fault(self._gaussians):
-            raise self._stopped(fault)
+            raise self._error_at_step(fault)
         if self._formation is not None and (fault := self._formation.fault()):
-            raise self._stopped(fault)
+            raise self._error_at_step(fault)
 
     def state(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint: parameters, moments, image formation, step and log."""
@@ -318,7 +318,7 @@ class Trainer:
         return self._schedule.sh_degree(self._schedule_step, self._gaussians.sh_degree)
 
     def _add_loss(self, image: Tensor, target: Tensor, mask: Tensor | None, weight: float) -> Tensor:
-        """Return the gradient of the loss by the image, and log the loss (on a GPU with a delay)."""
+        """Return the gradient with respect to the image, and log the loss (on a GPU with a delay)."""
         size = (target.shape[0], target.shape[1])
         if size not in self._image_gradients:
             self._image_gradients[size] = torch.empty_like(target)
@@ -333,8 +333,8 @@ class Trainer:
     ) -> Tensor:
         """Return the contribution of each Gaussian to the squared error of a frame, [N] >= 0.
 
-        The weight of a Gaussian in a pixel is the derivative of the pixel by its colour. The backward pass
-        sums weight times squared error over the pixels.
+        The weight of a Gaussian in a pixel is the derivative of the pixel with respect to its colour, so the
+        backward pass sums weight times squared error over the pixels.
         """
         error = (image - target).square_().mul_(weight)
         if mask is not None:
@@ -348,7 +348,7 @@ class Trainer:
             self._log.add_losses(step, read)
             if not math.isfinite(read.loss):
                 self.check_finite()
-                raise self._stopped("the loss is not finite")
+                raise self._error_at_step("the loss is not finite")
 
     def _densify(self) -> None:
         """Refine the Gaussians if it is due and errors were measured, then add noise to the means."""
@@ -375,7 +375,7 @@ class Trainer:
                 seed=(*self._seed, Stream.POSITION_NOISE, schedule_step),
             )
 
-    def _stopped(self, fault: str) -> StageError:
+    def _error_at_step(self, fault: str) -> StageError:
         return StageError(
             f"{fault} at step {self.done}; the last good checkpoint is kept",
             hint="lower the rates (lr_scales, lr_means), or use another --seed",
@@ -399,7 +399,7 @@ def _fault(gaussians: Gaussians) -> str | None:
 
 
 def _fingerprint(
-    scene: Scene, views: Sequence[TrainingView], config: TrainConfig, starts: Sequence[float | str]
+    scene: Scene, views: Sequence[TrainingView], config: TrainConfig, others: Sequence[float | str]
 ) -> Tensor:
     """Return a digest [32] of the arguments of a training, except pixels. It identifies checkpoints."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
@@ -407,7 +407,7 @@ def _fingerprint(
     for view in views:
         *lens, pose = vars(view.camera).values()
         seen.append((view.frame_id, view.kind, view.weight, [*lens, *pose.ravel().tolist()]))
-    parts = [settings, seen, scene.antialias, scene.background, list(starts)]
+    parts = [settings, seen, scene.antialias, scene.background, list(others)]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())

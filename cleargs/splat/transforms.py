@@ -70,21 +70,21 @@ def transform_scene(
     )
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)  # x y z w -> w x y z
     mixing = sh_rotation(turn, gaussians.sh.shape[1])
-    moved = Gaussians(
+    transformed = Gaussians(
         means=means.float(),
         log_scales=(gaussians.log_scales.double() + math.log(scale)).float(),
         rotations=_multiply(torch.from_numpy(quaternion), gaussians.rotations.double()).float(),
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=torch.einsum("jk,nkc->njc", mixing, gaussians.sh.double()).float().contiguous(),
     )
-    reach, before = (float(which.means.abs().max()) if which.num else 1.0 for which in (moved, gaussians))
-    finite = all(bool(torch.isfinite(tensor).all()) for tensor in moved.tensors().values())
+    reach, before = (float(g.means.abs().max()) if g.num else 1.0 for g in (transformed, gaussians))
+    finite = all(bool(torch.isfinite(tensor).all()) for tensor in transformed.tensors().values())
     if not finite or reach > MAX_REACH or (before > 0.0 and reach < 1.0 / MAX_REACH):
         raise InputError(
             "the coordinates of the scene in that world exceed the range of float32",
             hint="export the scene in the normalised world (without --world input)",
         )
-    return replace(scene, gaussians=moved)
+    return replace(scene, gaussians=transformed)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:

@@ -87,12 +87,11 @@ class ImageCache:
         self._limit = limit_bytes
         self._training = training
         self._device = torch.device(device)
-        # A tensor, because a GPU divides by a number as a product with its reciprocal, which rounds
-        # differently.
+        # A tensor: a GPU divides by a number by multiplying with its reciprocal, which rounds differently.
         self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._held: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
+        self._images: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
     def get(self, view: TrainingView, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
@@ -101,9 +100,9 @@ class ImageCache:
         The image is a buffer of the cache, valid until the next call.
         """
         if factor != self._factor:
-            self._held.clear()
+            self._images.clear()
             self._used, self._factor = 0, factor
-        entry = self._held.get(view)
+        entry = self._images.get(view)
         if entry is None:
             pixels, counts = _prepare(view, factor, self._training)
             entry = (
@@ -112,7 +111,7 @@ class ImageCache:
             )
             size = pixels.nbytes + (0 if counts is None else counts.nbytes)
             if self._used + size <= self._limit:
-                self._held[view] = entry
+                self._images[view] = entry
                 self._used += size
         stored, mask = entry
         height, width = stored.shape[:2]

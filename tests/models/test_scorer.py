@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
-from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected, features, terms
+from cleargs.models.naturalness import Quadratic, StatisticsScorer, expected_value, features, terms
 from cleargs.models.scorer import (
     CLARITY,
     NATURALNESS,
@@ -153,7 +153,7 @@ def test_scores_are_in_range(scorer: Scorer, image: Image) -> None:
 
 @given(a=st.floats(-3, 3), b=st.floats(-3, 3))
 def test_expected_value_is_in_range_and_monotonic(a: float, b: float) -> None:
-    low, high = expected(min(a, b)), expected(max(a, b))
+    low, high = expected_value(min(a, b)), expected_value(max(a, b))
     assert -1e-12 <= low <= high <= 1.0 + 1e-12
     if -0.2 <= min(a, b) < max(a, b) - 1e-3 and max(a, b) <= 1.2:
         assert low < high  # no saturation in the range of predictions
