@@ -46,7 +46,7 @@ _GRID = 10  # MUSIQ encodes positions on a grid with this number of cells per si
 
 
 class Scorer(Protocol):
-    """A function that rates the quality of single images."""
+    """A model that rates the quality of single images."""
 
     @property
     def name(self) -> str:
@@ -96,8 +96,8 @@ def information(image: ImageF32) -> float:
     In flat areas, and in areas clipped to black or white, a scorer has no evidence of the quality. A black
     frame could get a perfect score.
 
-    Each block of 16 px counts in proportion to its unclipped values (fully from one half) and to its contrast
-    (fully from a standard deviation of 3/4 of an 8-bit step). All limits are ramps, so the share is a
+    Each block of 16 px counts by its unclipped values (fully from one half) and by its contrast (from a
+    standard deviation of 1/2 of an 8-bit step, fully from 3/4). All limits are ramps, so the share is a
     continuous function of the image. It is close to 1 for normal frames (figures in ``weights/README.md``).
 
     Args:
@@ -107,8 +107,8 @@ def information(image: ImageF32) -> float:
     padded = np.pad(image, ((0, -height % BLOCK), (0, -width % BLOCK), (0, 0)), mode="symmetric")
     rows, columns = padded.shape[0] // BLOCK, padded.shape[1] // BLOCK
     blocks = padded.astype(np.float64).reshape(rows, BLOCK, columns, BLOCK, 3)
-    to_the_end = np.minimum(blocks, 1.0 - blocks) * (_STEPS / _CLIPPED)
-    unclipped = np.clip(to_the_end, 0.0, 1.0).mean(axis=(1, 3, 4))
+    from_the_ends = np.minimum(blocks, 1.0 - blocks) * (_STEPS / _CLIPPED)
+    unclipped = np.clip(from_the_ends, 0.0, 1.0).mean(axis=(1, 3, 4))
     deviation = _STEPS * np.sqrt(blocks.var(axis=(1, 3)).mean(axis=2))
     texture = np.clip((deviation - _FLAT) / (_TEXTURED - _FLAT), 0.0, 1.0)
     return float((np.minimum(unclipped / _MIN_UNCLIPPED, 1.0) * texture).mean())
