@@ -1,4 +1,4 @@
-"""Locks: one process per work folder, and file systems without locks, where the rename decides."""
+"""Locks: one process per work folder. On file systems without locks the rename decides."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_lock_excludes_and_ends_with_its_block(bench: Bench, tmp_path: Path) -> 
         assert second and not is_locked(path)
 
 
-def test_a_lock_without_a_name_is_waited_for(bench: Bench, tmp_path: Path) -> None:
+def test_waits_for_a_holder_without_a_name(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "key.lock"
     with ExitStack() as first:
         first.enter_context(file_lock(path))
@@ -48,7 +48,7 @@ def test_a_lock_without_a_name_is_waited_for(bench: Bench, tmp_path: Path) -> No
         with only_one(path, bench.remarks, "square") as alone:
             assert alone
         release.join()
-    assert bench.remarks.lines == ["square: another process works on it; waiting"]
+    assert bench.remarks.lines == ["square: another process works on it; waiting for it to end"]
 
 
 @pytest.mark.usefixtures("no_locks")
@@ -75,7 +75,7 @@ def test_without_locks_the_rename_decides(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("no_locks")
-def test_without_locks_a_failed_try_is_resumed(bench: Bench) -> None:
+def test_without_locks_a_failed_attempt_is_resumed(bench: Bench) -> None:
     (bench.capture / "3.txt").write_text("no number")
     with pytest.raises(ValueError, match="no number"):
         bench.run()
@@ -88,7 +88,7 @@ def test_without_locks_a_failed_try_is_resumed(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("no_locks")
-def test_without_locks_nothing_is_cleared_away(bench: Bench) -> None:
+def test_without_locks_nothing_is_removed(bench: Bench) -> None:
     bench.run("square.power=3")
     bench.run()
     with DigestMemo(bench.store / "digests.sqlite") as memo:
