@@ -159,7 +159,7 @@ def test_an_older_report_is_told_of_where_no_new_one_is_made(tmp_path: Path) -> 
     assert older_report(run.folder, run.dag) == ""
     (run.folder / "consolidate/manifest.json").unlink()
     line = older_report(run.folder, run.dag)
-    assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
+    assert line == f"note: {page} shows earlier results; update it with `cleargs report {run.folder}`"
 
 
 def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:
