@@ -89,7 +89,7 @@ def export(
 
     The cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap) are written next to it.
     """
-    from cleargs.cli.export_pruning import cropped, parse_crop, parse_prune, pruned
+    from cleargs.cli.export_pruning import crop_scene, parse_crop, parse_prune, prune_scene
     from cleargs.splat.formats import check_options, format_of, padded, write_scene
 
     kind, version = format_of(output), None if spz_version is None else int(spz_version)
@@ -131,14 +131,14 @@ def export(
     scene = read_ply(run / stage / SCENE)
     messages = []
     if thresholds:
-        scene, message = pruned(scene, thresholds, run, stage)
+        scene, message = prune_scene(scene, thresholds, run, stage)
         messages.append(message)
     if sh_degree is not None:
         scene = padded(scene, sh_degree)
     if similarity:
         scene = transform_scene(scene, **similarity)
     if region is not None:
-        scene, message = cropped(scene, region)
+        scene, message = crop_scene(scene, region)
         messages.append(message)
     if scene.gaussians.num == 0:
         raise InputError("no Gaussian is left", hint="prune or crop less")

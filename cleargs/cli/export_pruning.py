@@ -68,7 +68,7 @@ def _parsed(rule: str, **counts: int) -> tuple[str, tuple[float, ...]]:
     return kind, values if len(values) == counts.get(kind) and np.isfinite(values).all() else ()
 
 
-def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str) -> tuple[Scene, str]:
+def prune_scene(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str) -> tuple[Scene, str]:
     """Remove the Gaussians below a threshold.
 
     Args:
@@ -87,8 +87,8 @@ def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str)
     keep = torch.sigmoid(gaussians.logit_opacities) >= thresholds.get("opacity", 0.0)
     if "contribution" in thresholds:
         with reporter.task("contributions", len(views)) as task:
-            most = contributions(scene, (view.camera for view in views), task.advance)
-        keep &= most >= thresholds["contribution"]
+            largest = contributions(scene, (view.camera for view in views), task.advance)
+        keep &= largest >= thresholds["contribution"]
     smaller = replace(scene, gaussians=gaussians.select(keep))
     with reporter.task("PSNR", 2 * len(views)) as task:
         before, after = (_psnr(which, views, folder, task.advance) for which in (scene, smaller))
@@ -98,7 +98,7 @@ def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str)
     )
 
 
-def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, seen: Callable[[], None]) -> float:
+def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, advance: Callable[[], None]) -> float:
     """Return the mean PSNR of ``views`` in dB, with the image formation of the stage in ``folder``."""
     exposure = read_exposure(folder / "exposure.parquet")
     formations, _ = read_formation(folder / "formation.parquet")
@@ -106,11 +106,11 @@ def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, seen: Calla
     for view in views:
         (fit,) = evaluate_views(scene, [view], exposure, formations, engine=engine)
         values.append(fit.psnr)
-        seen()
+        advance()
     return fmean(values)
 
 
-def cropped(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
+def crop_scene(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     """Return the scene inside the ``region`` of `parse_crop`, and a message with the number of Gaussians."""
     means = scene.gaussians.means
     if not len(means):
@@ -126,7 +126,7 @@ def cropped(scene: Scene, region: tuple[float, ...]) -> tuple[Scene, str]:
     )
 
 
-def contributions(scene: Scene, cameras: Iterable[Camera], seen: Callable[[], None]) -> Tensor:  # [N]
+def contributions(scene: Scene, cameras: Iterable[Camera], advance: Callable[[], None]) -> Tensor:  # [N]
     """Return the largest contribution of each Gaussian to one picture, in pixels.
 
     The contribution is the sum over pixels of the blending weight (opacity times the transmittance in front).
@@ -137,19 +137,19 @@ def contributions(scene: Scene, cameras: Iterable[Camera], seen: Callable[[], No
     Args:
         scene: A scene with N Gaussians.
         cameras: The cameras of the pictures.
-        seen: Called after each camera.
+        advance: Called after each camera.
     """
     gaussians = scene.gaussians.detach()
     grey = Gaussians(**{**gaussians.tensors(), "sh": torch.zeros_like(gaussians.sh[:, :1])})
     engine = rasteriser_for(gaussians.device)
-    most = torch.zeros(gaussians.num, device=gaussians.device)
+    largest = torch.zeros(gaussians.num, device=gaussians.device)
     for camera in cameras:
         image = engine.forward(grey, camera, antialias=scene.antialias).image
         red_gradient = torch.zeros_like(image)
         red_gradient[..., 0] = 1.0 / SH_C0
-        torch.maximum(most, engine.backward(red_gradient).sh[:, 0, 0], out=most)
-        seen()
-    return most
+        torch.maximum(largest, engine.backward(red_gradient).sh[:, 0, 0], out=largest)
+        advance()
+    return largest
 
 
 def inside(means: Tensor, low: NDArray[np.float64], high: NDArray[np.float64]) -> Tensor:  # [N] bool

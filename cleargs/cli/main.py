@@ -96,12 +96,12 @@ def cli(debug: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None, dag: Dag | None = None, program: click.Group = cli) -> None:
     """Run the command line of ``program`` and exit. ``dag`` replaces the installed stages in tests."""
-    from cleargs.cli.terminal import answer_signals, protect_streams
+    from cleargs.cli.terminal import handle_signals, protect_streams
 
     protect_streams()
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        answer_signals()
+        handle_signals()
         code = invoke(given, dag, program)
     except KeyboardInterrupt:  # before the command began, or after it ended
         code = _interrupted()

@@ -51,7 +51,7 @@ def report(dag: Dag, run: Path, threads: int, store: Path | None, as_json: bool,
     answer(as_json, {"report": str(page)}, f"report: {page}")
 
 
-def report_on(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
+def write_run_report(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
     """Write the report at the end of a run, unless there already is one of the same results.
 
     Returns:
@@ -76,7 +76,7 @@ def report_on(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None
         return None
 
 
-def older_report(run: Path, dag: Dag) -> str:
+def outdated_report_note(run: Path, dag: Dag) -> str:
     """Return a note if the report of ``run`` shows earlier results, or "" otherwise."""
     from cleargs.report.report_json import is_current, linked_manifests, page_of
 

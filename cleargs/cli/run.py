@@ -25,7 +25,7 @@ from cleargs.cli.common import (
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.cli.report import older_report, report_on
+from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
@@ -129,8 +129,8 @@ def run(
             return 0
         runner = Runner(dag, settings, opened, threads, reporter)
         outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
-        page = report_on(runner.planner, outcomes) if wants_report else None
-        if not wants_report and (line := older_report(settings.folder, dag)):
+        page = write_run_report(runner.planner, outcomes) if wants_report else None
+        if not wants_report and (line := outdated_report_note(settings.folder, dag)):
             reporter.info(line)
     if as_json:
         print_json([outcome_json(outcome) for outcome in outcomes])
@@ -180,7 +180,7 @@ def stage(
         runner = Runner(dag, settings, opened, threads, make_reporter(quiet))
         outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
         if wants_report:
-            report_on(runner.planner, [outcome])
+            write_run_report(runner.planner, [outcome])
     if as_json:
         print_json(outcome_json(outcome))
     else:

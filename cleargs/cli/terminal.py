@@ -25,7 +25,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")  # the escapes that ClearGS itself writes
 
 
-def answer_signals() -> None:
+def handle_signals() -> None:
     """Turn SIGINT and SIGTERM into KeyboardInterrupt, and end the process if Python cannot raise it.
 
     Python raises it only between two of its instructions, so a long call of compiled code delays it. A

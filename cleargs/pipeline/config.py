@@ -157,7 +157,7 @@ def check_document(dag: Dag, document: Mapping[str, Any]) -> Config:
     models = {name: dag.load(name).CONFIG for name in dag.names}
     for name in document:
         if name != "seed" and name not in models:
-            raise _unknown(name, models)
+            raise _unknown_setting(name, models)
     sections: dict[str, BaseModel] = {}
     for name, model in models.items():
         try:
@@ -174,12 +174,12 @@ def _setting_error(
     first = error.errors(include_url=False)[0]
     name = ".".join([section, *map(str, first["loc"])])
     if first["type"] == "retired":
-        gone = first["ctx"]
+        retired = first["ctx"]
         return ConfigError(
-            f"{name}.{gone['name']} = {gone['value']!r} is no longer a setting", hint=gone["hint"]
+            f"{name}.{retired['name']} = {retired['value']!r} is no longer a setting", hint=retired["hint"]
         )
     if first["type"] == "extra_forbidden":
-        return _unknown(name, models)
+        return _unknown_setting(name, models)
     known = {setting.name: setting for setting in settings_of(section, models[section])}
     if first["type"] == "model_type":
         inner = next(full for full in known if full.startswith(f"{name}."))
@@ -189,7 +189,7 @@ def _setting_error(
         )
     message = first["msg"].removeprefix("Value error, ")
     # Pydantic's location may go further than the setting: to the item of a list or the member of a union.
-    setting = next((known[place] for place in _places(name) if place in known), None)
+    setting = next((known[place] for place in _prefixes(name) if place in known), None)
     if setting is None:
         return ConfigError(f"{name}: {message}", hint=f"change the settings of [{name}]")
     # The message of a ClearGS validator says more than the type.
@@ -198,13 +198,13 @@ def _setting_error(
     return ConfigError(f"{setting.name} = {first['input']!r} cannot be used", hint=hint)
 
 
-def _unknown(name: str, models: Mapping[str, type[BaseModel]]) -> ConfigError:
+def _unknown_setting(name: str, models: Mapping[str, type[BaseModel]]) -> ConfigError:
     """Return the error for an unknown setting, with a hint at the setting that the user probably meant."""
     settings = (setting.name for section, model in models.items() for setting in settings_of(section, model))
-    known = dict.fromkeys(place for full in ("seed", *settings) for place in _places(full))
+    known = dict.fromkeys(place for full in ("seed", *settings) for place in _prefixes(full))
     return ConfigError(f"there is no setting {name}", hint=suggestion(name, known))
 
 
-def _places(name: str) -> Iterator[str]:
+def _prefixes(name: str) -> Iterator[str]:
     """Yield the stage of a dotted name, then its tables, then the full name."""
     return accumulate(name.split("."), "{}.{}".format)

@@ -16,7 +16,7 @@ from cleargs.pipeline.settings import fields_of, flattened
 from cleargs.pipeline.stage import Device, Stage
 from cleargs.plugins import ExtensionPoint, installed_version, package_of, plugins
 
-UPSTREAM = "of "
+UPSTREAM_PREFIX = "of "
 """Prefix of a table in the key that holds the settings of another stage."""
 
 
@@ -39,7 +39,7 @@ def key_config(config: BaseModel) -> dict[str, Any]:
 
 def stage_key_config(stage: Stage, name: str, sections: Mapping[str, BaseModel]) -> dict[str, Any]:
     """Return the settings in the key of the stage ``name``, with one table per stage in `Stage.SETTINGS`."""
-    inherited = {f"{UPSTREAM}{other}": key_config(sections[other]) for other in stage.SETTINGS}
+    inherited = {f"{UPSTREAM_PREFIX}{other}": key_config(sections[other]) for other in stage.SETTINGS}
     return {**key_config(sections[name]), **inherited}
 
 
@@ -84,7 +84,9 @@ def differences(
     if old.version != new.version:
         lines.append(f"stage version: {old.version} -> {new.version}")
     for name, before, after in _changes(dict(flattened(old.config)), dict(flattened(new.config))):
-        own = name.removeprefix(UPSTREAM) if name.startswith(UPSTREAM) else f"{new.stage}.{name}"
+        own = (
+            name.removeprefix(UPSTREAM_PREFIX) if name.startswith(UPSTREAM_PREFIX) else f"{new.stage}.{name}"
+        )
         lines.append(f"setting {own}: {_show(before)} -> {_show(after)}")
     inputs = [("input", name) for name, _, _ in _changes(_input_digests(old), _input_digests(new))]
     externals = [("external", name) for name, _, _ in _changes(old.externals, new.externals)]

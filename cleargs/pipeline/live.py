@@ -22,7 +22,7 @@ from cleargs.safe_io import FAULTS, read_json
 
 PROGRESS_FILE = ".at_work.json"
 
-EVERY = 2.0
+WRITE_INTERVAL_S = 2.0
 """Seconds between two writes of the progress file, at least."""
 
 
@@ -101,7 +101,7 @@ class _RecordingReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         def show(done: int, note: str, left: float | None) -> None:
-            if time.monotonic() - self._written >= EVERY:
+            if time.monotonic() - self._written >= WRITE_INTERVAL_S:
                 now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
                 self._write(self._first.model_copy(update=now))
 

@@ -47,7 +47,7 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
 
 
 @contextmanager
-def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
+def exclusive_lock(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
     """Hold the lock file ``path``; report another holder and wait for it.
 
     Args:

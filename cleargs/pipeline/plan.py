@@ -28,7 +28,7 @@ MIN_ADDRESS_SPACE_GB = 2.0
 WORTH_MEASURING_MIN = 2.0
 """Expected work, in minutes, from which measuring the speed of this machine is worth its seconds."""
 
-NOT_MADE = "no results yet"
+NO_RESULTS = "no results yet"
 """Reason of a stage that never had results in this run."""
 
 Origins = dict[str, dict[str, str]]
@@ -161,7 +161,7 @@ class Planner:
             return tuple(f"retry, missing so far: {missing}" for missing in entry.usable.missing)
         before = last_shown(self.run.folder, stage_key.parts.stage)
         if before is None:
-            return (NOT_MADE,)
+            return (NO_RESULTS,)
         changes = differences(before.parts, stage_key.parts, before.origins, stage_key.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
@@ -243,12 +243,14 @@ class Planner:
         digests = self.external_digests(name)
         return parts.model_copy(
             update={
-                "config": _known(
+                "config": _updated(
                     stage_key_config(self.dag.load(name), name, self.run.config.sections), parts.config
                 ),
                 "seed": self.run.config.seed,
-                "inputs": _known(self.inputs(name, shown)[0], parts.inputs),
-                "externals": _known({role: tree_digest(digests[role]) for role in digests}, parts.externals),
+                "inputs": _updated(self.inputs(name, shown)[0], parts.inputs),
+                "externals": _updated(
+                    {role: tree_digest(digests[role]) for role in digests}, parts.externals
+                ),
             }
         )
 
@@ -280,25 +282,25 @@ class Planner:
         return plans
 
 
-def _known(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+def _updated(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``before`` with the values of ``now``, for the names that ``before`` has.
 
     A name that only one of them has belongs to another version of the program, which is not a change.
     """
     return {
-        name: _known(now[name], value)
+        name: _updated(now[name], value)
         if isinstance(value, Mapping) and isinstance(now.get(name), Mapping)
         else now.get(name, value)
         for name, value in before.items()
     }
 
 
-def redo_lines(plans: list[StagePlan]) -> list[str]:
+def rerun_lines(plans: list[StagePlan]) -> list[str]:
     """Return one line per stage whose results must be replaced, with the reasons. Empty for a new run."""
     lines = [
         f"{plan.stage} runs again: {'; '.join(plan.reasons)}"
         for plan in plans
-        if plan.stage_key is not None and plan.state != "done" and plan.reasons != (NOT_MADE,)
+        if plan.stage_key is not None and plan.state != "done" and plan.reasons != (NO_RESULTS,)
     ]
     after = [plan.stage for plan in plans if plan.stage_key is None]
     return [*lines, f"then: {', '.join(after)}"] if lines and after else lines

@@ -49,14 +49,17 @@ def write_run_file(run: RunSpec) -> None:
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
     document["seed"] = run.config.seed
-    path, text = run.folder / RUN_FILE, (HEADER + tomli_w.dumps(document) + _commented(run.config)).encode()
+    path, text = (
+        run.folder / RUN_FILE,
+        (HEADER + tomli_w.dumps(document) + _settings_toml(run.config)).encode(),
+    )
     with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:
             write_bytes(path, text)
 
 
-def _commented(config: Config) -> str:
+def _settings_toml(config: Config) -> str:
     """Return all settings as TOML, each below its meaning, range and default. Unset ones are comments."""
     tables: dict[str, list[str]] = {}
     for setting, value in config.settings():

@@ -27,7 +27,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import recorded_progress
-from cleargs.pipeline.lock import only_one
+from cleargs.pipeline.lock import exclusive_lock
 from cleargs.pipeline.plan import (
     Planner,
     StageKey,
@@ -35,7 +35,7 @@ from cleargs.pipeline.plan import (
     check_address_space,
     check_disk,
     cost_line,
-    redo_lines,
+    rerun_lines,
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
@@ -88,7 +88,7 @@ class Runner:
                 self.dag.load(plan.stage).preflight(self.run.config.sections[plan.stage])
         check_disk(plans, self.store.root)
         plans = self.planner.at_measured_pace(plans)
-        for line in (*redo_lines(plans), cost_line(plans)):
+        for line in (*rerun_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
         outcomes: list[StageOutcome] = []
@@ -112,7 +112,7 @@ class Runner:
 
     def _lock_run(self) -> AbstractContextManager[bool]:
         """Hold the lock of the run folder; wait for another process that works in it."""
-        return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
+        return exclusive_lock(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
     def _unlink_outdated(self) -> None:
         """Remove the links to results of other settings or inputs."""
@@ -175,18 +175,18 @@ class Runner:
         """Find or make the results of ``name``, and link them into the run folder."""
         stage_key = self.planner.stage_key(name, done)
         entry = self.store.find(name, stage_key.key)
-        manifest = entry.whole if entry is not None and not forced else None
+        manifest = entry.complete if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
             stage_key = self._rehashed_key(name, done)
             entry = self.store.find(name, stage_key.key)
             reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
-            with self.store.lock(stage_key.key, self.reporter, name) as alone:
+            with self.store.lock(stage_key.key, self.reporter, name) as locked:
                 entry = self._find(name, stage_key)
-                manifest = entry.whole if entry is not None and not forced else None
+                manifest = entry.complete if entry is not None and not forced else None
                 if manifest is None:  # otherwise another process made it in the meantime
                     self.reporter.info(f"{name}: started ({'; '.join(reasons)})")
-                    manifest, how = self._make(stage_key, entry, forced=forced, alone=alone), "made"
+                    manifest, how = self._make(stage_key, entry, forced=forced, locked=locked), "made"
         manifest = self._with_inherited(manifest, stage_key.inherited)
         self.store.link(self.run.folder, name, stage_key.key)
         return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
@@ -208,12 +208,12 @@ class Runner:
                 )
         return self.planner.stage_key(name, done, rehash=True)
 
-    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
+    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, locked: bool) -> Manifest:
         """Run the stage and publish its results. The caller holds the lock of the key."""
         name = stage_key.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(
-            stage_key.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
+            stage_key.key, forced=forced, entry=entry, leftovers=stage.LEFTOVERS, locked=locked
         )
         context = self.planner.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()

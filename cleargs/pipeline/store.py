@@ -37,7 +37,7 @@ from cleargs.manifest import (
     read_manifest,
     write_manifest,
 )
-from cleargs.pipeline.lock import file_lock, is_locked, only_one
+from cleargs.pipeline.lock import exclusive_lock, file_lock, is_locked
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, read_text
 
@@ -69,7 +69,7 @@ class Entry:
         return self.manifest if self.damage is None else None
 
     @property
-    def whole(self) -> Manifest | None:
+    def complete(self) -> Manifest | None:
         """The manifest, or None if something is damaged or missing."""
         return self.usable if self.usable is not None and not self.usable.missing else None
 
@@ -160,9 +160,9 @@ class Store:
                 f"{stage} has no results yet, and the store {self.root} is read-only",
                 hint="choose another folder with --store",
             )
-        with only_one(self.root / "locks" / f"{key}.lock", reporter, stage) as alone:
+        with exclusive_lock(self.root / "locks" / f"{key}.lock", reporter, stage) as locked:
             try:
-                yield alone
+                yield locked
             finally:  # without its suffix, the next attempt finds the work folder of this process
                 for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
                     with suppress(OSError):  # there is already one of another process
@@ -179,30 +179,30 @@ class Store:
         self,
         key: str,
         *,
-        fresh: bool,
+        forced: bool,
         entry: Entry | None,
         leftovers: Sequence[str] = (),
-        alone: bool = True,
+        locked: bool = True,
     ) -> WorkFolder:
         """Prepare the work folder of ``key``.
 
         Args:
             key: The key of the stage.
-            fresh: A forced rebuild. It has a separate work folder, which resumes only from a forced attempt.
-            entry: Results in the store. Usable ones are copied to the outputs unless ``fresh``, or unless
+            forced: A forced rebuild. It has a separate work folder, which resumes only from a forced attempt.
+            entry: Results in the store. Usable ones are copied to the outputs unless ``forced``, or unless
                 the work folder already has outputs.
             leftovers: Glob patterns of the outputs to keep from a killed attempt; all others are deleted.
-            alone: This process holds the lock of ``key``. Otherwise it works in its own folder, which takes
+            locked: This process holds the lock of ``key``. Otherwise it works in its own folder, which takes
                 over the common one if there is one.
         """
-        work = WorkFolder(self.root / "work" / (f"{key}.forced" if fresh else key))
+        work = WorkFolder(self.root / "work" / (f"{key}.forced" if forced else key))
         with disk_errors(work.folder):
-            if not alone:
+            if not locked:
                 left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._owner_suffix()))
                 with suppress(OSError):  # there is none, or another process took it over
                     left.folder.rename(work.folder)
             _keep_only(work.out, leftovers)
-            if entry is not None and entry.usable is not None and not fresh and not work.out.exists():
+            if entry is not None and entry.usable is not None and not forced and not work.out.exists():
                 _link_files(entry.folder, work.out)
             work.out.mkdir(parents=True, exist_ok=True)
             work.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -226,11 +226,11 @@ class Store:
             write_manifest(work.out, manifest)
             sync_tree(work.out)
             final.parent.mkdir(parents=True, exist_ok=True)
-            there = self.find(manifest.stage, manifest.key)
-            if there is not None:
-                if there.whole is not None and there.whole.digest == manifest.digest:
+            existing = self.find(manifest.stage, manifest.key)
+            if existing is not None:
+                if existing.complete is not None and existing.complete.digest == manifest.digest:
                     self.discard(work.folder)
-                    return there.whole
+                    return existing.complete
                 self.discard(final)
             try:
                 work.out.rename(final)
@@ -314,10 +314,10 @@ class Store:
         Raises:
             StoreError: A process uses the store, or the file system cannot tell.
         """
-        with file_lock(self.root / "locks" / "store.lock", wait=False) as alone:
-            if alone is False:
+        with file_lock(self.root / "locks" / "store.lock", wait=False) as locked:
+            if locked is False:
                 raise StoreError("a run is using this store", hint="try again when the run has ended")
-            if alone is None and not dry_run:
+            if locked is None and not dry_run:
                 raise StoreError(
                     f"the file system of {self.root} has no locks, which would protect data in use",
                     hint="when no run uses the store, delete the folders that --dry-run lists",

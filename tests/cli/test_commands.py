@@ -363,7 +363,7 @@ def test_tables_in_figures() -> None:
 def test_interrupt_ends_a_long_call_of_compiled_code() -> None:
     """Python cannot raise KeyboardInterrupt during the call below, which would take hours."""
     program = (
-        "import hashlib; from cleargs.cli.terminal import answer_signals; answer_signals()\n"
+        "import hashlib; from cleargs.cli.terminal import handle_signals; handle_signals()\n"
         "print('ready', flush=True); hashlib.pbkdf2_hmac('sha256', b'x', b'y', 2**31 - 1)"
     )
     process = subprocess.Popen(
@@ -382,7 +382,7 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
     program = (
         "import os, signal, time; from cleargs.cli import terminal\n"
         "terminal.SAVING_S = 1.0\n"
-        "terminal.answer_signals()\n"
+        "terminal.handle_signals()\n"
         "child = os.fork()\n"
         "if child == 0: time.sleep(60); os._exit(0)\n"
         "time.sleep(0.2); os.kill(child, signal.SIGTERM); os.waitpid(child, 0)\n"
@@ -395,8 +395,8 @@ def test_ending_a_forked_child_does_not_end_its_parent() -> None:
 def test_a_signal_blocked_at_the_start_stays_blocked() -> None:
     """A parent process that blocks a signal for its child handles the signal itself."""
     program = (
-        "import os, signal; from cleargs.cli.terminal import answer_signals\n"
-        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); answer_signals()\n"
+        "import os, signal; from cleargs.cli.terminal import handle_signals\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}); handle_signals()\n"
         "os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

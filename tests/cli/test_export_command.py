@@ -14,7 +14,7 @@ sys.path.append(str(Path(__file__).parents[1] / "evaluate"))
 from colmap_model import write_sparse
 from eval_world import cameras, make_scene, write_run
 
-from cleargs.cli.export_pruning import cropped
+from cleargs.cli.export_pruning import crop_scene
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 from cleargs.splat.ply import read_ply
@@ -64,4 +64,4 @@ def test_nothing_left_to_crop_is_an_error() -> None:
     empty = replace(scene, gaussians=scene.gaussians.select(torch.zeros(5, dtype=torch.bool)))
     for region in ((98.0,), (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)):
         with pytest.raises(InputError, match="no Gaussian is left"):
-            cropped(empty, region)
+            crop_scene(empty, region)

@@ -80,7 +80,7 @@ def test_a_damaged_progress_file_is_ignored(
 
 
 def test_the_task_that_advanced_last_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "EVERY", 0.0)
+    monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
