@@ -33,6 +33,7 @@ Examples:
   cleargs batch captures.toml --dry-run          check the sheet; show hours, memory and disk
   cleargs batch captures.toml                    run the missing stages, scene by scene
   cleargs batch captures.csv --quality draft
+
 To run scenes in parallel on a cluster, see docs/cluster.md.
 """
 )

@@ -122,7 +122,7 @@ Examples:
 def gc(
     dag: Dag, run: Path | None, store: Path | None, checkpoints: bool, dry_run: bool, as_json: bool
 ) -> None:
-    """Remove the results that no run links to from the store of RUN, or from --store.
+    """Remove the results that no run links to. The store is that of RUN, or --store.
 
     A run keeps its results as long as its folder exists where it was last used. If you return to settings
     whose results were removed, the stages run again.

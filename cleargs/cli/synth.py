@@ -22,6 +22,16 @@ Example:
   cleargs synth room --protocol mixed --frames 16 --size 480x270
   cleargs run room -o run                         use the given poses
   cleargs run room -o run --set ingest.poses=sfm  estimate the poses from the images
+
+\b
+Protocols, with mean lengths at a width of 640 px:
+  sharp                                  no degradation except a little noise
+  mixed                                  every other frame blurred, defocused or badly exposed
+  gs2e-slight, gs2e-medium, gs2e-severe  motion blur of 6, 12 and 20 px
+  gs2e-stretches                         motion blur of 14 px, almost all in groups of 12 frames
+  gsotm-mb, gsotm-rs, gsotm-mb-rs        motion blur of 8 px, rolling shutter of 12 px, or both
+  gsotm-pn                               sharp frames with inexact poses
+  phone                                  degradations of a phone's video
 """
 )
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
