@@ -287,7 +287,7 @@ def _times(outcomes: Sequence[StageOutcome]) -> str:
         stages = ", ".join(f"{outcome.stage} {duration(outcome.manifest.seconds)}" for outcome in made)
         words.append(f"{duration(sum(outcome.manifest.seconds for outcome in made))} ({stages})")
     if found:
-        words.append(f"already there: {', '.join(found)}")
+        words.append(f"reused: {', '.join(found)}")
     return "; ".join(words)
 
 

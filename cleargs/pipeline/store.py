@@ -298,7 +298,7 @@ class Store:
                 note.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(note, f"{run}\n".encode())
 
-    # -- clearing --------------------------------------------------------------------------------------
+    # -- removing --------------------------------------------------------------------------------------
 
     def collect(self, stages: tuple[str, ...], *, checkpoints: bool, dry_run: bool) -> list[Garbage]:
         """Remove finished results that no run links to, and the remains of deleted folders.

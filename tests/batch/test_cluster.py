@@ -77,7 +77,8 @@ def test_a_bad_scene_does_not_stop_the_others(toys: ToyBatch) -> None:
 
     (toys.root / "sheet.toml").write_text('[[scene]]\nname = "attic"\ninput = "nowhere"')
     finish(toys, start(toys, *here), 1)
-    assert "does not exist" in (toys.root / "snakemake.log").read_text()
+    cause = f"scene attic: {toys.root / 'nowhere'} does not exist"
+    assert cause in (toys.root / "snakemake.log").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -72,7 +72,7 @@ def test_run_twice(shell: Shell) -> None:
     assert f"next: cleargs show {shell.bench.folder}\n" in out
     assert "estimate: about" in err and "square: started (no results yet)" in err
     code, out, err = shell.run()
-    assert code == 0 and "already there: count, square, total\n" in out and err == ""
+    assert code == 0 and "reused: count, square, total\n" in out and err == ""
 
 
 def again(shell: Shell, *arguments: str) -> tuple[int, str, str]:
@@ -226,7 +226,7 @@ def test_gc(shell: Shell) -> None:
     assert len(garbage) == 2 and all(Path(item["folder"]).exists() for item in garbage)
     shell("gc", folder)
     assert not any(Path(item["folder"]).exists() for item in garbage)
-    assert "already there: count, square, total" in shell.run()[1]
+    assert "reused: count, square, total" in shell.run()[1]
 
 
 def test_store_from_the_environment(shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -270,7 +270,7 @@ def test_damaged_run_file_is_replaced(shell: Shell) -> None:
     (shell.bench.folder / "run.toml").write_text("[half")
     assert shell("status", str(shell.bench.folder))[0] == 2
     code, out, _ = shell.run()
-    assert code == 0 and "already there: count, square, total" in out
+    assert code == 0 and "reused: count, square, total" in out
     assert shell("status", str(shell.bench.folder))[0] == 0
 
 
@@ -449,7 +449,7 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
         f"scene: {run}/consolidate/scene.ply (22 of 24 frames placed, 7 strong, 11 repaired)",
         "quality: PSNR 23.6 dB (first scene 22.6) on pixels that no training saw; "
         "views off the camera path are worse",
-        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); already there: ingest, rva",
+        "time: 4.5 min (g0 90.0 s, rivr 90.0 s, consolidate 90.0 s); reused: ingest, rva",
         f"look at: {run}/consolidate/before_after.png",
         f"next: cleargs export '{run}' -o 'my room.ply'",
     ]
@@ -560,4 +560,4 @@ def test_gc_refuses_a_folder_that_is_not_a_store(shell: Shell, tmp_path: Path) -
         code, _, errors = shell("gc", "--store", str(folder), "--checkpoints")
         assert code == 2 and "is not a store" in errors
     assert thesis.is_file()
-    assert "already there: count, square, total" in shell.run()[1]
+    assert "reused: count, square, total" in shell.run()[1]
