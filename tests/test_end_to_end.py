@@ -121,7 +121,9 @@ def test_killed_at_any_moment_it_ends_with_the_same_digests(
     seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
     moments = random.Random(stage)
     for _ in range(KILLS_PER_STAGE):
-        _kill_inside(command(capture, run, "--until", stage), f"{stage}: started", moments.uniform(0, seconds))
+        _kill_inside(
+            command(capture, run, "--until", stage), f"{stage}: started", moments.uniform(0, seconds)
+        )
     finish(capture, run, "--until", stage)
     files = json.loads((run / stage / "manifest.json").read_text())["files"]
     assert {name: record["digest"] for name, record in files.items()} == digests(finished)[stage]
