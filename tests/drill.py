@@ -65,7 +65,7 @@ class Drill:
         Where it was faster than that, its result is taken away, so that there is work again.
         """
         program = self.run(self.run_folder, "--until", stage)
-        program.wait_for(f"{stage}: starts")
+        program.wait_for(f"{stage}: started")
         time.sleep(self.chance.uniform(0, seconds))
         if self.kills[stage] % 3 == 0:
             beside = self.collect()  # refused while the stage is at work, whatever becomes of it afterwards

@@ -105,7 +105,7 @@ def test_a_crop_keeps_what_lies_in_the_box_of_the_cameras_world(
 ) -> None:
     assert export(run, tmp_path / "a.ply", "--crop", "box:-1,-1,0,1,1,2") == 0
     means = read_ply(tmp_path / "a.ply").gaussians.means
-    (gone,) = told(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians lie outside")
+    (gone,) = told(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians are outside")
     assert 0 < len(means) == 4000 - gone and float(means.abs().max()) <= 2.0
     assert export(run, tmp_path / "b.ply", "--crop", "percentile:80", "--world", "input") == 0
     kept = read_ply(tmp_path / "b.ply").gaussians.num
