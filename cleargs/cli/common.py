@@ -97,8 +97,8 @@ def work_options(command: F) -> F:
         type=click.Choice(["auto", "cpu", "cuda"]),
         default="auto",
         show_default=True,
-        help="Device to compute on. auto takes an NVIDIA GPU that passed its self-test (cleargs doctor --gpu) "
-        "and is faster than the CPU.",
+        help="Device to compute on. auto takes an NVIDIA GPU that passed its self-test (cleargs doctor "
+        "--gpu) and is faster than the CPU.",
     )(command)
     return threads_option(command)
 
