@@ -62,7 +62,7 @@ def soft(image: Image, sigma: float = 0.7) -> Image:
     return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), sigma) * 0.98 + 0.01, 0, 1), np.float32)
 
 
-def sight(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
+def frame_pair(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
     """The pair of the raw frame ``observed`` and its render, without a margin."""
     seen = np.where(weight[..., None] > 0, observed, render)
     return FramePair(luminance(render), wall(), ALPHA, luminance(seen), weight, CAMERA, 0)
