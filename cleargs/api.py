@@ -96,7 +96,7 @@ def run(
         workflow=workflow,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
-            # JSON's spelling of a value is TOML's too.
+            # Settings are parsed as TOML, which reads these JSON values too.
             *(f"{name}={json.dumps(x, ensure_ascii=False, default=str)}" for name, x in (set or {}).items()),
         ],
         seed=seed,

@@ -116,11 +116,11 @@ class DigestMemo:
         """Drop the digest of ``path``, so that the next `digest` reads the file."""
         self._learnt[str(path.absolute())] = NOTHING
 
-    def digests_of(self, place: External, *, rehash: bool = False) -> dict[str, str]:
+    def digests_of(self, external: External, *, rehash: bool = False) -> dict[str, str]:
         """Return the digests of files outside the store.
 
         Args:
-            place: A file, a folder, or files by name.
+            external: A file, a folder, or files by name.
             rehash: Read every file, even if the memo has its digest.
 
         Returns:
@@ -129,7 +129,7 @@ class DigestMemo:
         Raises:
             InputError: if a file is missing, not regular or not readable, or if its name is not UTF-8.
         """
-        files = named_files(place)
+        files = named_files(external)
         for file in files.values():
             require_utf8(file)
             if rehash:
@@ -149,11 +149,11 @@ class DigestMemo:
             database.executemany("INSERT OR REPLACE INTO contents VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
-def named_files(place: External) -> dict[str, Path]:
-    """Return the files of ``place`` by the names that `DigestMemo.digests_of` gives them."""
-    if isinstance(place, Mapping):
-        return dict(place)
-    return files_under(place) if place.is_dir() else {"": place}
+def named_files(external: External) -> dict[str, Path]:
+    """Return the files of ``external`` by the names that `DigestMemo.digests_of` gives them."""
+    if isinstance(external, Mapping):
+        return dict(external)
+    return files_under(external) if external.is_dir() else {"": external}
 
 
 def _state(path: Path) -> tuple[str, tuple[int, int, int, int]]:

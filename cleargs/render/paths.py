@@ -55,17 +55,17 @@ def smooth_path(
     quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
     path = np.hstack([centres, quaternions])
     motion = _motion(path)
-    kept = np.concatenate([[True], np.diff(motion) > 1e-9])
-    if kept.sum() < 2:
+    moved = np.concatenate([[True], np.diff(motion) > 1e-9])  # repeated poses are left out
+    if moved.sum() < 2:
         raise InputError(
             "the cameras of this capture do not move, so there is no path to follow",
             hint="render one of its frames with --frame, or give --poses",
         )
-    numbers, motion = np.flatnonzero(kept), motion[kept]
+    numbers, motion = np.flatnonzero(moved), motion[moved]
     samples = np.linspace(0, motion[-1], max(_SAMPLES, 20 * len(cameras)))
     sigma = len(samples) * np.clip(0.75 / (len(numbers) - 1), *_SMOOTHING)
     border = int(4 * sigma) + 1
-    path = _at(samples, motion, path[kept])
+    path = _at(samples, motion, path[moved])
     path = np.pad(path, ((border, border), (0, 0)), mode="reflect", reflect_type="odd")
     path = gaussian_filter1d(path, sigma, axis=0)[border:-border]
     passed = np.interp(samples, motion, numbers)

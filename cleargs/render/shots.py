@@ -61,14 +61,14 @@ class CaptureShots:
     def still(self, frame_id: int | None) -> list[Shot]:
         """Return a shot at the pose of a frame (None: the frame in the middle of the capture)."""
         numbers = [frame.frame_id for frame in self._frames]
-        wanted = numbers[len(numbers) // 2] if frame_id is None else frame_id
-        if wanted not in numbers:
-            exists = any(frame.frame_id == wanted for frame in self._all)
+        number = numbers[len(numbers) // 2] if frame_id is None else frame_id
+        if number not in numbers:
+            exists = any(frame.frame_id == number for frame in self._all)
             raise InputError(
-                f"frame {wanted} {'has no pose' if exists else 'is not in this capture'}",
+                f"frame {number} {'has no pose' if exists else 'is not in this capture'}",
                 hint=f"choose one from {numbers[0]} to {numbers[-1]}",
             )
-        index = numbers.index(wanted)
+        index = numbers.index(number)
         return self._shots([self._cameras[index]], [self._frames[index]])
 
     def path(self, count: int) -> list[Shot]:

@@ -81,8 +81,8 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
     for name, shown in pictured.items():
         tiles = []
         for row in shown:
-            place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
-            label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
+            geometry = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
+            label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {geometry}"
             image = read_rgb(ingest / frames[row["frame_id"]].image)
             tiles.append(Tile(image, label, marked=bool(row["weight"])))
         sheet = contact_sheet([tiles], tile_width=_TILE)

@@ -77,8 +77,8 @@ class FrameRow:
         """Candidate of the latest round that the training uses; None if it was refused."""
         if self.selection is None:
             return None
-        kept = self.selection.accepted or self.selection.chosen == "observed"
-        return self.selection.chosen if kept else None
+        used = self.selection.accepted or self.selection.chosen == "observed"
+        return self.selection.chosen if used else None
 
     @property
     def gain_ev(self) -> float | None:
@@ -160,7 +160,7 @@ def camera_of(frame: Frame) -> Camera:
     return view_of(frame, Path(), 0.0).camera
 
 
-# -- pictures ------------------------------------------------------------------------------------------------
+# -- images --------------------------------------------------------------------------------------------------
 
 
 LAYERS = {

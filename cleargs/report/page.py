@@ -208,11 +208,11 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
 
 def command(run: RunSpec, dag: Dag) -> str:
     """Return the ``cleargs run`` command that reproduces a run, to be called next to its folder."""
-    wanted = dict(flattened(run.config.document()))
+    settings = dict(flattened(run.config.document()))
     candidates = []
     for recipe in ("default", *(name for name in recipe_names() if name != "default")):
-        have = dict(flattened(load_config(dag, recipe).document()))
-        changed = {name: value for name, value in wanted.items() if have.get(name) != value}
+        from_recipe = dict(flattened(load_config(dag, recipe).document()))
+        changed = {name: value for name, value in settings.items() if from_recipe.get(name) != value}
         candidates.append((len(changed), recipe, changed))
     _, recipe, changed = min(candidates, key=lambda item: item[0])
     source = os.path.relpath(run.source, run.folder.parent)
@@ -345,8 +345,8 @@ def camera_map(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
         return None
     cameras = [camera_of(row.frame) for row in placed]
     centres = np.array([camera.centre[[0, 2]] for camera in cameras]) * [1.0, -1.0]
-    looks = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
-    looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    directions = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     low, high = centres.min(axis=0), centres.max(axis=0)
     scale = 520.0 / max(float((high - low).max()), 1e-6)
     size = (high - low) * scale
@@ -363,7 +363,7 @@ def camera_map(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
             "tip": (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
             "active": bool(row.weight),
         }
-        for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
+        for row, (x, y), (dx, dy) in zip(placed, at, directions, strict=True)
     ]
     path = "M" + " L".join(f"{mark['x']},{mark['y']}" for mark in marks)
     return {"width": float(size[0]) + 120.0, "height": height + 120.0, "path": path, "marks": marks}

@@ -51,7 +51,7 @@ class ReportVerdict:
         self._placed = [row for row in rows if row.frame.registered]
         self._unused = sum(row.weight == 0.0 for row in self._placed)
         # PSNR in dB of the first scene on the best training frames, and a description of these frames.
-        self._psnr, self._compared = self._figure("g0", "psnr_strong"), "the most reliable training frames"
+        self._psnr, self._compared = self._figure("g0", "psnr_strong"), "the best training frames"
         if self._psnr is None:
             self._psnr, self._compared = self._figure("g0", "psnr_active"), "the training frames"
 
@@ -75,7 +75,7 @@ class ReportVerdict:
         if self._psnr >= CLOSE_DB:
             return "good", f"Good: {matches} closely."
         if self._psnr >= LOOSE_DB:
-            return "fair", f"Fair: {matches} fairly well."
+            return "fair", f"Fair: {matches} reasonably well."
         return "poor", f"Poor: {matches} only loosely."
 
     def text(self) -> str:
@@ -193,7 +193,7 @@ class ReportVerdict:
         if psnr is not None and psnr < CLOSE_DB:
             size = self._setting("ingest", "max_size") * 3 // 2
             yield Caution(
-                f"The first scene reaches only {psnr:.1f} dB on the most reliable frames",
+                f"The first scene reaches only {psnr:.1f} dB on the best training frames",
                 "A longer training or larger images give finer detail.",
                 (f"g0.steps={2 * self._figure('g0', 'steps')}", f"ingest.max_size={size}"),
             )

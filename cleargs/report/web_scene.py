@@ -56,9 +56,9 @@ def write_scene(path: Path, name: str, scene: Scene) -> int:
     gaussians = scene.gaussians
     visible = torch.sigmoid(gaussians.logit_opacities) >= _INVISIBLE
     degree = shown_degree(int(visible.sum()), gaussians.sh_degree)
-    kept = gaussians.select(visible)
-    kept = Gaussians(**{**kept.tensors(), "sh": kept.sh[:, : (degree + 1) ** 2].contiguous()})
-    packed = gzip.compress(compressed_ply(Scene(kept)), 6, mtime=0)
+    shown = gaussians.select(visible)
+    shown = Gaussians(**{**shown.tensors(), "sh": shown.sh[:, : (degree + 1) ** 2].contiguous()})
+    packed = gzip.compress(compressed_ply(Scene(shown)), 6, mtime=0)
     path.write_bytes(_script(name, packed))
     return degree
 

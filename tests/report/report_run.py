@@ -105,7 +105,7 @@ class FinishedRun:
         self._trained("consolidate", consolidated | {"psnr_unseen": 24.6})
 
     def planner(self, store: Store) -> Planner:
-        """A planner of this run on one thread."""
+        """A planner of this run with one thread."""
         return Planner(self.dag, self.run, store, 1, SilentReporter())
 
     def finish(self, stage: str, summary: dict[str, Any]) -> None:

@@ -193,7 +193,7 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(phone: Report) -> None:
 
 
 def test_dark_and_light_keep_their_contrast(wide: Report, phone: Report) -> None:
-    """WCAG AA, 4.5, for text on the page and on its cards, and 3 for the faint notes."""
+    """Text on the page and on its cards has the contrast 4.5 of WCAG AA, and faint notes have 3."""
     script = """() => {
         const probe = document.body.appendChild(document.createElement('i'));
         const rgb = (name) => {
