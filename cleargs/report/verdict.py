@@ -113,12 +113,11 @@ class ReportVerdict:
             yield str(active), "frames used in training", f"equivalent to {effective} equally weighted frames"
         if self._psnr is not None:
             rule = f"rule of thumb: close from {CLOSE_DB:g} dB, loose below {LOOSE_DB:g} dB"
-            note = f"PSNR of the first scene at training poses; {rule}"
-            yield f"{self._psnr:.1f} dB", f"on {self._compared}", note
+            yield f"{self._psnr:.1f} dB", f"PSNR on {self._compared}", f"first scene; {rule}"
         unseen = self._figure(last_scene(self._manifests) or "", "psnr_unseen")
         if unseen is not None:
-            note = "PSNR of the last scene on 1 % of each frame; views away from the path are worse"
-            yield f"{unseen:.1f} dB", "on pixels that no training used", note
+            note = "last scene, 1 % of each frame; views away from the camera path are worse"
+            yield f"{unseen:.1f} dB", "PSNR on pixels that no training used", note
         repairs = self._figure("consolidate", "repairs")
         if repairs is not None:
             views = "repaired views" if repairs != 1 else "repaired view"
