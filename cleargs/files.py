@@ -47,12 +47,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a new folder that becomes ``path`` when the block ends without an error.
 
-    Args:
-        path: The final place of the folder.
-        replace: Replace a folder that is already at ``path``.
-
-    Raises:
-        StoreError: if the folder cannot be written.
+    With ``replace``, it replaces a folder at ``path``. Raises StoreError if it cannot be written.
     """
     folder = path.with_name(f".{secrets.token_hex(4)}{PARTIAL_SUFFIX}.{path.name}")
     old = folder.with_name(f"{folder.name}.old")

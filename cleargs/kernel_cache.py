@@ -30,9 +30,6 @@ def configure_numba(name: str) -> None:
 
     OpenMP is preferred, since any Python thread may start a kernel. Without it Numba uses its own work queue,
     for which ``jit.LAUNCHING`` serialises launches.
-
-    Args:
-        name: Name of the cache folder; see `cache_folder`.
     """
     from numba import config
 

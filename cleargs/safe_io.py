@@ -76,12 +76,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Read UTF-8 text without its byte order mark.
-
-    Raises:
-        OSError: like `read_bytes`.
-        UnicodeDecodeError: if the text is not UTF-8.
-    """
+    """Read UTF-8 text without its byte order mark. Raises OSError (see `read_bytes`), UnicodeDecodeError."""
     return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
 
 

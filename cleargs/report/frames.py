@@ -247,14 +247,7 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
 
 
 def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
-    """Return the raw frame, and the other layers of its latest round.
-
-    Args:
-        row: The frame.
-        run: The run folder.
-
-    Returns:
-        Name of the layer -> image [H, W, 3] sRGB.
+    """Return layer -> image [H, W, 3] sRGB: the raw frame, and the other layers of its latest round.
 
     Raises:
         InputError: if an image cannot be read.

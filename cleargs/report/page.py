@@ -282,14 +282,7 @@ def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
     """Return the curves of loss, PSNR and number of Gaussians over the training steps.
 
     Loss and PSNR are those of raw frames. Positions of ticks, and of the starts of the trainings (``parts``),
-    are in the units of `WIDTH` and `HEIGHT`.
-
-    Args:
-        run: The run folder.
-        stages: The stages that trained a scene.
-
-    Raises:
-        StoreError: if a table cannot be read.
+    are in the units of `WIDTH` and `HEIGHT`. Raises StoreError if a table cannot be read.
     """
     paths = {stage: run / stage / "train.parquet" for stage in stages}
     tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
