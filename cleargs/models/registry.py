@@ -16,7 +16,7 @@ from pydantic import Field
 from cleargs.base_model import FrozenModel
 from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
-from cleargs.plugins import load_part, plugins
+from cleargs.plugins import load_plugin, plugins
 from cleargs.safe_io import read_json
 
 T = TypeVar("T")
@@ -198,7 +198,7 @@ def load_network(
     """
     path = model_file(spec, role)
     if path is None:
-        part: T = load_part("experts" if role == "expert" else "scorers", spec)(device)
+        part: T = load_plugin("experts" if role == "expert" else "scorers", spec)(device)
         return part
     model = registered(spec, role)
     if model is not None and model.shipped is None:

@@ -14,7 +14,7 @@ import torch
 
 from cleargs.errors import InputError
 from cleargs.files import atomic_path, write_bytes
-from cleargs.plugins import load_part, plugins
+from cleargs.plugins import load_plugin, plugins
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.glb import glb
@@ -102,7 +102,7 @@ def format_of(path: Path) -> str:
 
 
 def _format(kind: str) -> Format:
-    found: Format = FORMATS[kind] if kind in FORMATS else load_part("formats", kind)
+    found: Format = FORMATS[kind] if kind in FORMATS else load_plugin("formats", kind)
     return found
 
 

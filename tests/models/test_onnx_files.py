@@ -70,7 +70,7 @@ def test_weights_in_another_file_are_refused(
 
 def test_a_fifo_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "m.onnx")
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         OnnxModel(tmp_path / "m.onnx")
 
 

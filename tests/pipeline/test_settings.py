@@ -219,7 +219,7 @@ def test_a_pipe_for_a_run_file(bench: Bench) -> None:
     os.mkfifo(bench.folder / "run.toml")
     with pytest.raises(InputError, match="not a run"):
         read_run_file(bench.folder, bench.dag)
-    with pytest.raises(ConfigError, match="no regular file"):
+    with pytest.raises(ConfigError, match="not a regular file"):
         read_toml(bench.folder / "run.toml")
 
 

@@ -1,4 +1,4 @@
-"""`cleargs show RUN --frame N`: all about one frame, for people and for programs, and its layers as a PNG."""
+"""`cleargs show RUN --frame N`: data of one frame as text and JSON, and its layers as a PNG."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def test_a_frame_for_programs(run: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert blur["value"] == 3.25 and blur["meaning"].endswith("px")
 
 
-def test_layers_stand_side_by_side(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_layers_are_side_by_side(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     facts = json.loads(shown(run, 1, capsys, "--json"))
     assert facts["layers"] == ["observed", "restored", "render", "final"]
     sheet = read_rgb(Path(facts["picture"]))
-    assert sheet.shape[1] == 3 * 240 + 2 * 4, "three beside each other"
+    assert sheet.shape[1] == 3 * 240 + 2 * 4, "three next to each other"
     tile = round(HEIGHT * 240 / 96)
     first, second = sheet[22 : 22 + tile, :240], sheet[22 : 22 + tile, 244:484]
     assert first.std() > 20 and abs(first.astype(float) - second).mean() > 3  # restored is darker
