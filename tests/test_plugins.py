@@ -139,7 +139,7 @@ def test_format(parts: Path, tmp_path: Path) -> None:
     x, y, z = scene.gaussians.means[0].tolist()
     assert lines[0] == "x,y,z" and len(lines) == 1 + scene.gaussians.num
     assert [float(value) for value in lines[1].split(",")] == pytest.approx([x, -y, -z], rel=1e-5)
-    with pytest.raises(InputError, match="no ending") as caught:
+    with pytest.raises(InputError, match="not a known scene format") as caught:
         cg.save(scene, tmp_path / "room.xyz")
     assert ".csv" in caught.value.hint and ".ply" in caught.value.hint
 

@@ -24,6 +24,8 @@ class Dag:
 
     With ``say``, the pace is measured unless it is known, which takes seconds, and ``say`` announces it.
     """
+    gpu_fault: Callable[[BaseException], str | None] = lambda error: None
+    """Return in one line what failed on the GPU if that is the cause of an error, else None."""
 
     def check(self, name: str) -> str:
         """Return ``name`` if it is a stage; raise InputError with the nearest name otherwise."""
@@ -42,7 +44,7 @@ class Dag:
 def installed() -> Dag:
     """Return the stages of the package ``cleargs.stages``. A module is imported when it is first used."""
     package = import_module("cleargs.stages")
-    return Dag(tuple(package.STAGES), load_stage, package.pace)
+    return Dag(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
+from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
 from cleargs.pipeline.config import check_document, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
@@ -28,7 +27,6 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 MAX_LISTED = 3  # settings of an existing run that a message lists
-UNUSED_GPU = "--device auto does not use the NVIDIA GPU yet; give --device cuda to use it"
 
 
 def usable_cores() -> int:
@@ -38,35 +36,45 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def resolve_device(choice: DeviceChoice, say: Callable[[str], None]) -> Device:
+def resolve_device(
+    choice: DeviceChoice, say: Callable[[str], None], *, kept: Device | None = None, test: bool = False
+) -> Device:
     """Return the device to use. Does not import torch, which would take seconds.
 
     Args:
-        choice: The user's choice.
-        say: Receives a message if ``auto`` does not use an available GPU.
+        choice: The user's choice. ``auto`` uses a GPU that passed its self-test and is faster than the CPU.
+        say: Receives a message with the choice of ``auto`` and its reason.
+        kept: The device of an existing run, which ``auto`` keeps.
+        test: Let ``auto`` run the self-test of a GPU that was not tested yet.
 
     Raises:
-        InputError: ``choice`` is ``cuda``, and no GPU is usable.
+        InputError: The chosen or kept device is a GPU that cannot be used.
     """
-    obstacle = None if choice == "cpu" else cuda_obstacle()
-    if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
-        if choice == "auto" and obstacle is None:
-            say(UNUSED_GPU)
+    if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
-    if obstacle is not None:
+    obstacle = cuda_obstacle()
+    if obstacle is not None and (choice == "cuda" or kept == "cuda"):
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
-    return "cuda"
-
-
-def cuda_obstacle() -> str | None:
-    """Return the reason why no NVIDIA GPU is usable, or None if one is."""
-    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg")):
-        return "this machine has no NVIDIA GPU"
-    if find_spec("triton") is None:
-        return "Triton is not installed (pip install 'cleargs[cuda]')"
-    if version("torch").endswith("+cpu"):
-        return "this PyTorch is built for the CPU only (install a CUDA build)"
-    return None
+    if choice == "cuda":
+        return "cuda"
+    if obstacle is not None:
+        if obstacle != NO_GPU:
+            say(f"device: the CPU, because {obstacle}")
+        return "cpu"
+    facts = current_facts()
+    tested = cached_test(facts) or (self_test(facts, say) if test else None)
+    if kept == "cuda":
+        if tested is not None and tested.fault is not None:
+            raise InputError(
+                f"the run used the GPU, but {tested.reason}",
+                hint="run its stages again with --device cpu, or stay on the GPU with --device cuda",
+            )
+        return "cuda"
+    if tested is None:
+        say("device: the CPU, because the GPU is not tested yet (cleargs doctor --gpu tests it)")
+        return "cpu"
+    say(f"device: the {'GPU' if tested.device == 'cuda' else 'CPU'}, because {tested.reason}")
+    return tested.device
 
 
 @contextmanager
@@ -88,6 +96,7 @@ def resolve_run(
     reset: bool = False,
     store: Path | None = None,
     device: DeviceChoice = "auto",
+    test_gpu: bool = True,
     say: Callable[[str], None],
 ) -> RunSpec:
     """Return the run of a capture, with everything that decides its results.
@@ -104,7 +113,8 @@ def resolve_run(
         reset: Start from the recipe instead of the settings of an existing run.
         store: Folder of the store instead of that of the run.
         device: Device instead of that of the run, unless "auto".
-        say: Receives a message about settings that the run keeps.
+        test_gpu: Let "auto" run the self-test of a GPU that was not tested yet.
+        say: Receives messages about the device, and about settings that the run keeps.
 
     Raises:
         InputError: ``source`` does not exist or is a run.
@@ -133,7 +143,8 @@ def resolve_run(
             ) from error
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
-    chosen = resolve_device(metadata.device or device if device == "auto" else device, say)
+    keeps = device == "auto" and metadata.device is not None
+    chosen = resolve_device(device, say, kept=metadata.device, test=test_gpu)
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
@@ -142,4 +153,5 @@ def resolve_run(
         )
         if own:
             say(f"settings kept from {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    return RunSpec(folder, source.absolute(), config, root, chosen)
+    on_cpu = metadata.on_cpu if keeps else ()
+    return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")

@@ -35,7 +35,7 @@ def test_the_ending_chooses_the_format(run: Path, tmp_path: Path, capsys: pytest
     for name in ("x.splat", "x", "x.ply.gz"):
         assert export(run, tmp_path / name) == 2 and not (tmp_path / name).exists()
         cause, remedy = capsys.readouterr().err.splitlines()
-        assert "no ending that says what to write" in cause and ".ply" in remedy
+        assert "not a known scene format" in cause and ".ply" in remedy
     assert export(run, tmp_path / "x.PLY") == 0
     assert read_ply(tmp_path / "x.PLY").gaussians.num == 20
 
