@@ -88,7 +88,7 @@ class Batch:
     options: tuple[str, ...] = ()
     """More options for each ``cleargs run``."""
     falls_back: bool = False
-    """True: ``--device auto`` chose the GPU, and a scene continues on the CPU if the GPU's kernels fail."""
+    """True if ``--device auto`` chose the GPU: a scene on which its kernels fail continues on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         """Return the run folder of ``scene``."""
@@ -208,7 +208,7 @@ class Batch:
             say=lambda line: None,
         )
         before = read_metadata(run.folder) if self.falls_back else RunMetadata()
-        # Not resolved again: a login node need not have the device.
+        # The device is not checked: a login node may not have it.
         return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
 
     @property

@@ -42,12 +42,12 @@ class RunSpec:
     """Absolute path of the store."""
     device: Device
     on_cpu: tuple[str, ...] = ()
-    """Stages that run on the CPU although `device` is the GPU: its kernels failed there."""
+    """Stages that run on the CPU although `device` is the GPU, because its kernels failed there."""
     falls_back: bool = field(default=False, compare=False)
-    """True: a stage runs again on the CPU if the kernels of the GPU fail. ``run.toml`` does not hold this."""
+    """True if a stage runs again on the CPU when the kernels of the GPU fail. Not stored in ``run.toml``."""
 
     def device_of(self, stage: str) -> Device:
-        """Return the device class of one stage."""
+        """Return the device of one stage."""
         return "cpu" if stage in self.on_cpu else self.device
 
 

@@ -174,7 +174,7 @@ class Runner:
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and link them into the run folder.
 
-        If the GPU's kernels fail and the run may fall back, the stage starts again under the CPU's key.
+        If the kernels of the GPU fail and the run may fall back, the stage starts again on the CPU.
         """
         try:
             return self._find_or_make_on_device(name, done, forced=forced)
@@ -185,7 +185,7 @@ class Runner:
             if not self.run.falls_back:
                 raise StageError(
                     f"{name}: the GPU failed ({fault})",
-                    hint="cleargs doctor --gpu tests it; --device cpu runs on the CPU",
+                    hint="test the GPU with cleargs doctor --gpu, or run on the CPU with --device cpu",
                 ) from error
         # Outside the except block, so that the traceback holds no memory of the GPU.
         self._leave_gpu(name, fault)
@@ -196,7 +196,7 @@ class Runner:
         stages = self.dag.names[self.dag.names.index(name) :]
         self.reporter.warn(
             f"{name}: the GPU failed ({fault}); {', '.join(stages)} run on the CPU, {name} from its start. "
-            "Finished stages stay. --device cuda tries the GPU again"
+            "Finished stages are kept. Try the GPU again with --device cuda"
         )
         self.run = self.planner.run = replace(self.run, on_cpu=stages)
         write_run_file(self.run)

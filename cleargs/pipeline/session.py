@@ -39,16 +39,16 @@ def usable_cores() -> int:
 def resolve_device(
     choice: DeviceChoice, say: Callable[[str], None], *, kept: Device | None = None, test: bool = False
 ) -> Device:
-    """Return the device class to use, without importing torch, which takes seconds.
+    """Return the device to use. Does not import torch, which would take seconds.
 
     Args:
-        choice: The user's choice. ``auto`` takes a GPU that passed its self-test and is faster than the CPU.
-        say: Receives the line that says which device ``auto`` chose, and why.
-        kept: Device of an existing run, which ``auto`` keeps.
-        test: True: ``auto`` runs the self-test of a GPU that has no result yet.
+        choice: The user's choice. ``auto`` uses a GPU that passed its self-test and is faster than the CPU.
+        say: Receives a message with the choice of ``auto`` and its reason.
+        kept: The device of an existing run, which ``auto`` keeps.
+        test: Let ``auto`` run the self-test of a GPU that was not tested yet.
 
     Raises:
-        InputError: The GPU is chosen or kept and cannot be used.
+        InputError: The chosen or kept device is a GPU that cannot be used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
@@ -66,8 +66,8 @@ def resolve_device(
     if kept == "cuda":
         if tested is not None and tested.fault is not None:
             raise InputError(
-                f"the run was made on the GPU, but {tested.reason}",
-                hint="--device cpu makes its stages again on the CPU, --device cuda stays on the GPU",
+                f"the run used the GPU, but {tested.reason}",
+                hint="run its stages again with --device cpu, or stay on the GPU with --device cuda",
             )
         return "cuda"
     if tested is None:
@@ -113,8 +113,8 @@ def resolve_run(
         reset: Start from the recipe instead of the settings of an existing run.
         store: Folder of the store instead of that of the run.
         device: Device instead of that of the run, unless "auto".
-        test_gpu: See ``test`` of `resolve_device`.
-        say: Receives a message about settings that the run keeps.
+        test_gpu: Let "auto" run the self-test of a GPU that was not tested yet.
+        say: Receives messages about the device, and about settings that the run keeps.
 
     Raises:
         InputError: ``source`` does not exist or is a run.

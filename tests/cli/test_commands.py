@@ -494,9 +494,7 @@ PASSED = SelfTest(FACTS, [Check("Adam", [], 1.0)], gpu_ms=2.0, cpu_ms=60.0)
 FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)])
 
 
-def test_auto_takes_a_gpu_that_passed_and_a_dry_run_does_not_test_it(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auto_uses_a_tested_gpu_and_dry_run_tests_none(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     results = [None, PASSED]
     monkeypatch.setattr("cleargs.pipeline.session.cuda_obstacle", lambda: None)
     monkeypatch.setattr("cleargs.pipeline.session.current_facts", lambda: FACTS)

@@ -1,4 +1,4 @@
-"""The device that a run takes by itself, and a GPU whose kernels fail in the middle of a run."""
+"""The automatic choice of the device, and a GPU whose kernels fail during a run."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_auto_tests_a_gpu_that_is_new(
     assert resolve_device("auto", lambda line: None, test=True) == "cuda"
 
 
-def test_without_a_gpu_nothing_is_asked_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_gpu_there_is_no_test_and_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*given: object) -> None:
         raise AssertionError("there is no GPU to ask")
 
@@ -116,7 +116,7 @@ def test_a_run_keeps_its_device(gpu: Callable[[SelfTest | None], None]) -> None:
     assert resolve_device("auto", lines.append, kept="cuda") == "cuda"
     gpu(FAILED)
     assert resolve_device("cuda", lines.append, kept="cuda") == "cuda"
-    with pytest.raises(InputError, match="the run was made on the GPU, but the GPU failed") as caught:
+    with pytest.raises(InputError, match="the run used the GPU, but the GPU failed") as caught:
         resolve_device("auto", lines.append, kept="cuda")
     assert "--device cpu" in caught.value.hint
     assert not lines
@@ -126,7 +126,7 @@ def test_a_run_keeps_its_device(gpu: Callable[[SelfTest | None], None]) -> None:
 
 
 class Breaking(Square):
-    """Fails on the GPU behind its third number."""
+    """A stage that fails on the GPU after its first file."""
 
     error: Exception | None = ILLEGAL
     bare: bool = False
@@ -158,7 +158,7 @@ def run_on(
     folder: Path | None = None,
     store: Path | None = None,
 ) -> list[StageOutcome]:
-    """``cleargs run --device DEVICE``, or ``cleargs stage``."""
+    """Call ``cleargs run --device DEVICE``, or ``cleargs stage``."""
     (recipe := bench.root / "toy.toml").write_text("seed = 0\n")
     settings = resolve_run(
         bench.dag,
@@ -183,8 +183,8 @@ def test_a_stage_whose_kernels_fail_starts_again_on_the_cpu(breaking: Bench, tmp
     assert devices(outcomes) == {"count": "cuda", "square": "cpu", "total": "cpu"}
     assert breaking.remarks.warnings == [
         "square: the GPU failed (RuntimeError: CUDA error: an illegal memory access was encountered); "
-        "square, total run on the CPU, square from its start. Finished stages stay. "
-        "--device cuda tries the GPU again"
+        "square, total run on the CPU, square from its start. Finished stages are kept. "
+        "Try the GPU again with --device cuda"
     ]
     assert tomllib.loads((breaking.folder / "run.toml").read_text())["on_cpu"] == ["square", "total"]
     # The same keys and bytes as without a GPU.
@@ -261,7 +261,7 @@ def test_a_single_stage_falls_back_too(breaking: Bench, monkeypatch: pytest.Monk
     assert read_run_file(breaking.folder, breaking.dag).on_cpu == ("square", "total")
 
 
-def test_a_damaged_list_of_stages_is_told(breaking: Bench) -> None:
+def test_a_damaged_list_of_stages_is_an_error(breaking: Bench) -> None:
     run_on(breaking, "auto")
     path = breaking.folder / "run.toml"
     path.write_text(path.read_text().replace('"square",', "1,"))
