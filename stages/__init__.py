@@ -14,3 +14,10 @@ def pace(say: Callable[[str], None] | None = None) -> float:
     from cleargs.splat.pace import machine_pace
 
     return machine_pace(say)
+
+
+def gpu_fault(error: BaseException) -> str | None:
+    """Return in one line what failed on the GPU if that is the cause of ``error``, else None."""
+    from cleargs.splat.kernels.cuda.support import gpu_fault
+
+    return gpu_fault(error)

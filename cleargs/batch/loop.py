@@ -27,7 +27,7 @@ from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Device, RunSpec
+from cleargs.pipeline.run_file import Device, RunMetadata, RunSpec, read_metadata
 from cleargs.pipeline.runner import check_same_input
 from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
@@ -85,6 +85,8 @@ class Batch:
     """Settings of all scenes; those of a scene go over them."""
     options: tuple[str, ...] = ()
     """Further options of each ``cleargs run``."""
+    falls_back: bool = False
+    """True: ``--device auto`` chose the GPU, and a scene on which its kernels fail goes on on the CPU."""
 
     def run_folder(self, scene: SceneJob) -> Path:
         """Return the run folder of ``scene``."""
@@ -98,9 +100,10 @@ class Batch:
         """Return the arguments of ``cleargs`` that bring ``scene`` through the stages."""
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
+        device = "auto" if self.falls_back else self.device
         return [
             *("run", str(scene.source), "-o", str(self.run_folder(scene)), "--store", str(self._store)),
-            *("--workflow", scene.recipe, *settings, *until, "--device", self.device, *self.options),
+            *("--workflow", scene.recipe, *settings, *until, "--device", device, *self.options),
         ]
 
     def check(self, sheet: Path) -> None:
@@ -201,7 +204,9 @@ class Batch:
             device="cpu",
             say=lambda line: None,
         )
-        return replace(run, device=self.device)  # which a login node need not have
+        before = read_metadata(run.folder) if self.falls_back else RunMetadata()
+        # Not resolved again: a login node need not have the device.
+        return replace(run, device=before.device or self.device, on_cpu=before.on_cpu)
 
     @property
     def _store(self) -> Path:

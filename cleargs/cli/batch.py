@@ -24,6 +24,7 @@ from cleargs.cli.common import (
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
+from cleargs.pipeline.run_file import Device
 from cleargs.pipeline.session import DeviceChoice, resolve_device
 
 
@@ -83,10 +84,13 @@ def batch(
         *(["--allow-partial"] if allow_partial else []),
         *([] if wants_report else ["--no-report"]),
     )
-    resolved = "cuda" if looks_only and device == "cuda" else resolve_device(device, reporter.info)
+    resolved: Device = "cuda"
+    if not (looks_only and device == "cuda"):
+        resolved = resolve_device(device, reporter.info, test=not looks_only)
+    falls_back = device == "auto" and resolved == "cuda"
     root = (folder or sheet.with_suffix(".batch")).absolute()
     try:
-        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options)
+        scenes = Batch(dag, root, read_scenes(sheet), resolved, until, quality, options, falls_back)
         scenes.check(sheet)
     except SheetError as error:
         for problem in error.problems:

@@ -97,7 +97,8 @@ def work_options(command: F) -> F:
         type=click.Choice(["auto", "cpu", "cuda"]),
         default="auto",
         show_default=True,
-        help="Where to compute. auto is the CPU today: the GPU back end is untested on GPU hardware.",
+        help="Where to compute. auto takes an NVIDIA GPU that passed its self-test (cleargs doctor --gpu) "
+        "and is faster than the CPU.",
     )(command)
     return threads_option(command)
 

@@ -122,6 +122,7 @@ def run(
         reset=reset,
         store=store,
         device=device,
+        test_gpu=not dry_run,
         say=reporter.info,
     )
     with opened_store(settings.store) as opened:

@@ -21,6 +21,8 @@ class Dag:
     pace: Callable[[Say | None], float] = lambda say: 1.0
     """This machine's time over what the stages' estimates were made for. It may take seconds to measure, and
     is measured only where somebody is told (``say``)."""
+    gpu_fault: Callable[[BaseException], str | None] = lambda error: None
+    """Return in one line what failed on the GPU if that is the cause of an error, else None."""
 
     def check(self, name: str) -> str:
         """``name``, when there is such a stage. Raises InputError with the nearest name otherwise."""
@@ -39,7 +41,7 @@ class Dag:
 def installed() -> Dag:
     """The stages of the package ``cleargs.stages``. Each module is loaded when it is first asked for."""
     package = import_module("cleargs.stages")
-    return Dag(tuple(package.STAGES), load_stage, package.pace)
+    return Dag(tuple(package.STAGES), load_stage, package.pace, package.gpu_fault)
 
 
 def load_stage(name: str) -> Stage:

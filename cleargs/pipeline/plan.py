@@ -103,8 +103,8 @@ class Planner:
             inputs=inputs,
             externals={role: tree_digest(files) for role, files in digests.items()},
             seed=self.run.config.seed,
-            device=self.run.device,
-            libraries=library_versions(stage, self.run.device) | plugin_versions(config),
+            device=self.run.device_of(name),
+            libraries=library_versions(stage, self.run.device_of(name)) | plugin_versions(config),
         )
         folders = {upstream: self.store.folder(upstream, done[upstream].key) for upstream in stage.INPUTS}
         inherited: dict[str, None] = {}  # in order, each once
@@ -209,7 +209,7 @@ class Planner:
             checkpoints=work.checkpoints,
             cache=self.store.cache_folder(name),
             seed=self.run.config.seed,
-            device=self.run.device,
+            device=self.run.device_of(name),
             threads=self.threads,
             reporter=self.reporter,
         )

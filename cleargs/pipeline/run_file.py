@@ -41,11 +41,21 @@ class RunSpec:
     store: Path
     """Absolute."""
     device: Device
+    on_cpu: tuple[str, ...] = ()
+    """Stages that run on the CPU although `device` is the GPU: its kernels failed there."""
+    falls_back: bool = field(default=False, compare=False)
+    """True: a stage runs again on the CPU if the kernels of the GPU fail. ``run.toml`` does not hold this."""
+
+    def device_of(self, stage: str) -> Device:
+        """Return the device class of one stage."""
+        return "cpu" if stage in self.on_cpu else self.device
 
 
 def write_run_file(run: RunSpec) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
     document: Document = {"input": str(run.source), "device": run.device}
+    if run.on_cpu:
+        document["on_cpu"] = list(run.on_cpu)
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
     document["seed"] = run.config.seed
@@ -84,15 +94,16 @@ class RunMetadata:
     source: Path | None = None
     store: Path | None = None
     device: Device | None = None
+    on_cpu: tuple[str, ...] = ()
     damaged: bool = False
-    """True when it says one of the three wrongly."""
+    """True when it says one of the four wrongly."""
 
 
 def read_metadata(folder: Path) -> RunMetadata:
     """Return what `write_run_file` noted in ``folder``; nothing when there is no run.
 
-    Each of input, store and device is read on its own: a damaged one hides no other. Raises ConfigError when
-    the file is no TOML.
+    Each of input, store, device and on_cpu is read on its own: a damaged one hides no other. Raises
+    ConfigError when the file is no TOML.
     """
     if not (folder / RUN_FILE).is_file():
         return RunMetadata()
@@ -106,7 +117,11 @@ def read_metadata(folder: Path) -> RunMetadata:
     device = given["device"] if given["device"] in ("cpu", "cuda") else None
     read = {*paths, *(["device"] if device else [])}
     damaged = any(value not in (None, "") and name not in read for name, value in given.items())
-    return RunMetadata(document, paths.get("input"), paths.get("store"), device, damaged)
+    on_cpu = document.pop("on_cpu", [])
+    if not isinstance(on_cpu, list) or not all(isinstance(name, str) for name in on_cpu):
+        on_cpu, damaged = [], True
+    source, store = paths.get("input"), paths.get("store")
+    return RunMetadata(document, source, store, device, tuple(on_cpu), damaged)
 
 
 def read_source(folder: Path) -> Path | None:
@@ -134,7 +149,8 @@ def read_run_file(
         raise damaged_run_file(folder)
     config = check_document(dag, metadata.settings)
     place = store or metadata.store or folder / STORE_FOLDER
-    return RunSpec(folder, metadata.source, config, place, device or metadata.device or "cpu")
+    on_cpu, chosen = (metadata.on_cpu, metadata.device) if device is None else ((), device)
+    return RunSpec(folder, metadata.source, config, place, chosen or "cpu", on_cpu, device is None)
 
 
 def damaged_run_file(folder: Path) -> ConfigError:

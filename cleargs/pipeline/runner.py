@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from cleargs.digest import file_digest, tree_digest
-from cleargs.errors import InputError, StageError, StoreError
+from cleargs.errors import CleargsError, InputError, StageError, StoreError
 from cleargs.manifest import (
     FileRecord,
     Manifest,
@@ -163,7 +163,38 @@ class Runner:
         return entry
 
     def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
-        """Find or make the results of ``name``, and let the run folder show them."""
+        """Find or make the results of ``name``, and let the run folder show them.
+
+        If the GPU's kernels fail and the run may fall back, the stage starts again under the CPU's key.
+        """
+        try:
+            return self._find_or_make_on_device(name, done, forced=forced)
+        except Exception as error:
+            fault = self.dag.gpu_fault(error) if self.run.device_of(name) == "cuda" else None
+            if fault is None or (isinstance(error, CleargsError) and not self.run.falls_back):
+                raise
+            if not self.run.falls_back:
+                raise StageError(
+                    f"{name}: the GPU failed ({fault})",
+                    hint="cleargs doctor --gpu tests it; --device cpu runs on the CPU",
+                ) from error
+        # Outside the except block, so that the traceback holds no memory of the GPU.
+        self._leave_gpu(name, fault)
+        return self._find_or_make_on_device(name, done, forced=forced)
+
+    def _leave_gpu(self, name: str, fault: str) -> None:
+        """Let ``name`` and the stages after it run on the CPU, now and in later calls."""
+        stages = self.dag.names[self.dag.names.index(name) :]
+        self.reporter.warn(
+            f"{name}: the GPU failed ({fault}); {', '.join(stages)} run on the CPU, {name} from its start. "
+            "Finished stages stay. --device cuda tries the GPU again"
+        )
+        self.run = self.planner.run = replace(self.run, on_cpu=stages)
+        write_run_file(self.run)
+
+    def _find_or_make_on_device(
+        self, name: str, done: Mapping[str, Manifest], *, forced: bool
+    ) -> StageOutcome:
         stage_key = self.planner.stage_key(name, done)
         entry = self.store.find(name, stage_key.key)
         manifest = entry.whole if entry is not None and not forced else None
@@ -250,7 +281,7 @@ class Runner:
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
             started=started.isoformat(timespec="seconds"),
-            device=self.run.device,
+            device=self.run.device_of(name),
             summary=plain_json(result.summary),
             **cost,
         )

@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
+from cleargs.gpu import NO_GPU, cached_test, cuda_obstacle, current_facts, self_test
 from cleargs.pipeline.config import check_document, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
@@ -28,7 +27,6 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 MOST_NAMED = 3  # settings of an existing run that are named
-UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
 
 
 def usable_cores() -> int:
@@ -38,31 +36,45 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def resolve_device(choice: DeviceChoice, say: Callable[[str], None]) -> Device:
-    """The device class to use. Looks for a GPU without importing torch, which would cost seconds.
+def resolve_device(
+    choice: DeviceChoice, say: Callable[[str], None], *, kept: Device | None = None, test: bool = False
+) -> Device:
+    """Return the device class to use, without importing torch, which takes seconds.
 
-    Where ``auto`` leaves a GPU alone, ``say`` is told. Raises InputError when ``cuda`` is asked for and
-    cannot be had.
+    Args:
+        choice: the user's. ``auto`` takes a GPU that passed its self-test and is faster than the CPU.
+        say: takes the line that says what ``auto`` chose and why.
+        kept: the device of an existing run, which ``auto`` keeps.
+        test: whether ``auto`` runs the self-test of a GPU that has no result yet.
+
+    Raises:
+        InputError: if the GPU is chosen or kept and cannot be used.
     """
-    obstacle = None if choice == "cpu" else cuda_obstacle()
-    if choice != "cuda":  # auto stays on the CPU until tests/gpu/run.sh has passed on a GPU (docs/gpu.md)
-        if choice == "auto" and obstacle is None:
-            say(UNUSED_GPU)
+    if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
-    if obstacle is not None:
+    obstacle = cuda_obstacle()
+    if obstacle is not None and (choice == "cuda" or kept == "cuda"):
         raise InputError(f"--device cuda cannot be used: {obstacle}", hint="use --device cpu")
-    return "cuda"
-
-
-def cuda_obstacle() -> str | None:
-    """Why work cannot run on an NVIDIA GPU here; None when it can."""
-    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg")):
-        return "there is no NVIDIA GPU"
-    if find_spec("triton") is None:
-        return "Triton is not installed (pip install 'cleargs[cuda]')"
-    if version("torch").endswith("+cpu"):
-        return "this PyTorch is built for the CPU only (install a CUDA build)"
-    return None
+    if choice == "cuda":
+        return "cuda"
+    if obstacle is not None:
+        if obstacle != NO_GPU:
+            say(f"device: the CPU, because {obstacle}")
+        return "cpu"
+    facts = current_facts()
+    tested = cached_test(facts) or (self_test(facts, say) if test else None)
+    if kept == "cuda":
+        if tested is not None and tested.fault is not None:
+            raise InputError(
+                f"the run was made on the GPU, but {tested.reason}",
+                hint="--device cpu makes its stages again on the CPU, --device cuda stays on the GPU",
+            )
+        return "cuda"
+    if tested is None:
+        say("device: the CPU, because the GPU is not tested yet (cleargs doctor --gpu tests it)")
+        return "cpu"
+    say(f"device: the {'GPU' if tested.device == 'cuda' else 'CPU'}, because {tested.reason}")
+    return tested.device
 
 
 @contextmanager
@@ -84,12 +96,14 @@ def resolve_run(
     reset: bool = False,
     store: Path | None = None,
     device: DeviceChoice = "auto",
+    test_gpu: bool = True,
     say: Callable[[str], None],
 ) -> RunSpec:
     """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
 
     An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
-    forgets the settings, as does a ``workflow``. ``say`` is told what is kept. Raises InputError when
+    forgets the settings, as does a ``workflow``. ``say`` is told what is kept. ``test_gpu``: see
+    `resolve_device`. Raises InputError when
     ``source`` is missing or itself a run, ConfigError for settings that cannot be used.
     """
     if not source.exists():
@@ -115,7 +129,8 @@ def resolve_run(
             ) from error
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
-    chosen = resolve_device(metadata.device or device if device == "auto" else device, say)
+    keeps = device == "auto" and metadata.device is not None
+    chosen = resolve_device(device, say, kept=metadata.device, test=test_gpu)
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
@@ -124,4 +139,5 @@ def resolve_run(
         )
         if own:
             say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    return RunSpec(folder, source.absolute(), config, root, chosen)
+    on_cpu = metadata.on_cpu if keeps else ()
+    return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")

@@ -19,6 +19,7 @@ from cleargs.cli.main import COMMANDS, explanation, invoke
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
+from cleargs.gpu import Check, SelfTest
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
 from cleargs.pipeline.runner import StageOutcome
@@ -483,22 +484,68 @@ def test_the_time_left_follows_the_work_where_steps_differ(
     assert "G0: 500/1000, 30 s left" in capsys.readouterr().err.splitlines()
 
 
-def test_a_gpu_that_is_not_used_is_told_of(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+FACTS = {"gpu": "NVIDIA A1", "driver": "550.54.15"}
+PASSED = SelfTest(FACTS, [Check("Adam", [], 1.0)], gpu_ms=2.0, cpu_ms=60.0)
+FAILED = SelfTest(FACTS, [Check("Adam", ["means: differs by 1"], 1.0)])
+
+
+def test_auto_takes_a_gpu_that_passed_and_a_dry_run_does_not_test_it(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    results = [None, PASSED]
     monkeypatch.setattr("cleargs.pipeline.session.cuda_obstacle", lambda: None)
-    assert "--device cuda" in shell.run()[2]
-    assert "--device cuda" not in shell.run("--device", "cpu")[2]
+    monkeypatch.setattr("cleargs.pipeline.session.current_facts", lambda: FACTS)
+    monkeypatch.setattr("cleargs.pipeline.session.cached_test", lambda facts: results[0])
+    monkeypatch.setattr("cleargs.pipeline.session.self_test", lambda facts, say: results.pop())
+    assert "device: the CPU, because the GPU is not tested yet" in shell.run("--dry-run")[2]
+    assert "device: the GPU, because NVIDIA A1 passed its self-test" in shell.run()[2]
+    assert 'device = "cuda"' in (shell.bench.folder / "run.toml").read_text()
+    assert "device: the" not in shell.run("--device", "cpu")[2]
 
 
-def test_the_doctor_notes_a_gpu_that_is_not_used(
+@pytest.mark.parametrize(
+    ("obstacle", "tested", "state", "words"),
+    [
+        ("there is no NVIDIA GPU", None, "ok", "cpu (there is no NVIDIA GPU)"),
+        (None, None, "note", "cpu (the GPU is not tested yet: cleargs doctor --gpu)"),
+        (None, PASSED, "ok", "cuda (NVIDIA A1 passed its self-test; a training step takes 2 ms"),
+        (None, FAILED, "note", "cpu (the GPU failed its self-test (Adam: means: differs by 1)"),
+    ],
+)
+def test_the_doctor_names_the_device(
+    obstacle: str | None,
+    tested: SelfTest | None,
+    state: str,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: obstacle)
+    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
+    monkeypatch.setattr("cleargs.gpu.cached_test", lambda facts: tested)
+    invoke(["doctor", "--json"])
+    (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
+    assert found["state"] == state and found["text"].startswith(words)
+
+
+def test_the_doctor_tests_the_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for obstacle, state, words in ((None, "note", "--device cuda"), ("no GPU", "ok", "cpu (no GPU)")):
-        monkeypatch.setattr("cleargs.cli.doctor.cuda_obstacle", lambda obstacle=obstacle: obstacle)
-        invoke(["doctor", "--json"])
-        (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "device")
-        assert found["state"] == state and words in found["text"]
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: "there is no NVIDIA GPU")
+    assert invoke(["doctor", "--gpu"]) == 1
+    assert "bad   device" in capsys.readouterr().out
+    monkeypatch.setattr("cleargs.gpu.cuda_obstacle", lambda: None)
+    monkeypatch.setattr("cleargs.gpu.current_facts", lambda: FACTS)
+    for tested, last in (
+        (PASSED, ["Adam: passed, 1.0 s", "a training step takes 2 ms on the GPU, 60 ms on the CPU"]),
+        (FAILED, ["Adam: failed, 1.0 s", "  means: differs by 1"]),
+    ):
+        monkeypatch.setattr("cleargs.gpu.self_test", lambda facts, say, tested=tested: tested)
+        code, lines = invoke(["doctor", "--gpu"]), capsys.readouterr().out.splitlines()
+        assert lines[-2:] == last
+        assert "driver: 550.54.15" in lines
+        assert f"{'bad' if tested is FAILED else 'ok':<5} device" in "\n".join(lines)
+        assert code == (1 if tested is FAILED else 0)
 
 
 def test_the_doctor_tells_the_pace(
