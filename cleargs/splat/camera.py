@@ -57,7 +57,7 @@ class Camera:
         return centre
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the camera of this view resampled to ``width`` x ``height`` pixels."""
+        """Return this camera for images resampled to ``width`` x ``height`` pixels."""
         x, y = width / self.width, height / self.height
         return replace(
             self,
@@ -70,7 +70,7 @@ class Camera:
         )
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera of this view resampled by ``factor``, its size rounded to pixels (at least 1)."""
+        """Return this camera for images resampled by ``factor``, its sides rounded to pixels (at least 1)."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
 
