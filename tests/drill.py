@@ -64,7 +64,7 @@ class Drill:
         If the stage finished earlier, its result is deleted, so that it runs again.
         """
         program = self.run(self.run_folder, "--until", stage)
-        program.wait_for(f"{stage}: starts")
+        program.wait_for(f"{stage}: started")
         time.sleep(self.chance.uniform(0, seconds))
         if self.kills[stage] % 3 == 0:
             collector = self.collect()  # refused while the stage is running

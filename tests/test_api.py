@@ -59,7 +59,7 @@ def test_training_needs_no_capture_libraries() -> None:
 
 
 def test_a_missing_run_or_stage_is_an_error_with_a_hint(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is no run"):
+    with pytest.raises(InputError, match="is not a run"):
         cg.open_run(tmp_path)
     with pytest.raises(InputError, match="there is no stage"):
         cg.Run(tmp_path)["rvaa"]

@@ -99,7 +99,7 @@ def test_one_thread_gives_the_same_digests(capture: Path, finished: Path, tmp_pa
 def test_the_same_command_again_does_nothing(capture: Path, finished: Path) -> None:
     before = _times(finished)
     done = finish(capture, finished)
-    assert all(f"{stage}: starts" not in done.stderr for stage in STAGES)
+    assert all(f"{stage}: started" not in done.stderr for stage in STAGES)
     after = _times(finished)
     assert {path: after.get(path) for path in before} == before
 
@@ -121,7 +121,9 @@ def test_a_killed_stage_ends_with_the_same_digests(
     seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
     moments = random.Random(stage)
     for _ in range(KILLS_PER_STAGE):
-        _kill_inside(command(capture, run, "--until", stage), f"{stage}: starts", moments.uniform(0, seconds))
+        _kill_inside(
+            command(capture, run, "--until", stage), f"{stage}: started", moments.uniform(0, seconds)
+        )
     finish(capture, run, "--until", stage)
     files = json.loads((run / stage / "manifest.json").read_text())["files"]
     assert {name: record["digest"] for name, record in files.items()} == digests(finished)[stage]

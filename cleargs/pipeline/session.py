@@ -1,4 +1,4 @@
-"""How work begins, for the command line and the library alike: device, store, and a run as asked for."""
+"""Choose device, store and settings of a run, for the command line and the library."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
-MOST_NAMED = 3  # settings of an existing run that are named
+MAX_LISTED = 3  # settings of an existing run that a message lists
 
 
 def usable_cores() -> int:
-    """The CPU cores that this process may use, as far as the system says."""
+    """Return the number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -42,13 +42,13 @@ def resolve_device(
     """Return the device class to use, without importing torch, which takes seconds.
 
     Args:
-        choice: the user's. ``auto`` takes a GPU that passed its self-test and is faster than the CPU.
-        say: takes the line that says what ``auto`` chose and why.
-        kept: the device of an existing run, which ``auto`` keeps.
-        test: whether ``auto`` runs the self-test of a GPU that has no result yet.
+        choice: The user's choice. ``auto`` takes a GPU that passed its self-test and is faster than the CPU.
+        say: Receives the line that says which device ``auto`` chose, and why.
+        kept: Device of an existing run, which ``auto`` keeps.
+        test: True: ``auto`` runs the self-test of a GPU that has no result yet.
 
     Raises:
-        InputError: if the GPU is chosen or kept and cannot be used.
+        InputError: The GPU is chosen or kept and cannot be used.
     """
     if choice == "cpu" or (choice == "auto" and kept == "cpu"):
         return "cpu"
@@ -79,7 +79,7 @@ def resolve_device(
 
 @contextmanager
 def opened_store(root: Path) -> Iterator[Store]:
-    """The store at ``root`` with its digest memo. Its folder appears when the first stage starts."""
+    """Yield the store at ``root`` with its digest memo. The folder is created when the first stage starts."""
     root = root.absolute()
     with DigestMemo(root / "digests.sqlite") as memo:
         yield Store(root, memo)
@@ -99,20 +99,34 @@ def resolve_run(
     test_gpu: bool = True,
     say: Callable[[str], None],
 ) -> RunSpec:
-    """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
+    """Return the run of a capture, with everything that decides its results.
 
-    An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
-    forgets the settings, as does a ``workflow``. ``say`` is told what is kept. ``test_gpu``: see
-    `resolve_device`. Raises InputError when
-    ``source`` is missing or itself a run, ConfigError for settings that cannot be used.
+    An existing run keeps its settings, store and device unless an argument gives others.
+
+    Args:
+        dag: The stages, whose models check the settings.
+        source: The capture.
+        folder: The run folder, which need not exist.
+        workflow: Recipe to start from instead of the settings of an existing run.
+        overrides: Settings as ``a.b=value``.
+        seed: Seed instead of that of the recipe or the run.
+        reset: Start from the recipe instead of the settings of an existing run.
+        store: Folder of the store instead of that of the run.
+        device: Device instead of that of the run, unless "auto".
+        test_gpu: See ``test`` of `resolve_device`.
+        say: Receives a message about settings that the run keeps.
+
+    Raises:
+        InputError: ``source`` does not exist or is a run.
+        ConfigError: A setting is unknown or cannot be used.
     """
     if not source.exists():
-        raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
+        raise InputError(f"{source} does not exist", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
         made_from = read_source(source)
         raise InputError(
             f"{source} is a run, not a capture",
-            hint=f"give the capture that it was made from{f': {made_from}' if made_from else ''}",
+            hint=f"give the capture of this run{f': {made_from}' if made_from else ''}",
         )
     folder, forgets = folder.absolute(), reset or workflow is not None
     metadata, kept = RunMetadata(), None
@@ -120,12 +134,12 @@ def resolve_run(
         metadata = read_metadata(folder)
         if metadata.damaged:
             raise damaged_run_file(folder)
-        # Checked, they hold no names that are gone: those would contradict what is set now.
+        # The check drops retired settings. In the raw document they could contradict the overrides.
         kept = check_document(dag, metadata.settings) if metadata.settings and not forgets else None
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
-                f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
+                f"the settings of {folder} cannot be used: {error}", hint="start from the recipe with --reset"
             ) from error
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
@@ -134,10 +148,10 @@ def resolve_run(
     if kept is not None:
         own = [f"seed={kept.seed}"] if kept.seed else []
         own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
-        line = ", ".join(own[:MOST_NAMED]) + (
-            f" and {len(own) - MOST_NAMED} more" if own[MOST_NAMED:] else ""
+        line = ", ".join(own[:MAX_LISTED]) + (
+            f" and {len(own) - MAX_LISTED} more" if own[MAX_LISTED:] else ""
         )
         if own:
-            say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
+            say(f"settings kept from {folder / RUN_FILE}: {line}; --reset starts from the recipe")
     on_cpu = metadata.on_cpu if keeps else ()
     return RunSpec(folder, source.absolute(), config, root, chosen, on_cpu, device == "auto")

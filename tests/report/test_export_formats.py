@@ -105,7 +105,7 @@ def test_a_crop_uses_the_coordinates_of_the_cameras(
 ) -> None:
     assert export(run, tmp_path / "a.ply", "--crop", "box:-1,-1,0,1,1,2") == 0
     means = read_ply(tmp_path / "a.ply").gaussians.means
-    (gone,) = numbers(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians lie outside")
+    (gone,) = numbers(capsys, r"cropped to the box -1,-1,0,1,1,2: (\d+) of 4000 Gaussians are outside")
     assert 0 < len(means) == 4000 - gone and float(means.abs().max()) <= 2.0
     assert export(run, tmp_path / "b.ply", "--crop", "percentile:80", "--world", "input") == 0
     kept = read_ply(tmp_path / "b.ply").gaussians.num

@@ -17,7 +17,7 @@ import pytest
 from pages import Page, assert_offline
 from report_run import COUNT, HOSTILE, FinishedRun, wall
 
-from cleargs.cli.report import older_report, report_on
+from cleargs.cli.report import outdated_report_note, write_run_report
 from cleargs.digest import DigestMemo
 from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest, write_manifest
@@ -140,28 +140,28 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
 
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         planner = run.planner(Store(tmp_path, memo))
-        page = report_on(planner, outcomes("found"))
+        page = write_run_report(planner, outcomes("found"))
         assert page == run.folder / "report/index.html" and "reused in the last run" in page.read_text()
         page.write_text("as it was")
-        assert report_on(planner, outcomes("found")) == page and page.read_text() == "as it was"
-        assert report_on(planner, outcomes("made")) == page
+        assert write_run_report(planner, outcomes("found")) == page and page.read_text() == "as it was"
+        assert write_run_report(planner, outcomes("made")) == page
         assert "computed in the last run" in page.read_text()
         (run.folder / "consolidate/scene.ply").write_bytes(b"damaged")
-        assert report_on(planner, outcomes("made")) is None  # the run itself has succeeded
+        assert write_run_report(planner, outcomes("made")) is None  # the run itself has succeeded
         assert "computed in the last run" in page.read_text()  # the report before stays
         (run.folder / "ingest/manifest.json").unlink()
-        assert report_on(planner, outcomes("found")) is None  # there is nothing to report on
+        assert write_run_report(planner, outcomes("found")) is None  # there is nothing to report on
 
 
 def test_an_older_report_gets_a_note(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
-    assert older_report(run.folder, run.dag) == "", "there is none"
+    assert outdated_report_note(run.folder, run.dag) == "", "there is none"
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         page = write_report(run.planner(Store(tmp_path, memo)))
-    assert older_report(run.folder, run.dag) == ""
+    assert outdated_report_note(run.folder, run.dag) == ""
     (run.folder / "consolidate/manifest.json").unlink()
-    line = older_report(run.folder, run.dag)
-    assert line == f"note: {page} shows earlier results; `cleargs report {run.folder}` makes it anew"
+    line = outdated_report_note(run.folder, run.dag)
+    assert line == f"note: {page} shows earlier results; update it with `cleargs report {run.folder}`"
 
 
 def test_stages_that_the_run_does_not_show_are_left_out(tmp_path: Path) -> None:

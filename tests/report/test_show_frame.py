@@ -41,13 +41,13 @@ def test_a_frame_in_words_fits_100_columns(
     assert max(map(len, lines)) <= 100
     words = " ".join(text.split())
     assert "frame 2 file clip.mp4#2" in words and "time 0.07 s" in words
-    assert "pose at (-0.200, 0.060, " in words
+    assert "pose camera at (-0.200, 0.060, " in words
     assert "role geometric, weight 0.40: B > 0.6, adds views" not in words  # R 0.8 and B 0.1 pass
-    assert "R 0.80 reliable appearance, B 0.10 risk of degradation, G 0.30 worth of its place" in words
+    assert "R 0.80 reliable appearance, B 0.10 risk of degradation, G 0.30 geometric utility" in words
     assert "motion blur 0.70, defocus 0.20" in words and "worst cue motion blur 0.70" in words
-    assert "motion blur, which takes away 62 % of the frame's misfit" in words
+    assert "motion blur, explains 62 % of the misfit" in words
     assert "blur 3.25 px, rolling shutter 0.00 px" in words
-    assert "weight 0.40 before, 0.75 after it" in words
+    assert "weight 0.40 before image formation, 0.75 after it" in words
     assert "round 1 the restored frame (primary score)" in words
     assert "sharp-1: render 80.0, restored 87.0, observed 75.0" in words
     assert "restored from the frame as filmed: blur 4.0 px, skew 0.3 px" in words
@@ -87,7 +87,7 @@ def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert invoke(["show", str(run), "--frame", str(COUNT)]) == 2
     assert f"choose one from 0 to {COUNT - 1}" in capsys.readouterr().err
     assert invoke(["show", str(run), "rva", "--frame", "1"]) == 2
-    assert "about all stages" in capsys.readouterr().err
+    assert "cannot be used with a stage" in capsys.readouterr().err
 
 
 def test_a_damaged_table_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,7 @@ def until(page: Any, condition: str) -> None:
 
 
 def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "EVERY", 0.0)
+    monkeypatch.setattr(live, "WRITE_INTERVAL_S", 0.0)
     made = reported(tmp_path)
     picture = torch.from_numpy(Viewer(wall(1)).view(camera(1)) / 255)
     complaints: list[str] = []
