@@ -67,7 +67,7 @@ def make_capture(
     height: int,
     seed: int,
     reporter: Reporter,
-    setting: SceneSetup | None = None,
+    setup: SceneSetup | None = None,
     video: bool = False,
 ) -> dict[str, Any]:
     """Write a capture into a new folder.
@@ -88,7 +88,7 @@ def make_capture(
         height: Height of the images, px.
         seed: Seed of the room, the walk and the faults.
         reporter: Receives the progress.
-        setting: World, course and lens for this number and size of frames; None: the room of ``seed``.
+        setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
         video: Also write ``out/capture.mp4``.
 
     Returns:
@@ -102,7 +102,7 @@ def make_capture(
         raise InputError(f"{out} is not empty", hint="choose a new folder for the capture")
     if video or rules.phone:
         require_even(width, height)
-    setup = setting or room_setup(frames, width, height, seed)
+    setup = setup or room_setup(frames, width, height, seed)
     look = phone_look(seed) if rules.phone else PLAIN
     formation = {
         "tone_contrast": look.contrast,
