@@ -25,7 +25,7 @@ def check_evaluator(config: EvaluatorConfig) -> None:
             folder does not contain a Qwen3-VL model.
     """
     if config.evaluator == "qwen3-vl":
-        _make_qwen(config.qwen).check()
+        _qwen(config.qwen).check()
     elif config.evaluator not in EVALUATORS:
         load_part("evaluators", config.evaluator)
 
@@ -37,7 +37,7 @@ def make_evaluator(
 
     Args:
         config: Name of the evaluator, and its settings.
-        seed: Seed of the evaluator; ``statistics`` does not use it.
+        seed: Seed of a model on a server, or of a plugin.
         device: Device of a local model.
         cache: Folder for results of single frames; None: no cache.
 
@@ -49,12 +49,12 @@ def make_evaluator(
 
         return StatisticsEvaluator(cache)
     if config.evaluator == "qwen3-vl":
-        return _make_qwen(config.qwen, seed, device, cache)
+        return _qwen(config.qwen, seed, device, cache)
     maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
     return maker(seed=seed, device=device, cache=cache)
 
 
-def _make_qwen(
+def _qwen(
     config: QwenConfig, seed: int = 0, device: Device = "cpu", cache: Path | None = None
 ) -> QwenEvaluator:
     """Create a Qwen3-VL evaluator. Raise InputError if the HTTP client of the server is not installed."""
