@@ -1,6 +1,6 @@
 """Protocol of the evaluators, which score the appearance of frames, and a cache of results per frame.
 
-The cache means that only new frames are evaluated after frames are added to a capture.
+With the cache only the new frames are evaluated after frames are added to a capture.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Orbit:
         return look_at(self._centres(shares), self._focus)
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
-        """Return a pose off the course by up to 0.22 m per axis: the distance of one and a half frames."""
+        """Return a pose off the course by up to 0.22 m per axis, about 1.5 times the distance of frames."""
         centre = self._centres(np.array([share]))[0] + rng.uniform(-0.22, 0.22, 3)
         return look_at(centre, self._focus + rng.uniform(-0.08, 0.08, 3))
 
@@ -100,7 +100,7 @@ FRAMES_PER_STRETCH = 32
 STRETCH_SHARE = 0.375
 """Share of these frames in the stretch."""
 SHAKE_GAIN = 12.0
-"""Factor of the tremor within a stretch, as of a hand in a hurry. Outside there are no swings."""
+"""Factor of the tremor within a stretch, as of a hand in a hurry. A stretched walk has swings only there."""
 STRETCH_EDGE_S = 1 / FPS
 """Seconds over which the shaking rises and falls."""
 

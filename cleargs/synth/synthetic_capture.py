@@ -89,7 +89,7 @@ def make_capture(
         seed: Seed of the room, the walk and the faults.
         reporter: Receives the progress.
         setup: World, course and lens for this number and size of frames; None: the room of ``seed``.
-        video: Also write ``out/capture.mp4``.
+        video: Also write ``out/capture.mp4``, which the protocol phone always has.
 
     Returns:
         The contents of ``truth/capture.json``.
@@ -104,7 +104,7 @@ def make_capture(
         require_even(width, height)
     setup = setup or room_setup(frames, width, height, seed)
     look = phone_look(seed) if rules.phone else PLAIN
-    formation = {
+    processing = {
         "tone_contrast": look.contrast,
         "tone_pivot": look.pivot,
         "sharpening": look.sharpening,
@@ -142,7 +142,7 @@ def make_capture(
             light, seen = _expose(setup, motion, fault, nearness, rng)
             shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             moving = {"moving_share": float((seen > 0).mean())}
-            rows.append(_row(number, images[number], motion, fault) | formation | moving)
+            rows.append(_row(number, images[number], motion, fault) | processing | moving)
             if setup.film is not None:
                 mask = np.repeat(np.where(seen > 0, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
                 write_rgb(out / "truth" / "moving" / f"{stems[number]}.png", mask)
@@ -171,7 +171,7 @@ def make_capture(
         "height": height,
         "fps": FPS,
         "jpeg_quality": rules.jpeg,
-        "codec_bits_per_pixel": formation["codec_bits_per_pixel"],
+        "codec_bits_per_pixel": processing["codec_bits_per_pixel"],
         "moving": setup.film is not None,
         "blur_px": _distribution([row["blur_px"] for row in rows]),
         "rolling_shutter_px": _distribution([row["rolling_shutter_px"] for row in rows]),
