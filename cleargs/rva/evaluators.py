@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from cleargs.errors import InputError
-from cleargs.plugins import load_part
+from cleargs.plugins import load_plugin
 from cleargs.rva.config import EVALUATORS, EvaluatorConfig, QwenConfig
 from cleargs.rva.evaluator import Evaluator
 
@@ -27,7 +27,7 @@ def check_evaluator(config: EvaluatorConfig) -> None:
     if config.evaluator == "qwen3-vl":
         _qwen(config.qwen).check()
     elif config.evaluator not in EVALUATORS:
-        load_part("evaluators", config.evaluator)
+        load_plugin("evaluators", config.evaluator)
 
 
 def make_evaluator(
@@ -50,7 +50,7 @@ def make_evaluator(
         return StatisticsEvaluator(cache)
     if config.evaluator == "qwen3-vl":
         return _qwen(config.qwen, seed, device, cache)
-    maker: Callable[..., Evaluator] = load_part("evaluators", config.evaluator)
+    maker: Callable[..., Evaluator] = load_plugin("evaluators", config.evaluator)
     return maker(seed=seed, device=device, cache=cache)
 
 

@@ -64,9 +64,9 @@ def test_the_plot_can_go_elsewhere(shell: Shell) -> None:
 @pytest.mark.parametrize(
     ("stage", "options", "words"),
     [
-        ("ingest", ["--plot"], "--plot draws the stage rva"),
-        ("rva", ["-o", "a.png"], "--output names the PNG of --plot or --frame"),
-        ("rva", ["--plot", "-o", "a.jpg"], "--output names the PNG of --plot or --frame"),
+        ("ingest", ["--plot"], "--plot needs the stage rva"),
+        ("rva", ["-o", "a.png"], "--output needs --plot or --frame, and a .png file"),
+        ("rva", ["--plot", "-o", "a.jpg"], "--output needs --plot or --frame, and a .png file"),
     ],
 )
 def test_wrong_usage(shell: Shell, stage: str, options: list[str], words: str) -> None:

@@ -129,7 +129,7 @@ def test_the_weights_are_part_of_the_key(
     assert run(tmp_path / "a", model_dir) == 0
     capsys.readouterr()
     assert run(tmp_path / "a", copy) == 0
-    assert "already there: ingest, rva" in capsys.readouterr().out, "the same model elsewhere"
+    assert "reused: ingest, rva" in capsys.readouterr().out, "the same model elsewhere"
     config = copy / "generation_config.json"
     config.write_text(config.read_text() + "\n")
     assert run(tmp_path / "a", copy) == 0
