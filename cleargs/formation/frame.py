@@ -18,6 +18,7 @@ from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
 from cleargs.formation.pretest import BlurEvidence, blur_evidence
 from cleargs.formation.search import blur_along, preferred, refine, search
 from cleargs.formation.warp import Warp, displacement_fields
+from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
@@ -118,7 +119,9 @@ def fit_motion(
     margin = margin_for(frame.reach_px * factor, camera)
     rendered = render(widened(camera, margin))
     pair = frame_pair(rendered, affine, target, mask, camera, margin)
-    found = refine(pair, frame.model, _scaled(frame.motion, factor), pose=config.pose)
+    kernels = backend_for(rendered.image.device)
+    known = _scaled(frame.motion, factor)
+    found = refine(pair, frame.model, known, pose=config.pose, kernels=kernels)
     best = _accepted(found[-1], found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
@@ -130,18 +133,19 @@ def fit_motion(
             margin, rendered = wide, render(widened(camera, wide))
             pair = frame_pair(rendered, affine, target, mask, camera, margin)
         whole = evidence if best.model == "none" else _unexplained(pair, rendered, found[0])
-        known = found[-1]
+        before = found[-1]
         found = search(
             pair,
             start=None if skews else blur_along(whole.length, whole.angle),
             skew=skews,
             defocus=skews or whole.disc_gain > whole.line_gain,
             pose=config.pose,
+            kernels=kernels,
         )
         if skews:
             frame = replace(frame, skew_gain=_skew_gain(found))
-        if known.model != "none":
-            found += refine(pair, known.model, known.motion, pose=config.pose)[1:]
+        if before.model != "none":
+            found += refine(pair, before.model, before.motion, pose=config.pose, kernels=kernels)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
         best = _accepted(best, found[0], frame.model, config)
     return _described(frame, best, factor, camera, rendered, margin)
