@@ -96,8 +96,9 @@ def fit_motion(
 ) -> FrameFormation:
     """Estimate how a raw frame was taken, from the scene that ``render`` shows.
 
-    A known formation is refined. The frame is searched only if the test of `pretest` finds blur that the
-    present model does not explain, or if a rolling shutter is asked for: the test cannot see a skew.
+    The first time, the frame is searched. Later a known formation is refined, and the frame is searched only
+    if the test of `pretest` finds blur that the present model does not explain, or if a rolling shutter is
+    asked for, since the test cannot see a skew.
 
     Args:
         frame: The formation so far. Its model remains a candidate.
@@ -125,7 +126,8 @@ def fit_motion(
     best = _accepted(found[-1], found[0], frame.model, config)
     evidence = _unexplained(pair, rendered, best)
     skews = rolling or test_rolling
-    asked = untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
+    first = frame.draws == 0  # a scene that is still soft hides short blurs from the test
+    asked = first or untested or test_rolling or (rolling and again) or not _admitted(frame.model, rolling)
     enough = DOUBTED_EVIDENCE if doubted else EVIDENCE
     if asked or (evidence.gain > enough and best.misfit > MIN_MISFIT):
         wide = margin_for(SEARCHED_SHARE * max(camera.width, camera.height), camera)
