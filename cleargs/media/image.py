@@ -14,10 +14,20 @@ from cleargs.errors import InputError
 from cleargs.files import write_bytes
 from cleargs.media import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from cleargs.media import MAX_PIXELS
+from cleargs.media.photos import (
+    decode_photo,
+    open_photo,
+    photo_format,
+    photo_orientation,
+    srgb_from_profile,
+)
 from cleargs.untrusted import cause, open_regular, read_bytes
 
-_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp"})
+_FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp", "jpegxl"})
 """Formats that are read, as OpenImageIO names them."""
+
+_PHOTOS = frozenset({"heic", "avif"})
+"""Formats that Pillow reads."""
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
@@ -37,6 +47,8 @@ class Header(NamedTuple):
     orientation: int
     """EXIF's, 1 to 8, and 1 where there is none."""
     format: str
+    profile: bytes = b""
+    """The embedded ICC profile; empty where there is none."""
 
 
 def read_header(path: Path) -> Header:
@@ -45,17 +57,28 @@ def read_header(path: Path) -> Header:
 
     try:
         with open_regular(path) as file:
-            empty = not file.read(1)
+            head = file.read(12)
     except OSError as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    if kind := photo_format(head):
+        with open_photo(path, kind) as photo:
+            profile = photo.info.get("icc_profile") or b""
+            return Header(*photo.size, photo_orientation(photo), kind, profile)
     source = ImageInput.open(str(path))
     if source is None:
         geterror()  # else OpenImageIO prints it on stderr at the end
     elif source.format_name() in _FORMATS:
         spec = source.spec()
         noted = spec.get_int_attribute("Orientation", 1)
-        return Header(spec.width, spec.height, noted if 1 <= noted <= 8 else 1, source.format_name())
-    fault = "is empty (zero bytes)" if empty else "is not an image that can be read"
+        profile = spec.getattribute("ICCProfile")
+        return Header(
+            spec.width,
+            spec.height,
+            noted if 1 <= noted <= 8 else 1,
+            source.format_name(),
+            b"" if profile is None else bytes(profile),
+        )
+    fault = "is empty (zero bytes)" if not head else "is not an image that can be read"
     raise InputError(f"{path} {fault}", hint=_HINT)
 
 
@@ -137,17 +160,10 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
             f"{path} has {header.width}x{header.height} pixels; at most {MAX_PIXELS} are read",
             hint="reduce the image: no more than ingest.max_size of its long side is used anyway",
         )
-    try:
-        content = read_bytes(path)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    image = None
-    # libpng would tell of a file that breaks off on stderr.
-    if header.format != "png" or b"IEND" in content:
-        with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
+    image = _stored(path, header, flags)
+    if header.profile and flags == cv2.IMREAD_COLOR:
+        rgb = np.ascontiguousarray(image[..., ::-1])
+        image = srgb_from_profile(rgb, header.profile)[..., ::-1]
     # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
     turn = header.orientation
     if header.format == "tiff":
@@ -158,3 +174,42 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
         image = image.swapaxes(0, 1)
     down, across = _MIRRORED[turn]
     return np.ascontiguousarray(image[::down, ::across])
+
+
+def _stored(path: Path, header: Header, flags: int) -> NDArray[Any]:
+    """Return the image as it is stored, in OpenCV's order of channels, as its ``flags`` ask for it."""
+    if header.format in _PHOTOS:
+        with open_photo(path, header.format) as photo:
+            return _as_flags_ask(decode_photo(path, photo), flags)
+    try:
+        content = read_bytes(path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
+    image = None
+    if header.format == "jpegxl":
+        from OpenImageIO import ImageInput, geterror
+
+        source = ImageInput.open(str(path))
+        pixels = None if source is None else source.read_image("uint8")
+        if pixels is not None and pixels.ndim == 3:
+            image = _as_flags_ask(pixels if pixels.shape[2] > 2 else pixels[..., [0, 0, 0]], flags)
+        geterror()  # else OpenImageIO prints it on stderr at the end
+    # libpng would tell of a file that breaks off on stderr.
+    elif header.format != "png" or b"IEND" in content:
+        with suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} is not an image that can be read", hint=_HINT)
+    return image
+
+
+def _as_flags_ask(pixels: NDArray[np.uint8], flags: int) -> NDArray[np.uint8]:  # [H, W, 3 or 4] RGB(A)
+    """Return ``pixels`` as OpenCV's flags of `imdecode` ask for them."""
+    alpha = pixels.shape[2] == 4
+    if flags == cv2.IMREAD_UNCHANGED:
+        code = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
+    elif flags == cv2.IMREAD_GRAYSCALE:
+        code = cv2.COLOR_RGBA2GRAY if alpha else cv2.COLOR_RGB2GRAY
+    else:
+        code = cv2.COLOR_RGBA2BGR if alpha else cv2.COLOR_RGB2BGR
+    return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
