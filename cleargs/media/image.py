@@ -185,7 +185,7 @@ def _stored(path: Path, header: Header, flags: int) -> NDArray[Any]:
         content = read_bytes(path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    image = None
+    image: NDArray[Any] | None = None
     if header.format == "jpegxl":
         from OpenImageIO import ImageInput, geterror
 

@@ -18,6 +18,9 @@ from PIL import Image, ImageCms
 from cleargs.errors import InputError
 from cleargs.untrusted import FAULTS, cause
 
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
+"""What Pillow raises for a file of the wrong form."""
+
 _HEIC = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 _AVIF = frozenset({b"avif", b"avis"})
 _ORIENTATION = 274  # EXIF's number for it
@@ -48,7 +51,7 @@ def open_photo(path: Path, kind: str) -> Image.Image:
     try:
         with warnings.catch_warnings(action="ignore"):  # of its size, which is checked against ours
             return Image.open(path)
-    except (*FAULTS, Image.DecompressionBombError) as error:
+    except _FAULTS as error:
         raise InputError(
             f"{path} is not an image that can be read: {cause(error)}",
             hint="copy the file again, convert it to JPEG or PNG, or remove it",
@@ -69,7 +72,7 @@ def decode_photo(path: Path, photo: Image.Image) -> NDArray[np.uint8]:
     """
     try:
         return np.asarray(photo.convert("RGBA" if photo.has_transparency_data else "RGB"), np.uint8)
-    except (*FAULTS, SyntaxError) as error:
+    except _FAULTS as error:
         raise InputError(
             f"{path} is not an image that can be read: {cause(error)}",
             hint="copy the file again, convert it to JPEG or PNG, or remove it",
@@ -81,7 +84,7 @@ def srgb_from_profile(rgb: NDArray[np.uint8], profile: bytes) -> NDArray[np.uint
 
     Stays as it is where the profile is sRGB's own, is not one of RGB, or is damaged.
     """
-    with suppress(ImageCms.PyCMSError, *FAULTS):
+    with suppress(ImageCms.PyCMSError, *_FAULTS):
         source = ImageCms.getOpenProfile(io.BytesIO(profile))
         if "srgb" in ImageCms.getProfileDescription(source).lower():
             return rgb

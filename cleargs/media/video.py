@@ -7,8 +7,9 @@ it stands (a display shows both alike); HLG and PQ go through `cleargs.media.col
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,8 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.filter import Graph
+from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
@@ -29,6 +32,8 @@ from cleargs.untrusted import open_regular
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}
 _FULL_RANGE = 2
+_PREVIEW = 0.1
+_PROGRESSIVE = 1  # AVFieldOrder: 0 is unknown, above 1 are those of two fields
 _SLACK_S, _SLACK = 0.5, 0.02
 """By how much a video may end before its container says, s and as a share: frame durations are rounded."""
 _HINT = "copy the file again, or re-encode what is readable: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4"
@@ -44,6 +49,10 @@ class Timeline:
     """Seconds per unit of ``pts``."""
     transfer: str | None
     """``pq`` or ``hlg`` for HDR, else None."""
+    interlaced: bool = False
+    """True where the frames are of two fields each. They are deinterlaced when they are decoded."""
+    others: int = 0
+    """Number of other streams in the file that are videos too, not pictures."""
 
     def seconds(self, index: int) -> float:
         """Presentation time of a frame, from the first one on, s."""
@@ -75,7 +84,9 @@ def read_timeline(path: Path) -> Timeline:
         if short or (stream.frames > len(pts) + 1 and not edited):
             raise _broken(path, len(pts), stream)
         transfer = _TRANSFERS.get(int(stream.codec_context.color_trc))
-        return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer)
+        interlaced = int(stream.codec_context.field_order) > _PROGRESSIVE
+        others = len(_by_merit(path)) - 1 if len(container.streams.video) > 1 else 0
+        return Timeline(tuple(sorted(set(pts))), float(stream.time_base), transfer, interlaced, others)
 
 
 def video_size(path: Path) -> tuple[int, int]:
@@ -112,7 +123,7 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
     last = max(wanted)
     with _open(path) as (container, stream):
         stream.thread_type = "AUTO"
-        for frame in container.decode(stream):
+        for frame in _progressive(container, stream):
             if frame.pts is None or frame.pts > last:
                 continue
             if frame.pts in wanted:
@@ -120,6 +131,28 @@ def _decoded(path: Path, pts: Collection[int]) -> Iterator[tuple[int, VideoFrame
                 yield frame.pts, frame, float(stream.sample_aspect_ratio or 1.0)
             if not wanted:
                 return
+
+
+def _progressive(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Decode ``stream``; where its header says that it is interlaced, through FFmpeg's deinterlacer (bwdif).
+
+    Each frame keeps its time and shows the moment of its first field.
+    """
+    if int(stream.codec_context.field_order) <= _PROGRESSIVE:
+        yield from container.decode(stream)
+        return
+    graph = Graph()
+    graph.link_nodes(
+        graph.add_buffer(template=stream), graph.add("bwdif", "mode=send_frame"), graph.add("buffersink")
+    ).configure()
+    for frame in (*container.decode(stream), None):
+        graph.vpush(frame)
+        with suppress(av.error.BlockingIOError, av.error.EOFError):  # it asks for the next, or is through
+            while True:
+                made = graph.vpull()
+                if made.pts is not None and made.time_base and stream.time_base:
+                    made.pts = round(made.pts * made.time_base / stream.time_base)
+                yield made
 
 
 def _require_few(subject: str, width: int, height: int, what: str = "pixels") -> None:
@@ -169,13 +202,36 @@ def _open(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             if not container.streams.video:
                 raise InputError(f"{path.name} holds no video", hint="give a video, or a folder of images")
             stream = container.streams.video[0]
+            if len(container.streams.video) > 1:
+                stream = container.streams.video[_by_merit(path)[0]]
             if stream.codec_context is None:  # of a form that FFmpeg does not know
                 raise InputError(f"{path.name} is in a form that cannot be decoded", hint=_HINT)
+            if min(stream.width, stream.height) < 1:
+                raise InputError(f"{path.name} is damaged: its header gives the picture no size", hint=_HINT)
             _require_few(f"{path.name} has", stream.width, stream.height)
             yield container, stream
     except (av.error.FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path.name} cannot be read as a video: {reason}", hint=_HINT) from error
+
+
+def _by_merit(path: Path) -> list[int]:
+    """Return the numbers of the video streams in ``path``, best first, without attached and single pictures.
+
+    The best has the most pixels over all its frames, which are counted. One with less than a tenth of them is
+    a preview.
+    """
+    with av.open(path, metadata_errors="replace") as container:
+        streams = container.streams.video
+        frames = Counter(packet.stream_index for packet in container.demux(streams) if packet.size)
+        merit = {
+            number: frames[stream.index] * stream.width * stream.height
+            for number, stream in enumerate(streams)
+            if not stream.disposition & Disposition.attached_pic
+        }
+    best = max(merit.values(), default=0)
+    kept = [number for number in merit if merit[number] >= _PREVIEW * best]
+    return sorted(kept, key=lambda number: -merit[number]) or [0]
 
 
 def _stated_seconds(container: InputContainer, stream: VideoStream) -> float:
