@@ -52,7 +52,7 @@ class IngestConfig(SfmConfig, CaptureConfig):
         return value
 
 
-VERSION = 8
+VERSION = 9
 CONFIG = IngestConfig
 SETTINGS: tuple[str, ...] = ()
 INPUTS: Mapping[str, tuple[str, ...]] = {}
@@ -133,6 +133,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         f"{len(capture.frames)} of {capture.n_available} frames ({capture.kind}), "
         f"long side at most {config.max_size} px"
     )
+    for note in capture.notes:
+        reporter.warn(note)
     if capture.hdr is not None:
         reporter.warn(
             f"HDR video ({capture.hdr.upper()}): tone-mapped to sRGB, reference white (203 cd/m²) at 0.8, "
@@ -149,6 +151,8 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
         lambda index: read_rgb(work / "images" / frames[index].image),
         [frame.image in registered for frame in frames],
     )
+    if config.holdout == "none":
+        test = {index for index, frame in enumerate(frames) if frame.source.test}
     outcome = scene.outcome
     model = publish(frames, scene.model, outcome.placed, test, work, context.out, config.max_size, reporter)
     return StageResult(

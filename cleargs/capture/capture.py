@@ -28,6 +28,8 @@ class SourceFrame:
     mask: Path | None = None
     camera: Camera | None = None
     pose: Pose | None = None
+    test: bool = False
+    """True where the input itself names it as a test view."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,10 @@ class Capture:
     """The sparse model of a COLMAP project, where it has points."""
     hdr: str | None = None
     """``pq`` or ``hlg`` for an HDR video, which is tone-mapped."""
+    stretch: tuple[float | None, float | None] = (None, None)
+    """From where to where videos are taken, s; None: from the first, to the last frame."""
+    notes: tuple[str, ...] = ()
+    """What the user should know of how the input was read. They are shown as warnings."""
 
     @property
     def posed(self) -> bool:

@@ -27,6 +27,12 @@ class CaptureConfig(Record):
         ge=3,
         description="most frames to take, evenly; of a video, the sharpest nearby",
     )
+    start: float | None = Field(
+        None, ge=0, description="take a video from this time on, s; unset: from its first frame on"
+    )
+    end: float | None = Field(
+        None, gt=0, description="take a video up to this time, s; unset: up to its last frame"
+    )
     layout: str = Field(
         "auto",
         json_schema_extra={"key": False, "plugin": "layouts"},  # what is read in consequence is in the key

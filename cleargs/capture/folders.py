@@ -10,7 +10,8 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from cleargs.capture.capture import External, SourceFrame
-from cleargs.media import IMAGE_SUFFIXES
+from cleargs.errors import InputError
+from cleargs.media import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
 
@@ -37,6 +38,101 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
         and path.is_file()
         and lies_below(path.relative_to(folder).as_posix())
     ]
+
+
+def folder_of_images(root: Path) -> Path | None:
+    """Return the first folder that holds any image of ``images/``, ``root`` itself, and the reductions.
+
+    The largest reduction comes first. None where no folder has images.
+    """
+    folders = [root / "images", root, *image_folders(root)]
+    return next((folder for folder in folders if folder.is_dir() and image_files(folder)), None)
+
+
+def folders_to_search(root: Path) -> list[Path]:
+    """Return the folders that may hold the images of a listing.
+
+    They are ``images/``, its reductions, other folders, and ``root``. Masks and folders without images are
+    left out.
+    """
+    named = image_folders(root)
+    others = sorted(path for path in root.iterdir() if path.is_dir() and lies_below(path.name))
+    folders = [*named, *(path for path in others if path not in named and path.name != "masks"), root]
+    return [folder for folder in folders if image_files(folder, below=folder != root)]
+
+
+def find_images(root: Path, names: Sequence[str]) -> tuple[Path, dict[str, Path], bool]:
+    """Return the folder of ``root`` with most images of these ``names``, the paths found, and how.
+
+    Images of the very names come first. Where no folder has any, those of the same stems are taken, whatever
+    their suffix and case; the last value is True then.
+    """
+    best: tuple[Path, dict[str, Path], bool] = (root / "images", {}, False)
+    for by_stem in (False, True):
+        for folder in folders_to_search(root):
+            files = image_files(folder, below=True)
+            stored = {_spelling(path.relative_to(folder).as_posix(), by_stem): path for path in files}
+            paths = {name: stored.get(_spelling(name_below_images(name), by_stem)) for name in names}
+            found = {name: path for name, path in paths.items() if path is not None}
+            if len(found) > len(best[1]):
+                best = folder, found, by_stem
+        if best[1]:
+            break
+    return best
+
+
+def _spelling(name: str, by_stem: bool) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix().lower() if by_stem else name
+
+
+def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:
+    """Return the note that images are missing; none where all are there.
+
+    Raises:
+        InputError: more than half of them are missing.
+    """
+    if not missing:
+        return ()
+    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    if 2 * len(missing) > total:
+        raise InputError(
+            f"{listing} lists {len(missing)} images that do not exist: {', '.join(missing[:3])}{more}",
+            hint="put the images where it says, remove the entries, or set ingest.poses=sfm",
+        )
+    return (
+        f"{len(missing)} of {total} images that {listing} lists do not exist: "
+        f"{', '.join(missing[:3])}{more}; they are left out",
+    )
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """Return the videos in ``folder`` itself, in natural order, without hidden ones."""
+    found = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and lies_below(path.name)
+    ]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def left_out(folder: Path) -> tuple[str, ...]:
+    """Return notes on videos and raw photographs in ``folder``, from which images are read."""
+    videos = [path.name for path in videos_in(folder)]
+    raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in RAW_SUFFIXES)
+    notes = []
+    if videos:
+        notes.append(
+            f"{_counted(videos, 'video')} in {folder.name}/ left out, as it holds photographs too; "
+            "to take videos, give one as the input, or a folder with videos alone"
+        )
+    if raw:
+        notes.append(f"{_counted(raw, 'file')} not read: convert raw photographs and GIFs to JPEG or PNG")
+    return tuple(notes)
+
+
+def _counted(names: Sequence[str], word: str) -> str:
+    listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"{len(names)} {word}{'' if len(names) == 1 else 's'} ({listed})"
 
 
 def lies_below(name: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +12,23 @@ from numpy.typing import NDArray
 
 from cleargs.capture.cameras import Camera
 from cleargs.capture.capture import Capture, SourceFrame
+from cleargs.capture.overlay import still_parts, wraps_around
 from cleargs.errors import InputError
 from cleargs.files import make_folder, remove
-from cleargs.media.image import image_size, read_alpha, read_mask, read_rgb, write_mask, write_rgb
+from cleargs.media.image import (
+    image_size,
+    is_panorama,
+    read_alpha,
+    read_mask,
+    read_rgb,
+    write_mask,
+    write_rgb,
+)
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
+
+_PANORAMAS = 3
+"""Pictures that are looked at for panoramas."""
 
 _COARSEST_MASK = 8
 """Most pixels of a working image that one of its mask may stand for, along a side."""
@@ -33,6 +45,8 @@ class WorkFrame:
     height: int
     masked: bool
     camera: Camera | None
+    transparent: bool = False
+    """True where its mask is the transparency of its image."""
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
@@ -54,14 +68,21 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             else:
                 todo[name] = frame
         if capture.kind == "video":
-            pictures = _decoded(capture.frames[0].path, todo)
+            pictures = _decoded(todo)
         else:
             pictures = ((name, read_image(frame)) for name, frame in todo.items())
         for name, rgb in pictures:
             write_rgb(images / name, reduced(rgb, long_side))
             task.advance()
+    _refuse_panoramas(capture, [images / name for name in names])
+    still = still_parts([images / name for name in names])
+    if still is not None:
+        reporter.warn(
+            f"{(still == 0).mean():.1%} of the pixels never move (text, a logo or a bar in the pictures): "
+            "masked in all frames"
+        )
     prepared = [
-        _work_frame(frame, images / name, masks / f"{name}.png", reporter)
+        _work_frame(frame, images / name, masks / f"{name}.png", still, reporter)
         for frame, name in zip(capture.frames, names, strict=True)
     ]
     if any(made.masked for made in prepared):
@@ -69,12 +90,24 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
             mask = masks / f"{made.image}.png"
             if not mask.is_file():
                 write_mask(mask, np.full((made.height, made.width), 255, np.uint8))
-    transparent = sum(made.masked and made.source.mask is None for made in prepared)
+    transparent = sum(made.transparent for made in prepared)
     if transparent:
         reporter.info(
             f"{transparent} of {len(prepared)} images are transparent in places: ignored, like masks"
         )
     return prepared
+
+
+def _refuse_panoramas(capture: Capture, images: Sequence[Path]) -> None:
+    """Raise InputError where the first pictures are equirectangular, by their metadata or their edges."""
+    first = list(zip(capture.frames, images, strict=True))[:_PANORAMAS]
+    if all(
+        (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(at)) for frame, at in first
+    ):
+        raise InputError(
+            "the pictures are equirectangular panoramas, which show all directions",
+            hint="cut perspective views out of them first (ffmpeg's filter v360 does), and give these",
+        )
 
 
 def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
@@ -105,11 +138,12 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decoded(video: Path, frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """The names and pictures of these frames of a video, in its order."""
-    names = {frame.pts: name for name, frame in frames.items() if frame.pts is not None}
-    if names:
-        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, names))
+def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """The names and pictures of these frames of videos, one video after the other."""
+    for video in dict.fromkeys(frame.path for frame in frames.values()):
+        names = {frame.pts: name for name, frame in frames.items() if frame.path == video}
+        wanted = [pts for pts in names if pts is not None]
+        yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, wanted))
 
 
 def read_image(frame: SourceFrame) -> NDArray[np.uint8]:  # [H, W, 3]
@@ -130,7 +164,9 @@ def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
 
-def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter) -> WorkFrame:
+def _work_frame(
+    frame: SourceFrame, image: Path, mask: Path, still: NDArray[np.uint8] | None, reporter: Reporter
+) -> WorkFrame:
     rgb = read_rgb(image)
     height, width = rgb.shape[:2]
     camera = frame.camera
@@ -142,17 +178,34 @@ def _work_frame(frame: SourceFrame, image: Path, mask: Path, reporter: Reporter)
             )
         camera = camera.resized(width, height)
     stencil = read_stencil(frame)
-    if stencil is not None and not resumable(mask, reporter, read_mask):
-        # To whole pixels, a mask of one pixel has any proportions.
-        coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
-        if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
-            what = "is far smaller than it" if coarse else "does not have its proportions"
-            raise InputError(
-                f"the mask of {frame.name} {what}",
-                hint="make masks of the size of their images",
-            )
-        write_mask(mask, np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST)))
-    return WorkFrame(frame, image.name, width, height, stencil is not None, camera)
+    masked = stencil is not None or still is not None
+    if masked and not resumable(mask, reporter, read_mask):
+        write_mask(mask, _stencilled(frame, stencil, still, width, height))
+    transparent = stencil is not None and frame.mask is None
+    return WorkFrame(frame, image.name, width, height, masked, camera, transparent)
+
+
+def _stencilled(
+    frame: SourceFrame,
+    stencil: NDArray[np.uint8] | None,
+    still: NDArray[np.uint8] | None,
+    width: int,
+    height: int,
+) -> NDArray[np.uint8]:  # [height, width]
+    """The mask of a working image: 0 where its own one, or that of still parts, has 0."""
+    mask = np.full((height, width), 255, np.uint8) if still is None else still
+    if stencil is None:
+        return mask
+    # To whole pixels, a mask of one pixel has any proportions.
+    coarse = _COARSEST_MASK * min(stencil.shape) < min(width, height)
+    if coarse or not _alike(stencil.shape[1], stencil.shape[0], (width, height)):
+        what = "is far smaller than it" if coarse else "does not have its proportions"
+        raise InputError(
+            f"the mask of {frame.name} {what}",
+            hint="make masks of the size of their images",
+        )
+    own = np.asarray(cv2.resize(stencil, (width, height), interpolation=cv2.INTER_NEAREST))
+    return np.minimum(mask, own)
 
 
 def read_stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:

@@ -14,7 +14,7 @@ from cleargs.plugins import load_part
 MIN_FRAMES = 3
 """Two frames have no third to confirm what they see."""
 
-LAYOUTS: tuple[Layout, ...] = (video, transforms, colmap, llff, images)
+LAYOUTS: tuple[Layout, ...] = (transforms, colmap, llff, video, images)
 
 
 def layout_of(source: Path, config: CaptureConfig) -> Layout:
@@ -42,6 +42,11 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     if not source.exists():
         raise InputError(f"{source} does not exist", hint="give a video, or a folder of images")
     capture = layout_of(source, config).open_capture(source, config)
+    if capture.kind != "video" and (config.start is not None or config.end is not None):
+        raise InputError(
+            f"{source} is no video: ingest.start and ingest.end choose a stretch of a video",
+            hint="leave them out, or give the video",
+        )
     if len(capture.frames) < MIN_FRAMES:
         raise InputError(
             f"{source} gives {len(capture.frames)} frames; a scene needs at least {MIN_FRAMES}",

@@ -31,6 +31,9 @@ _PHOTOS = frozenset({"heic", "avif"})
 
 _OPAQUE = frozenset({".jpg", ".jpeg", ".bmp"})
 
+_METADATA = 2**18
+"""Bytes at the start of a file in which its metadata are."""
+
 _HINT = "copy the file again, convert it to JPEG or PNG, or remove it"
 
 _MIRRORED = {
@@ -80,6 +83,12 @@ def read_header(path: Path) -> Header:
         )
     fault = "is empty (zero bytes)" if not head else "is not an image that can be read"
     raise InputError(f"{path} {fault}", hint=_HINT)
+
+
+def is_panorama(path: Path) -> bool:
+    """Return True if the metadata of the image in ``path`` say that it is equirectangular (XMP's GPano)."""
+    with open_regular(path) as file:
+        return b"equirectangular" in file.read(_METADATA)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -7,10 +7,11 @@ it stands (a display shows both alike); HLG and PQ go through `cleargs.media.col
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
@@ -53,10 +54,19 @@ class Timeline:
     """True where the frames are of two fields each. They are deinterlaced when they are decoded."""
     others: int = 0
     """Number of other streams in the file that are videos too, not pictures."""
+    before: tuple[int, ...] = ()
+    """Time stamps of the frames that were cut off at the start."""
 
     def seconds(self, index: int) -> float:
-        """Presentation time of a frame, from the first one on, s."""
-        return (self.pts[index] - self.pts[0]) * self.time_base
+        """Return the presentation time of a frame from the first one of the file on, s."""
+        return (self.pts[index] - (self.before or self.pts)[0]) * self.time_base
+
+    def between(self, start: float | None, end: float | None) -> Timeline:
+        """Return the part from ``start`` to ``end``, s, both included; it may hold no frame."""
+        times = [self.seconds(index) for index in range(len(self.pts))]
+        first = 0 if start is None else bisect_left(times, start)
+        last = len(times) if end is None else bisect_right(times, end)
+        return replace(self, pts=self.pts[first:last], before=self.before + self.pts[:first])
 
 
 def read_timeline(path: Path) -> Timeline:
