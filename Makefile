@@ -5,7 +5,7 @@
 # make test-package   wheel and sdist, built and installed apart; the smoke demo run from the wheel
 # make drill  every stage and gc killed 50 times: same results
 # make fuzz   every reader under 2,000 mutations a file; SEED=N for others
-# make lint   ruff, codespell and mypy
+# make lint   ruff, codespell, mypy and the check of the prose (tools/prose.py)
 # make docs   the documentation as a site, in site/; a broken link is an error
 # make dist   wheel and sdist, in dist/
 # make test-gpu-kernels   the GPU kernels, without a GPU: in Triton's interpreter, and compiled ahead of time
@@ -78,6 +78,7 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
 	$(BIN)/mypy cleargs stages benchmarks tools
+	$(BIN)/python -m tools.prose
 
 convert-env: .venv-convert/stamp
 

@@ -26,7 +26,8 @@ class Task(Protocol):
 
     def update(self, *, done: int | None = None, note: str | None = None, share: float | None = None) -> None:
         """``done`` in all are done; ``note`` (a few figures, say) is shown beside the bar. ``share`` of the
-        work is behind us, where steps differ so much that their number does not say."""
+        work is behind us, where steps differ so much that their number does not say.
+        """
 
 
 class Reporter(Protocol):

@@ -90,7 +90,8 @@ class StageResults:
 
     def table(self, name: str) -> pa.Table:
         """The table ``name`` (``frames``, say), all its columns. Raises InputError where there is none,
-        StoreError where it is damaged."""
+        StoreError where it is damaged.
+        """
         from cleargs.parquet import read_any_table
 
         path = self.folder.resolve() / f"{name}.parquet"
@@ -126,7 +127,8 @@ class Prepared:
 
     def views(self, weights: Mapping[int, float] | None = None) -> list[View]:
         """What a training looks at: the frames with a pose, not held out, whose weight (default: 1) is
-        above 0. Images are read when they are needed."""
+        above 0. Images are read when they are needed.
+        """
         from cleargs.formation.frames import real_views
 
         given = {frame.frame_id: 1.0 for frame in self.frames} if weights is None else weights

@@ -77,7 +77,8 @@ def read_bytes(path: Path, at_most: int = MAX_BYTES) -> bytes:
 
 def read_text(path: Path) -> str:
     """The UTF-8 text at ``path``, without a byte order mark. Raises OSError like `read_bytes`, and
-    UnicodeDecodeError."""
+    UnicodeDecodeError.
+    """
     return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
 
 

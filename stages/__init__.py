@@ -1,5 +1,6 @@
 """The five stages, in order. The runner loads ``cleargs.stages.<name>`` by name; each module fulfils
-`cleargs.pipeline.stage.Stage`."""
+`cleargs.pipeline.stage.Stage`.
+"""
 
 from __future__ import annotations
 

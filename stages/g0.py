@@ -87,7 +87,8 @@ def preflight(config: G0Config) -> None:
 
 def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
-    buffers."""
+    buffers.
+    """
     from cleargs.splat.effort import training_cost
 
     from .cost import capture_size, pace, sparse_points

@@ -145,7 +145,8 @@ def externals(config: RivrConfig, source: Path) -> Mapping[str, Path]:
 
 def preflight(config: RivrConfig) -> None:
     """The expert and the scorers: raises InputError for one that is not installed, damaged or of another
-    form."""
+    form.
+    """
     from cleargs.models.expert import load_expert
     from cleargs.models.scorer import load_scorer
 
@@ -156,7 +157,8 @@ def preflight(config: RivrConfig) -> None:
 
 def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
-    one), making and scoring candidates 2 s (two cores). Every group leaves a scene."""
+    one), making and scoring candidates 2 s (two cores). Every group leaves a scene.
+    """
     from cleargs.splat.effort import training_cost
 
     from .cost import capture_size, pace
@@ -193,7 +195,8 @@ def _degraded(context: StageContext[RivrConfig], frames: int) -> int:
 
 def run(context: StageContext[RivrConfig]) -> StageResult:
     """Candidates -> scores -> choice -> distillation, for every group of every round; then the check for
-    harm."""
+    harm.
+    """
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
@@ -265,7 +268,8 @@ def _repair_and_distil(
     g0: Snapshot,
 ) -> tuple[list[Selection], list[Path], Snapshot]:
     """Every round along the trajectory, group by group: what each frame got, the folders of the trainings,
-    and the last scene."""
+    and the last scene.
+    """
     from cleargs.rivr.distillation import superseded
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share

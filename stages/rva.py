@@ -36,7 +36,8 @@ def externals(config: RvaConfig, source: Path) -> Mapping[str, Path]:
 
 def preflight(config: RvaConfig) -> None:
     """The evaluator: raises InputError where the server does not answer or lacks the model, or the folder
-    holds none that can be loaded."""
+    holds none that can be loaded.
+    """
     from cleargs.rva.evaluators import check_evaluator
 
     check_evaluator(config)

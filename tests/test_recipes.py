@@ -101,7 +101,8 @@ def test_the_paper_has_as_many_gaussians_as_its_field() -> None:
 
 def test_the_open_row_trains_as_the_default_does() -> None:
     """Frames, poses, trainer and steps alike, so that the table compares methods. Formation is none of the
-    paper's."""
+    paper's.
+    """
     off = {"formation": FormationConfig(enabled=False)}
     default, row = load_config(installed(), "default"), load_config(installed(), "paper-open")
     assert row.sections["ingest"] == default.sections["ingest"]

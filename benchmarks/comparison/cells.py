@@ -140,7 +140,8 @@ class Cells:
 
     def best(self, views: ViewSet, column: str, metric: str) -> str | None:
         """The variant with the best mean, of those that were measured on the most samples: means over
-        other samples say nothing of each other."""
+        other samples say nothing of each other.
+        """
         spreads = {
             variant: found
             for variant in self.variants()

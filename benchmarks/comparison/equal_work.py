@@ -47,7 +47,8 @@ class Steps:
 
 def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
     """The steps that a run on so many frames makes up to ``stage``, provided that some repair is accepted in
-    each round."""
+    each round.
+    """
     whole: Any = config.sections
     rivr, consolidate = stage != "g0", stage == "consolidate"
     return Steps(

@@ -188,7 +188,8 @@ def make_section(section: Section, shop: Workshop) -> Outcome:
 
 def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
     """Rough time of each section on two quiet cores, everything still to be made; what a section before it
-    has made takes no time."""
+    has made takes no time.
+    """
     made: set[object] = set()
 
     def first(*what: object) -> bool:

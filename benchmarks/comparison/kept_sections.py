@@ -58,7 +58,8 @@ def keep_section(folder: Path, found: Outcome, version: str, machine: str) -> No
 
 def kept_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[KeptSection]:
     """Those of ``sections`` that ``folder`` has, as they are listed now; what was made from another list, or
-    cannot be read, is left out with a warning."""
+    cannot be read, is left out with a warning.
+    """
     found = []
     for section in sections:
         path = _file(folder, section)

@@ -32,7 +32,8 @@ _NAME_INCHES = 2.6
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
     """Write a PNG of the differences to the first variant: a row a metric, a panel a set of views; a point a
     variant and column, with the 95 % interval of the paired difference where there are several samples. Of a
-    single variant the values themselves are shown."""
+    single variant the values themselves are shown.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -135,7 +136,8 @@ def comparison_sheet(
 
 def _telling(out: Path, cell: Cell, capture: Path) -> str:
     """The frame to show: a bad one, but not the worst. At the upper quartile of the input's error against the
-    truth; where there is no such pair, at the lower quartile of the scene's PSNR."""
+    truth; where there is no such pair, at the lower quartile of the scene's PSNR.
+    """
     truth, observed = capture / "truth" / "observed" / "images", capture / "images"
     evaluation = Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
     errors = {}

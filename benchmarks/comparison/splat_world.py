@@ -43,7 +43,8 @@ class SplatWorld:
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
         """The mean over the samples. Off the optical axis the principal point moves with the lens, so that
-        what is in focus stays where it is."""
+        what is in focus stays where it is.
+        """
         points = np.broadcast_to(aperture.points, (shutter.samples, 2))
         shares: defaultdict[tuple[int, float, float], Array] = defaultdict(lambda: np.zeros(lens.height))
         for row_poses, (right, down) in zip(shutter.index, points, strict=True):

@@ -83,7 +83,8 @@ class Iteration:
 
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
         """Copies, on the CPU, of the rendered image [H, W, 3] and of the gradients for dL/d(image)
-        [H, W, 3]."""
+        [H, W, 3].
+        """
         image = self.image().clone()
         gradients = self.backward(grad_image.to(image.device)).clone()
         return image.cpu(), gradients.to("cpu")

@@ -104,7 +104,8 @@ class Batch:
 
     def check(self, sheet: Path) -> None:
         """Raise SheetError where a scene has no input, a setting is wrong, a model is missing, or the run
-        folder belongs to another input: hours of work are not to end in a missing file."""
+        folder belongs to another input: hours of work are not to end in a missing file.
+        """
         problems = []
         for scene in self.scenes:
             try:

@@ -231,7 +231,8 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
 
 def _upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The smallest rotation that takes ``up`` to -y; from nearly +y, the smallest after half a turn about x
-    (there the smallest rotation's axis hangs on rounding errors)."""
+    (there the smallest rotation's axis hangs on rounding errors).
+    """
     length = float(np.linalg.norm(up))
     if length < 1e-6:
         return np.eye(3)

@@ -78,5 +78,6 @@ class Layout(Protocol):
 
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:
         """The frames in trajectory order, at most ``config.max_frames``, with what is known of cameras and
-        poses. Decodes no frame; changes nothing. Raises InputError."""
+        poses. Decodes no frame; changes nothing. Raises InputError.
+        """
         ...

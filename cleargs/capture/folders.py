@@ -18,7 +18,8 @@ T = TypeVar("T")
 
 def image_folders(root: Path) -> list[Path]:
     """``images/`` and its reductions ``images_N/`` (N times smaller, as LLFF and nerfstudio name them),
-    largest images first; empty when ``root`` has none of them."""
+    largest images first; empty when ``root`` has none of them.
+    """
     found = [(0, root / "images")] if (root / "images").is_dir() else []
     for folder in root.glob("images_*"):
         factor = folder.name.removeprefix("images_")
@@ -29,7 +30,8 @@ def image_folders(root: Path) -> list[Path]:
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
     """The images in ``folder``, with ``below`` also those in its folders, but none that is hidden; in any
-    order."""
+    order.
+    """
     found = folder.rglob("*") if below else folder.iterdir()
     return [
         path
@@ -165,7 +167,8 @@ def mask_externals(source: Path) -> dict[str, External]:
 
 def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """The masks in ``folder`` of the images of these ``names``: in the same place, by stem or full name (as
-    COLMAP has them); elsewhere where no other image has that stem."""
+    COLMAP has them); elsewhere where no other image has that stem.
+    """
     if folder is None:
         return {}
     found = {
@@ -187,7 +190,8 @@ def chosen(
     frames: Sequence[SourceFrame], source: Path, at_most: int, names: Sequence[str] | None = None
 ) -> tuple[SourceFrame, ...]:
     """At most so many of ``frames``, each with its mask in the input ``source``: the mask of its name, or of
-    the one in ``names``, where it brings none."""
+    the one in ``names``, where it brings none.
+    """
     names = [frame.name for frame in frames] if names is None else names
     masks = masks_of(mask_folder(source), names)
     return tuple(

@@ -40,7 +40,8 @@ _MAX_IMAGES = 2**31 - 1
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
     """Each frame with its ``overlap`` next ones, and with those 2^k on for k < overlap (COLMAP's quadratic
-    overlap), which bridges stretches too blurred to match."""
+    overlap), which bridges stretches too blurred to match.
+    """
     steps = set(range(1, overlap + 1)) | {2**power for power in range(overlap)}
     return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
 
@@ -156,7 +157,8 @@ def _shares(database: Path) -> list[Path]:
 
 def _gather(database: Path, share: Path) -> None:
     """Copy the matches in ``share`` to ``database``. Raises sqlite3.DatabaseError, and copies none, where one
-    cannot be read or the other not be written."""
+    cannot be read or the other not be written.
+    """
     if not is_sound(share):
         raise sqlite3.DatabaseError(f"{share} is damaged")
     with closing(sqlite3.connect(database)) as opened:

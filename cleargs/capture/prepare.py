@@ -153,7 +153,8 @@ def read_image(frame: SourceFrame) -> NDArray[np.uint8]:  # [H, W, 3]
 
 def _is_as_stored(frame: SourceFrame) -> bool:
     """Whether the frame's camera fits the image as it is stored, which is what COLMAP works on. Half a turn
-    keeps the proportions: then it is taken to fit."""
+    keeps the proportions: then it is taken to fit.
+    """
     camera = frame.camera
     return camera is not None and _alike(camera.width, camera.height, image_size(frame.path))
 

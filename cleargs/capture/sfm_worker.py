@@ -381,7 +381,8 @@ def _median_error(model: pycolmap.Reconstruction) -> float:
 
 def _centre_and_axes(image: pycolmap.Image) -> NDArray[np.float64]:  # [4, 3]
     """Where a camera is, and the points at distance 1 on its axes: the centres of a straight path alone leave
-    the turn about it open. (1 is the distance of the farthest camera in the normalised world.)"""
+    the turn about it open. (1 is the distance of the farthest camera in the normalised world.)
+    """
     centre: NDArray[np.float64] = image.projection_center()
     return np.vstack([centre, centre + image.cam_from_world().rotation.matrix()])
 

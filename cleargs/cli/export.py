@@ -86,7 +86,8 @@ def export(
     force: bool,
 ) -> None:
     """Write the scene of RUN to a file, its cameras (FILE.cameras.json) and the COLMAP model (FILE.colmap)
-    next to it."""
+    next to it.
+    """
     from cleargs.cli.export_pruning import cropped, parse_crop, parse_prune, pruned
     from cleargs.splat.formats import check_options, format_of, padded, write_scene
 

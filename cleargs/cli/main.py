@@ -55,6 +55,8 @@ Examples:
 \b
 Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 3 done only in part,
 130 interrupted (the same command resumes).
+
+Terms: docs/glossary.md
 """
 
 

@@ -222,7 +222,8 @@ def exit_code(outcomes: Sequence[Outcome]) -> int:
 
 def print_outcomes(outcomes: Sequence[Outcome], run: Path, report: Path | None = None) -> None:
     """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
-    what to look at (the ``report``, a picture), the next command."""
+    what to look at (the ``report``, a picture), the next command.
+    """
     last = outcomes[-1].manifest
     for missing in (*last.inherited, *(f"{last.stage}: {line}" for line in last.missing)):
         click.echo(f"missing: {printable(missing)}", err=True)

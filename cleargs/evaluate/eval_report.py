@@ -41,7 +41,8 @@ LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 
 class Figures(Record):
     """A record whose JSON writes an infinite figure, as the PSNR of a perfect image, as ``"Infinity"``: JSON
-    has no number for it. Read back, it is a number again."""
+    has no number for it. Read back, it is a number again.
+    """
 
     model_config = ConfigDict(ser_json_inf_nan="strings")
 

@@ -47,7 +47,8 @@ class Exposure:
     @classmethod
     def from_gains(cls, frame_ids: Sequence[int], gains: NDArray[np.float64]) -> Exposure:
         """Exposure that brightens each of these distinct frames by its gain (NaN: not at all) over the median
-        one."""
+        one.
+        """
         known = gains[np.isfinite(gains)]
         relative = gains / np.median(known) if len(known) else gains
         order = np.argsort(np.asarray(frame_ids))
@@ -67,7 +68,8 @@ class Exposure:
 
 def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """The affines [F, 3, 4] shifted so that the (lower) median of each entry, weighted by ``weights`` [F], is
-    the identity's."""
+    the identity's.
+    """
     total = weights.sum()
     if total <= 0.0:
         return affines

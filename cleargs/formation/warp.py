@@ -143,7 +143,8 @@ def padded(image: Floats) -> Floats:
 
 def through_curve(image: Tensor, curve: Tensor, channels: int = 3) -> tuple[Tensor, Tensor]:
     """The colours of ``image`` [H, W, 3 or 4] through `linear_curve` or `srgb_curve`, as an image of
-    ``channels``, and the slopes there [H, W, 3]."""
+    ``channels``, and the slopes there [H, W, 3].
+    """
     return backend_for(image.device).through_curve(image, curve, channels)
 
 

@@ -122,7 +122,8 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
 
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast. Frames that
-    cannot be decoded, as at the start of a clip that was cut out of another, are left out."""
+    cannot be decoded, as at the start of a clip that was cut out of another, are left out.
+    """
     for number, frame, _ in _decoded(path, pts):
         yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)
 

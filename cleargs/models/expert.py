@@ -87,7 +87,8 @@ class OnnxExpert:
 
 def load_expert(spec: str, device: Device = "cpu") -> Expert:
     """The expert named by ``spec`` (see `load_network`), on what `network_device` found. Raises InputError,
-    also as `OnnxExpert` does."""
+    also as `OnnxExpert` does.
+    """
 
     def own(path: Path, model: Model | None) -> Expert:
         return OnnxExpert(path, None if model is None else spec, device)

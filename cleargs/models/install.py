@@ -37,7 +37,8 @@ def install(model: Model, directory: Path, archive: Path | None = None) -> list[
 
 def place(model: Model, directory: Path, write: Callable[[Path], object]) -> list[Path]:
     """Have ``write`` fill a folder with the model's files, and move them to ``directory`` once they have
-    passed the checks of `verify`. Returns them. Raises InputError when they do not pass."""
+    passed the checks of `verify`. Returns them. Raises InputError when they do not pass.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="new-", dir=directory) as folder:
         new = Path(folder)

@@ -177,7 +177,8 @@ def _state_dict(net: Net, checkpoint: Mapping[str, Any], backbone: Mapping[str, 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """torch's convolutions and reductions differ in the last bits between thread counts; one gives one
-    result."""
+    result.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

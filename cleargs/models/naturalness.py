@@ -101,7 +101,8 @@ def terms(
     deviation: NDArray[np.float64],  # [F]
 ) -> NDArray[np.float64]:
     """The terms of the quadratic: 1, every standardised feature, every product of two. [..., 1 + F + F (F +
-    1) / 2]"""
+    1) / 2]
+    """
     z = np.clip((features - mean) / deviation, -_LIMIT, _LIMIT)
     i, j = np.triu_indices(z.shape[-1])
     return np.concatenate([np.ones_like(z[..., :1]), z, z[..., i] * z[..., j]], axis=-1)

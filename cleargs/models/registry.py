@@ -117,7 +117,8 @@ def find_model(name: str) -> Model:
 
 def model_dir() -> Path:
     """The folder of installed models: ``CLEARGS_MODELS``, or ``cleargs/models`` in the user's cache
-    folder."""
+    folder.
+    """
     if chosen := os.environ.get("CLEARGS_MODELS"):
         return Path(chosen)
     if sys.platform == "darwin":
@@ -222,7 +223,8 @@ def read_receipt(model: Model, directory: Path) -> dict[str, str]:
 
 def file_digest(path: Path) -> str:
     """SHA-256 in hexadecimal: of an ONNX file's bytes, or of the names, shapes and values of the tensors in a
-    safetensors file; "" if these cannot be read."""
+    safetensors file; "" if these cannot be read.
+    """
     if path.suffix != ".safetensors":
         return bytes_digest(path)
     from safetensors import SafetensorError

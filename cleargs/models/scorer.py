@@ -174,7 +174,8 @@ class MusiqScorer:
 
 def patches(image: Image) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
     """The patches [N, 3, 32, 32] of an sRGB image in [0, 1], in [-1, 1]; cells of the position grid [N] and
-    numbers of the sizes [N]."""
+    numbers of the sizes [N].
+    """
     import torch  # seconds, which naming a scorer must not take
     from torch.nn.functional import interpolate
 

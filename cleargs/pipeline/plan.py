@@ -274,7 +274,8 @@ class Planner:
 
 def _known(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
     """``before`` with the values of ``now``. A name that only one of them has came or went with a version of
-    the program."""
+    the program.
+    """
     return {
         name: _known(now[name], value)
         if isinstance(value, Mapping) and isinstance(now.get(name), Mapping)
@@ -321,7 +322,8 @@ def check_disk(plans: list[StagePlan], store: Path) -> None:
 
 def check_address_space() -> None:
     """Raise InputError where a limit on addresses (``ulimit -v``) does not even let the libraries in: some of
-    them wait for ever then."""
+    them wait for ever then.
+    """
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_GB * 1e9:
         raise InputError(

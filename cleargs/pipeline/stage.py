@@ -75,7 +75,8 @@ class Estimate:
 
 class Stage(Protocol):
     """A module in ``stages/``. Its top level imports only its config model: heavy imports live in ``run``,
-    so that a run with nothing to do costs no import of torch."""
+    so that a run with nothing to do costs no import of torch.
+    """
 
     VERSION: int
     """Raised whenever the stage's source changes its results."""

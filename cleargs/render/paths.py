@@ -145,7 +145,8 @@ def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
 
 def framed(camera: Camera, width: int, height: int) -> Camera:
     """``camera`` with a picture of ``width`` x ``height``, not stretched: it shows all that it showed, and
-    more on two sides where the shape differs."""
+    more on two sides where the shape differs.
+    """
     scale = min(width / camera.width, height / camera.height)
     return replace(
         camera,

@@ -71,7 +71,8 @@ def weight_colour(weight: float) -> str:
 
 def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
     """The cameras of the placed frames from above (x to the right, z up), in units of the SVG; None without
-    any. The tip of a mark ends the line that shows where it looks."""
+    any. The tip of a mark ends the line that shows where it looks.
+    """
     placed = [row for row in rows if row.frame.registered]
     if not placed:
         return None

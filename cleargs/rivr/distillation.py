@@ -73,7 +73,8 @@ def observation(view: View) -> tuple[Image, Mask | None]:
 
 class Snapshot:
     """A scene on disk (``scene.ply``, ``exposure.parquet`` and ``formation.parquet`` in ``folder``), ready to
-    be rendered. Raises StoreError without one of them."""
+    be rendered. Raises StoreError without one of them.
+    """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         self.folder = folder
@@ -110,7 +111,8 @@ class Snapshot:
 
     def deblur(self, view: View) -> Deblurred | None:
         """The raw frame without what the camera did to it, found by comparing it with the scene; None where
-        nothing explains the frame better than the render as it is."""
+        nothing explains the frame better than the render as it is.
+        """
         observed, mask = observation(view)
         affine = (
             None
@@ -226,7 +228,8 @@ def publish(snapshot: Snapshot, trainings: Sequence[Path], out: Path, rejected: 
 
 def superseded(training: Path) -> None:
     """Drop from the folder of a finished training what only the last one is asked for: its state, which is
-    three times as large as the scene."""
+    three times as large as the scene.
+    """
     (training / STATE).unlink(missing_ok=True)
 
 

@@ -93,7 +93,8 @@ def shifts(repair: Image, observed: Image, render: Image) -> Array:
 
 def colour_differences(repair: Image, observed: Image, render: Image) -> Array:
     """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
-    farthest, in sRGB [rows, columns]."""
+    farthest, in sRGB [rows, columns].
+    """
     means, *references = (_block_means(image) for image in (repair, observed, render))
     nearer: Array = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
     return nearer

@@ -19,7 +19,8 @@ SHEET_FRAMES = 6
 
 def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) -> None:
     """One line a row: the observation, the same without its motion, and its candidates, with both scores, the
-    chosen one marked."""
+    chosen one marked.
+    """
     write_rgb(path, contact_sheet([_candidates(row, rivr) for row in rows] or [_nothing()]))
 
 
@@ -32,7 +33,8 @@ def write_before_after_sheet(
     rivr: Path,
 ) -> None:
     """One line a view: G0's render, the final render, the observation, and, where any of the views has one,
-    the repair that was distilled."""
+    the repair that was distilled.
+    """
     repaired = any(view.frame_id in repairs for view in views)
     lines = []
     for view in views:

@@ -1,5 +1,6 @@
 """The frames of a capture as RIVR and the consolidation see them: those that are repaired, in groups along
-the trajectory, and those that are held back to measure whether repairing does harm."""
+the trajectory, and those that are held back to measure whether repairing does harm.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +114,8 @@ class Supervision:
 
     def targets(self, which: Targets) -> list[View]:
         """The frames that every round repairs: ``all``, or those whose role is not ``strong``, but never the
-        held-back ones."""
+        held-back ones.
+        """
         return [
             self.views[frame.frame_id]
             for frame in self.appraisals

@@ -42,7 +42,8 @@ class Observations:
 @dataclass(frozen=True)
 class Assessment:
     """One entry a frame, in the order given; geometry is NaN (bin -1) where the frame is unregistered
-    or not scored."""
+    or not scored.
+    """
 
     R: Floats
     B: Floats

@@ -19,7 +19,8 @@ Device = Literal["cpu", "cuda"]
 
 def check_evaluator(config: EvaluatorConfig) -> None:
     """Raise InputError when the model of the evaluator that the settings name cannot be had: nobody answers
-    at the server's address, the server has no such model, or the folder holds none that can be loaded."""
+    at the server's address, the server has no such model, or the folder holds none that can be loaded.
+    """
     if config.evaluator == "qwen3-vl":
         _qwen(config.qwen).check()
     elif config.evaluator not in EVALUATORS:

@@ -132,7 +132,8 @@ def extents_from_ratios(
     content: Floats,  # [...] > 1: what sharp views of the same content have
 ) -> Floats:  # [...] px, in [0, MAX_EXTENT]
     """Standard deviation s of the blur: solves ratio = ((COARSE^2 + s^2) / (FINE^2 + s^2))^p with the p that
-    ``content`` has at s = 0."""
+    ``content`` has at s = 0.
+    """
     p = np.log(content) / np.log(COARSE**2 / FINE**2)
     quotient = np.maximum(ratio, 1.0) ** (1.0 / p)
     square = (COARSE**2 - quotient * FINE**2) / np.maximum(quotient - 1.0, 1e-6)

@@ -249,7 +249,8 @@ def motion_blur(extents: Floats) -> Floats:
 
 def defocus(extents: Floats) -> Floats:
     """b_defocus: the visible blur that even the best direction has, where it is the same in all. Failure
-    modes: as for `motion_blur`."""
+    modes: as for `motion_blur`.
+    """
     return isotropy(extents) * visible_blur(extents.min(axis=1), _DEFOCUS_HALF)
 
 

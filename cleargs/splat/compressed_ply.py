@@ -133,7 +133,8 @@ def smaller_parts(
     quaternions: NDArray[np.floating[Any]],  # [N, 4]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Which part of each unit quaternion is largest [N], and the others in their order [N, 3], with the sign
-    that makes the largest positive: all that is needed to find it again."""
+    that makes the largest positive: all that is needed to find it again.
+    """
     unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)

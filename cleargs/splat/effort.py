@@ -54,7 +54,8 @@ def training_cost(
     config: TrainConfig, frames: int, megapixels: float, start: int | None = None
 ) -> tuple[float, float]:
     """Rough wall seconds on two quiet cores, and GB beside the images, of a training on so many frames from
-    ``start`` Gaussians (None: from as many as it may have)."""
+    ``start`` Gaussians (None: from as many as it may have).
+    """
     pixels = round(frames * megapixels * 1e6)
     budget = config.budget_for(pixels)
     whole = config.model_copy(update={"steps": config.steps_for(frames), "budget": budget})

@@ -51,7 +51,8 @@ class Formation(Protocol):
     ) -> Formed | None:
         """For a step on ``view`` reduced by ``factor``, ``progress`` (0 to 1) through the training.
 
-        None where the view shows the render as it is."""
+        None where the view shows the render as it is.
+        """
         ...
 
     def digest(self) -> str:

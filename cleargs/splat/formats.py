@@ -54,7 +54,8 @@ FORMATS: Mapping[str, Format] = {
 
 def format_of(path: Path) -> str:
     """The ending of ``path`` in `FORMATS`, or of a format that another package brings. Raises InputError for
-    any other."""
+    any other.
+    """
     name = path.name.lower()
     for endings in (FORMATS, brought := plugins("formats")):
         for ending in endings:

@@ -24,7 +24,8 @@ other within eight times as many steps there are fewer, since each costs a backw
 def rate_factor(steps: int) -> float:
     """How much faster means, scales, rotations and SH learn in a training of so many steps than in one of
     `INRIA_STEPS`: a step of Adam is as long as its rate, so a short training with the rates of a long one
-    ends before they have got where they go (docs/training.md)."""
+    ends before they have got where they go (docs/training.md).
+    """
     return min(MAX_RATE_FACTOR, max(1.0, math.sqrt(INRIA_STEPS / steps)))
 
 

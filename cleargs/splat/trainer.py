@@ -215,7 +215,8 @@ class Trainer:
 
     def shares_of_work(self) -> list[float]:
         """For 0 to ``length`` steps done, the share of the work that is behind us: growth makes later steps
-        longer."""
+        longer.
+        """
         views = self._real or self._pseudo
         megapixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / 1e6
         seconds = seconds_by_step(self._config, len(views), megapixels, self._scene.gaussians.num)

@@ -113,7 +113,8 @@ def _multiply(first: Tensor, second: Tensor) -> Tensor:
 
 def upright(first: Camera, up: str) -> dict[str, Any]:
     """Scale, rotation [3, 3] and translation [3] from the normalised world to one with ``up`` of `UP`, in
-    which ``first`` stands at the origin and looks ahead. Up stays up, whatever its pitch and roll."""
+    which ``first`` stands at the origin and looks ahead. Up stays up, whatever its pitch and roll.
+    """
     ahead = first.world_to_camera[2, :3] * [1.0, 0.0, 1.0]
     length = float(np.linalg.norm(ahead))
     x, _, z = ahead / length if length > 1e-6 else (0.0, 0.0, 1.0)  # straight up or down: as it lies

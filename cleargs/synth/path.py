@@ -155,7 +155,8 @@ def _stretches(duration: float, seed: int) -> Array:
 
 class HandheldPath:
     """Where the camera is at any time of a walk along ``course`` that takes ``frames`` frames at `FPS`; for
-    ``stretched`` see `Hand`."""
+    ``stretched`` see `Hand`.
+    """
 
     def __init__(self, course: Course, frames: int, seed: int, *, stretched: bool = False) -> None:
         self.duration = frames / FPS

@@ -361,7 +361,8 @@ class RoomWorld:
         self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
     ) -> tuple[Array, Array]:
         """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
-        [H, W] of the exposure in which a pixel sees it."""
+        [H, W] of the exposure in which a pixel sees it.
+        """
         image, _, share = self._expose(shutter, lens, aperture, balloon)
         return image, share
 

@@ -202,7 +202,8 @@ def make_room(seed: int) -> Room:
 
 class Balloon:
     """A ball that drifts to and fro above the table of ``room``: it touches nothing, and crosses the view
-    from side to side in two or three seconds."""
+    from side to side in two or three seconds.
+    """
 
     def __init__(self, room: Room, seed: int) -> None:
         rng = np.random.default_rng([seed, Stream.BALLOON])

@@ -31,7 +31,8 @@ Image = NDArray[np.float32]
 
 def dead_leaves(seed: int, height: int = 200, width: int = 320) -> Image:
     """Opaque discs of all sizes, each with a fine texture of its own: the classical stand-in for a
-    photograph."""
+    photograph.
+    """
     rng = np.random.default_rng(seed)
     scale = 3  # drawn larger and reduced, so that edges are as soft as a camera's
     canvas = np.full((scale * height, scale * width, 3), 0.5, np.float32)

@@ -51,7 +51,8 @@ WEIGHTS = (0.9, 0.6, 0.4, 0.99, 0.1, 0.0, 0.0)
 
 def wall(seed: int, gaussians: int = 4000, sh_degree: int = 1) -> Scene:
     """Opaque coloured blobs at depth 2, wider than the view of any camera. They are small, since large ones
-    that lie close together are drawn in an order that differs between renderers."""
+    that lie close together are drawn in an order that differs between renderers.
+    """
     chance = np.random.default_rng(seed)
 
     def tensor(values: Any) -> torch.Tensor:

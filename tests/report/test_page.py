@@ -77,6 +77,14 @@ def test_every_picture_says_what_it_shows(parsed: Page) -> None:
     assert len(drawings) == 1 + 3 + 3 and all(svg.get("aria-label") for svg in drawings)
 
 
+def test_terms_mean_what_the_glossary_says(page: Path) -> None:
+    glossary = (Path(__file__).parents[2] / "docs/glossary.md").read_text("utf-8")
+    entries = dict(re.findall(r"### (.+)\n((?:.+\n)+)", glossary))
+    terms = re.findall(r"<dt>([\w ]+)</dt><dd>([A-Z][^<]+\.)</dd>", page.read_text())
+    assert {"R", "Role", "Gate"} <= dict(terms).keys()
+    assert [name for name, text in terms if not " ".join(entries[name].split()).startswith(text)] == []
+
+
 def test_nothing_is_loaded_from_a_network(page: Path) -> None:
     assert_offline(page)
 

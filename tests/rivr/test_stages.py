@@ -199,7 +199,8 @@ class Faithful:
 
 def keeping(**changes: Any) -> Any:
     """The default: motion undone, no fusion, raw frames kept. The stand-in scorers have no calibrated scale,
-    so that the margin leaves the choice to them only where they differ grossly."""
+    so that the margin leaves the choice to them only where they differ grossly.
+    """
     return tiny_rivr(undo_motion=True, use_fused=False, keep_raw=True, margin=20.0, **changes)
 
 

@@ -126,7 +126,8 @@ def tiny_g0(**changes: Any) -> G0Config:
 
 def tiny_rivr(**changes: Any) -> RivrConfig:
     """Two rounds of a few steps, no margin of harm exceeded; the paper's rules: raw frames as they are, three
-    candidates, and every target frame gets a pseudo observation."""
+    candidates, and every target frame gets a pseudo observation.
+    """
     settings: dict[str, Any] = {
         "rounds": 2,
         "undo_motion": False,

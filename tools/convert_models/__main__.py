@@ -49,7 +49,8 @@ _PACKAGES = {
 )
 def main(target: str, checkpoint: Path, accept_licence: bool, directory: Path | None, tile: int) -> None:
     """Install the model NAME from its published CHECKPOINT, or write the restoration network of a CHECKPOINT,
-    of any architecture that spandrel reads, as OUTPUT.onnx, for rivr.expert=OUTPUT.onnx."""
+    of any architecture that spandrel reads, as OUTPUT.onnx, for rivr.expert=OUTPUT.onnx.
+    """
     if target.endswith(".onnx"):
         require(*_PACKAGES["spandrel"], purpose=f"converting {checkpoint.name}")
         restorer.convert(read_bytes(checkpoint), Path(target), tile)

@@ -170,7 +170,8 @@ def blocks(image: Image, rng: np.random.Generator) -> Image:
 
 def rendered(image: Image, rng: np.random.Generator) -> Image:
     """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
-    front."""
+    front.
+    """
     out = splat(image, rng, _log_uniform(rng, 2.2, 7.0), rng.uniform(1.5, 8.0))
     if rng.random() < 0.5:
         share = patches(image.shape[0], image.shape[1], rng)
@@ -281,7 +282,8 @@ def _footprint(
     width: int,
 ) -> tuple[tuple[slice, slice], NDArray[np.float64]]:
     """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the
-    centre."""
+    centre.
+    """
     x, y, angle, major, minor = gaussian
     c, s = np.cos(angle), np.sin(angle)
     reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)

@@ -47,7 +47,8 @@ def agreement(
     names: list[str],  # [K]
 ) -> list[str]:
     """A Markdown table by artefact: rank agreement with -LPIPS, and how often the clean photo scores
-    higher."""
+    higher.
+    """
     within = [spearman(s, -d) for s, d in zip(scores, distances, strict=True)]
     lines = [
         f"Spearman with -LPIPS: {spearman(scores, -distances):.3f} over all images, "

@@ -170,7 +170,8 @@ class Contents:
 
 def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Image]:
     """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each. Defocus is part of the truth
-    (`SHALLOW_SHARE`)."""
+    (`SHALLOW_SHARE`).
+    """
     kind = rng.random()
     if kind < DRAWN_SHARE:
         sharp = graphic(PATCH + 2 * MARGIN, rng)
@@ -188,7 +189,8 @@ def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Im
 
 def _cut(images: Sequence[NDArray[np.uint8]], scale: float, rng: np.random.Generator) -> Image:
     """A patch with its margin, shrunk by ``scale``, turned and mirrored; of two random places that with more
-    detail."""
+    detail.
+    """
     image = images[int(rng.integers(len(images)))]
     size = PATCH + 2 * MARGIN
     side = min(round(size * scale), *image.shape[:2])

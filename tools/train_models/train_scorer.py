@@ -183,7 +183,8 @@ def _loss(
     targets: Tensor,  # [G, V]
 ) -> Tensor:
     """Smooth L1, a logistic loss on the order of every two versions of one content, and one on the order of
-    all images of the batch, by how far apart they should be."""
+    all images of the batch, by how far apart they should be.
+    """
     regression = functional.smooth_l1_loss(predicted, targets, beta=0.05)
     within = (targets[:, :, None] - targets[:, None, :] > _TOLERANCE).float()
     within[:, 1:, 0] = _CLEAN_FIRST

@@ -39,7 +39,8 @@ def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
     """See `Layout.open_capture`; in the order of the rows, every N-th of which is a test view of these data
-    sets."""
+    sets.
+    """
     frames = read_llff(source)
     return Capture("llff", chosen(frames, source, config.max_frames), len(frames))
 

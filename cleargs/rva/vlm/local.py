@@ -31,7 +31,8 @@ class QwenFolder(QwenEvaluator):
 
     def __init__(self, config: QwenConfig, *, device: Literal["cpu", "cuda"], cache: Path | None) -> None:
         """The folder's files are known by size and time: reading gigabytes for a digest is left to the
-        stage's key."""
+        stage's key.
+        """
         self._folder = Path(config.model_dir).expanduser().absolute()
         self._device = device
         files = sorted(path for path in self._folder.rglob("*") if path.is_file())
@@ -41,7 +42,8 @@ class QwenFolder(QwenEvaluator):
 
     def check(self) -> None:
         """Raise InputError when the extra is not installed or the folder is not that of a Qwen3-VL model.
-        Reads no weights."""
+        Reads no weights.
+        """
         try:
             import llguidance.hf  # noqa: F401
             from transformers import AutoConfig

@@ -103,7 +103,8 @@ class QwenServer(QwenEvaluator):
 
     def check(self) -> None:
         """Raise InputError when nobody answers, the server refuses the key, or it lists its models and the
-        one of the settings is not among them. A server that lists none passes."""
+        one of the settings is not among them. A server that lists none passes.
+        """
         model = self._config.model
         try:
             answer, raw = self._send("GET", "models", min(self._config.timeout_s, _MAX_CHECK_S))

@@ -47,7 +47,8 @@ def tiles_of(camera: Camera) -> int:
 
 def view_numbers(camera: Camera) -> list[float]:
     """A camera as the kernels read it: rotation rows and translation from the world to it, centre,
-    intrinsics, and gsplat's bounds of x/z and y/z in the Jacobian (left, right, top, bottom)."""
+    intrinsics, and gsplat's bounds of x/z and y/z in the Jacobian (left, right, top, bottom).
+    """
     pose = camera.world_to_camera
     beyond_x = VIEW_CLAMP * 0.5 * camera.width / camera.fx
     beyond_y = VIEW_CLAMP * 0.5 * camera.height / camera.fy

@@ -287,7 +287,8 @@ SIZE = 16
 
 def warm_up() -> None:
     """Run every kernel with the types that a training has, in the order of its steps; the backward pass with
-    and without alpha and depth."""
+    and without alpha and depth.
+    """
     scene = Gaussians(  # one that is grey, in front of the camera
         means=torch.tensor([[0.0, 0.0, 2.0]]),
         log_scales=torch.full((1, 3), -2.0),
