@@ -19,10 +19,12 @@ from cleargs.splat.camera import Camera as Camera
 from cleargs.splat.config import TrainConfig as TrainConfig
 from cleargs.splat.gaussians import Gaussians as Gaussians
 from cleargs.splat.scene import Scene as Scene
-from cleargs.splat.views import View as View
+from cleargs.splat.views import TrainingView as TrainingView
 
 # An installation has it; a checkout holds the package as stages/, where mypy does not look for it.
 from cleargs.stages.g0 import G0Config as G0Config  # type: ignore[import-not-found]
+
+View = TrainingView  # its former name
 
 __all__: list[str]
 __version__: str

@@ -14,16 +14,14 @@ from typing import TYPE_CHECKING, Any
 from cleargs.errors import InputError
 from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, usable_cores
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_run, usable_cores
 from cleargs.progress import LineReporter, Reporter, Say, log_reporter
 from cleargs.run_results import SCENE, Prepared, Run, open_prepared
+from cleargs.splat.budget import resolve_config
 from cleargs.splat.config import Quality
-from cleargs.splat.effort import decided
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
-    from numpy.typing import NDArray
 
     from cleargs import G0Config
     from cleargs.evaluate.config import EvalOptions
@@ -35,9 +33,8 @@ if TYPE_CHECKING:
     from cleargs.splat.scene import Scene
     from cleargs.splat.trainer import Trained
     from cleargs.splat.types import Render
-    from cleargs.splat.views import View
-
-    Image = NDArray[np.uint8] | NDArray[np.float32]
+    from cleargs.splat.views import TrainingView
+    from cleargs.types import AnyImage, ImageF32
 
 Progress = Reporter | Say | None
 """Where progress and remarks go: to the logger ``cleargs`` (None), to a function that takes lines, or to a
@@ -71,7 +68,7 @@ def run(
 
     dag, reporter = installed(), _reporter(progress)
     dag.until(until)
-    asked = asked_run(
+    spec = resolve_run(
         dag,
         Path(source),
         Path(folder),
@@ -85,15 +82,15 @@ def run(
         device=device,
         say=reporter.info,
     )
-    with opened_store(asked.store) as opened:
-        runner = Runner(dag, asked, opened, threads or usable_cores(), reporter)
+    with opened_store(spec.store) as opened:
+        runner = Runner(dag, spec, opened, threads or usable_cores(), reporter)
         runner.run_until(until, force=force, allow_partial=allow_partial)
-    return Run(asked.folder)
+    return Run(spec.folder)
 
 
 def initialise(
     capture: Prepared,
-    views: Sequence[View] | None = None,
+    views: Sequence[TrainingView] | None = None,
     config: G0Config | None = None,
     *,
     seed: int = 0,
@@ -109,7 +106,7 @@ def initialise(
     from cleargs.splat.scene import Scene
 
     views = capture.views() if views is None else views
-    config = decided(config or G0Config(), views)
+    config = resolve_config(config or G0Config(), views)
     points, observations = capture.points, load_observations(capture.folder)
     frame_ids = [view.frame_id for view in views]
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
@@ -126,7 +123,7 @@ def initialise(
 
 def train(
     scene: Scene,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     config: TrainConfig | None = None,
     *,
     formation: Formation | None = None,
@@ -195,13 +192,13 @@ def score_frames(
     import pyarrow as pa
 
     from cleargs.rva.allocation import appearance_scores
-    from cleargs.rva.evaluator import View
+    from cleargs.rva.evaluator import EvaluatedFrame
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import CUE_COLUMNS
 
     config: Any = check_document(installed(), {"rva": {"evaluator": evaluator}}).sections["rva"]
     with tempfile.TemporaryDirectory() as cache:
-        views = [View(number, Path(path)) for number, path in enumerate(paths)]
+        views = [EvaluatedFrame(number, Path(path)) for number, path in enumerate(paths)]
         cues = make_evaluator(config, cache=Path(cache)).evaluate(
             views, threads=threads or usable_cores(), reporter=_reporter(progress)
         )
@@ -210,7 +207,7 @@ def score_frames(
     return pa.table({"path": [str(path) for path in paths], **columns, "R": R, "B": B})
 
 
-def score(image: Image, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
+def score(image: AnyImage, *, scorer: str = "clarity-net", threads: int | None = None) -> float:
     """How good an image looks without a reference: 0 to 100, higher is better.
 
     ``scorer`` is clarity-net, naturalness-stats, an installed model (``cleargs models list``) or an ONNX
@@ -221,7 +218,7 @@ def score(image: Image, *, scorer: str = "clarity-net", threads: int | None = No
     return load_scorer(scorer).score(_floats(image), threads=threads or usable_cores())
 
 
-def restore(image: Image, *, expert: str = "embedded", threads: int | None = None) -> NDArray[np.float32]:
+def restore(image: AnyImage, *, expert: str = "embedded", threads: int | None = None) -> ImageF32:
     """A sharper image of the same size [H, W, 3] by a restoration network, float32 in [0, 1].
 
     ``expert`` is embedded, an installed model or an ONNX file. Raises InputError for another name.
@@ -239,13 +236,13 @@ def deblur(run: Run, frame_id: int, *, stage: str | None = None) -> Deblurred | 
     better than the render as it is. Raises InputError for a frame without a pose.
     """
     from cleargs.formation.frames import view_of
-    from cleargs.rivr.distillation import Snapshot
+    from cleargs.rivr.distillation import TrainedScene
 
     capture = open_prepared(run["ingest"])
     frame = next((frame for frame in capture.frames if frame.frame_id == frame_id), None)
     if frame is None or not frame.registered:
         raise InputError(f"frame {frame_id} has no pose", hint="see cleargs show RUN ingest")
-    return Snapshot(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
+    return TrainedScene(run.scene_file(stage).parent).deblur(view_of(frame, capture.folder, 1.0))
 
 
 def evaluate_scene(
@@ -296,7 +293,7 @@ def _toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, default=str)
 
 
-def _floats(image: Image) -> NDArray[np.float32]:
+def _floats(image: AnyImage) -> ImageF32:
     import numpy as np
 
     floats = image.astype(np.float32)

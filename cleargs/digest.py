@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from cleargs.errors import InputError
 from cleargs.files import External
-from cleargs.untrusted import open_regular, require_utf8
+from cleargs.safe_io import open_regular, require_utf8
 
 RACY_NS = 2_000_000_000
 """A file changed less than this long ago may change again within one tick of its time stamp: not memoised."""
@@ -112,16 +112,16 @@ class DigestMemo:
         """Drop what is known of ``path``, so that the next `digest` reads the file."""
         self._learnt[str(path.absolute())] = NOTHING
 
-    def digests_of(self, place: External, *, afresh: bool = False) -> dict[str, str]:
+    def digests_of(self, place: External, *, rehash: bool = False) -> dict[str, str]:
         """Relative path -> digest for a folder, {"": digest} for a file, name -> digest for files by name.
 
-        With ``afresh`` every file is read, whatever is known of it. Raises InputError when a file is missing
+        With ``rehash`` every file is read, whatever is known of it. Raises InputError when a file is missing
         or not regular, cannot be read, or has a name that is not UTF-8.
         """
         files = named_files(place)
         for file in files.values():
             require_utf8(file)
-            if afresh:
+            if rehash:
                 self.forget(file)
         try:
             return {name: self.digest(file) for name, file in files.items()}

@@ -10,10 +10,10 @@ from typing import Any, Literal
 from pydantic_core import to_jsonable_python
 
 import cleargs
+from cleargs.base_model import FrozenModel
 from cleargs.digest import DigestMemo, json_digest
 from cleargs.files import is_partial, write_json
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
 
 MANIFEST = "manifest.json"
 
@@ -25,7 +25,7 @@ PRECISION = "float32"
 """Precision of the parameters that the stages train and publish."""
 
 
-class KeyParts(Record):
+class KeyParts(FrozenModel):
     """What goes into the key of one stage."""
 
     stage: str
@@ -48,14 +48,14 @@ class KeyParts(Record):
         return json_digest(self.model_dump(mode="json"))
 
 
-class FileRecord(Record):
+class FileRecord(FrozenModel):
     """One published file."""
 
     size: int
     digest: str
 
 
-class Manifest(Record):
+class Manifest(FrozenModel):
     """What a finished stage folder holds and what it was made from. Names no host and no absolute path."""
 
     stage: str
@@ -159,12 +159,12 @@ def published_files(folder: Path) -> dict[str, Path]:
 
 
 def damages(
-    folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, afresh: bool = False
+    folder: Path, manifest: Manifest, names: Iterable[str], memo: DigestMemo, *, rehash: bool = False
 ) -> Iterator[str]:
     """What makes the files ``names`` in ``folder`` others than those of ``manifest``.
 
     Sizes are always read; digests come through ``memo``, and one that differs is computed again first. With
-    ``afresh`` each file is read.
+    ``rehash`` each file is read.
     """
     for name in names:
         record, file = manifest.files[name], folder / name
@@ -172,7 +172,7 @@ def damages(
             if file.stat().st_size != record.size:
                 yield f"{name} has another size"
                 continue
-            if afresh:
+            if rehash:
                 memo.forget(file)
             if memo.digest(file) != record.digest:
                 memo.forget(file)

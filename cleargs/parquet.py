@@ -54,7 +54,7 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
     A nullable column that the file of an older version lacks is null. Raises StoreError when the file is
     missing, damaged, or lacks another column.
     """
-    with damage_told(path):
+    with read_errors(path):
         table = pq.read_table(path)
         for field in schema:
             if field.nullable and field.name not in table.column_names:
@@ -64,12 +64,12 @@ def read_table(path: Path, schema: pa.Schema) -> pa.Table:
 
 def read_any_table(path: Path) -> pa.Table:
     """Read a table with whatever columns it has. Raises StoreError when it is missing or damaged."""
-    with damage_told(path):
+    with read_errors(path):
         return pq.read_table(path)
 
 
 @contextmanager
-def damage_told(path: Path) -> Iterator[None]:
+def read_errors(path: Path) -> Iterator[None]:
     """While a table is read: what cannot be read becomes a StoreError that names it."""
     try:
         yield

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from cleargs.errors import InputError, did_you_mean
 
-Socket = Literal["evaluators", "experts", "scorers", "formats", "layouts"]
+ExtensionPoint = Literal["evaluators", "experts", "scorers", "formats", "layouts"]
 
 
 def installed_version(distribution: str) -> str:
@@ -26,9 +26,9 @@ def installed_version(distribution: str) -> str:
         return "absent"
 
 
-def plugins(socket: Socket) -> dict[str, EntryPoint]:
+def plugins(point: ExtensionPoint) -> dict[str, EntryPoint]:
     """Name -> part that the installed packages bring for a socket; of two of a name, the first by package."""
-    parts = sorted(entry_points(group=f"cleargs.{socket}"), key=package_of, reverse=True)
+    parts = sorted(entry_points(group=f"cleargs.{point}"), key=package_of, reverse=True)
     return {part.name: part for part in parts}
 
 
@@ -37,11 +37,11 @@ def package_of(part: EntryPoint) -> tuple[str, str]:
     return ("unknown", "unknown") if part.dist is None else (part.dist.name, part.dist.version)
 
 
-def load_part(socket: Socket, name: str) -> Any:
+def load_part(point: ExtensionPoint, name: str) -> Any:
     """What the entry point of that name refers to. Raises InputError where there is none, or it is broken."""
-    part = plugins(socket).get(name)
+    part = plugins(point).get(name)
     if part is None:
-        raise InputError(f"no installed package brings {name!r}", hint=f"install it: cleargs.{socket}")
+        raise InputError(f"no installed package brings {name!r}", hint=f"install it: cleargs.{point}")
     try:
         return part.load()
     except Exception as error:
@@ -52,12 +52,12 @@ def load_part(socket: Socket, name: str) -> Any:
         ) from error
 
 
-def require_known(socket: Socket, name: str, shipped: Iterable[str]) -> str:
+def require_known(point: ExtensionPoint, name: str, shipped: Iterable[str]) -> str:
     """``name``, where it ships with ClearGS or a package brings it. Raises ValueError with what was meant."""
     shipped = tuple(shipped)
     if name in shipped:  # without a look at what is installed
         return name
-    names = [*shipped, *plugins(socket)]
+    names = [*shipped, *plugins(point)]
     if name in names:
         return name
     raise ValueError(did_you_mean(name, names, f"choose {', '.join(names)}"))

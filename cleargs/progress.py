@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Protocol
 
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 Say = Callable[[str], object]
 """Is told a line."""
@@ -53,7 +53,7 @@ class Rate:
         self._readings: list[tuple[float, int]] = []
         """Time and steps done: where the rate counts from, then where it will."""
 
-    def a_second(self, done: int) -> float | None:
+    def per_second(self, done: int) -> float | None:
         """To be asked whenever ``done`` grows; None at first."""
         now = time.monotonic()
         begin = self._readings[0] if self._readings else None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cleargs.capture.tables import Frame, Points
     from cleargs.splat.camera import Camera
     from cleargs.splat.scene import Scene
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 
 SCENE = "scene.ply"
@@ -125,7 +125,7 @@ class Prepared:
     """All of them, by frame_id; those without a pose too."""
     points: Points
 
-    def views(self, weights: Mapping[int, float] | None = None) -> list[View]:
+    def views(self, weights: Mapping[int, float] | None = None) -> list[TrainingView]:
         """What a training looks at: the frames with a pose, not held out, whose weight (default: 1) is
         above 0. Images are read when they are needed.
         """

@@ -16,14 +16,14 @@ def deferred_sigterm() -> Iterator[Callable[[], bool]]:
     before a time limit, so that a job can save. Nothing is held back outside the main thread, where Python
     runs no signal handlers, nor in a program that does not answer SIGTERM itself.
     """
-    asked = threading.Event()
+    requested = threading.Event()
     in_main_thread = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     if not in_main_thread or not callable(before):
-        yield asked.is_set
+        yield requested.is_set
         return
-    signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
+    signal.signal(signal.SIGTERM, lambda number, frame: requested.set())
     try:
-        yield asked.is_set
+        yield requested.is_set
     finally:
         signal.signal(signal.SIGTERM, before)

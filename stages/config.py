@@ -7,9 +7,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from cleargs.base_model import Inherited, Settings
 from cleargs.pipeline.stage import Device
 from cleargs.plugins import installed_version
-from cleargs.record import Inherited, Settings
 from cleargs.splat.config import TrainConfig, steps_from_frames
 
 G0_END, ROUNDS_END = 16 / 19, 18 / 19

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
+from cleargs.base_model import Inherited, Settings
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.record import Inherited, Settings
 
 from .config import MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, DistilConfig
 from .config import other_libraries as other_libraries
@@ -74,7 +74,7 @@ def preflight(config: ConsolidateConfig) -> None:
 
 def estimate(context: StageContext[ConsolidateConfig]) -> Estimate:
     """The training, and two looks at the frames that are held back."""
-    from cleargs.splat.effort import training_cost
+    from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace
 
@@ -92,7 +92,7 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     """Latest accepted repairs -> distillation from RIVR's scene -> the check for harm."""
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import Snapshot, publish
+    from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.rounds import pseudo_view
     from cleargs.rivr.sheets import SHEET_FRAMES, write_before_after_sheet
@@ -116,8 +116,8 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
     repairs, kept = latest_accepted(rows), kept_raw(rows)
     write_repairs(context.out / "repairs.parquet", repairs)
 
-    g0 = Snapshot(context.inputs["g0"], context.device)
-    start = Snapshot(rivr, context.device) if repairs or kept else g0
+    g0 = TrainedScene(context.inputs["g0"], context.device)
+    start = TrainedScene(rivr, context.device) if repairs or kept else g0
     consolidated, trainings = start, []
     if repairs or kept:
         pseudo = [pseudo_view(supervision.views[row.frame_id], row, rivr) for row in repairs]
@@ -136,9 +136,9 @@ def run(context: StageContext[ConsolidateConfig]) -> StageResult:
         trainings.append(consolidated.folder)
 
     verdict = judge_harm(
-        supervision.held_back,
-        g0.fidelity(supervision.judges, scorer, threads),
-        consolidated.fidelity(supervision.judges, scorer, threads),
+        supervision.holdout_ids,
+        g0.fidelity(supervision.holdout_views, scorer, threads),
+        consolidated.fidelity(supervision.holdout_views, scorer, threads),
         harm,
     )
     final, rejected = (consolidated, None) if verdict.harm is None else (start, consolidated)

@@ -11,7 +11,7 @@ from cleargs.pipeline.stage import StageContext
 
 _UNKNOWN = (60, 0.5)
 """Frames and megapixels assumed where nothing is known of the capture."""
-_POINTS_A_FRAME = 250
+_POINTS_PER_FRAME = 250
 """Sparse points assumed before ingest: captures of 16 to 150 frames gave 80 to 350."""
 _SERIAL = 0.1
 """Share of the work that more threads do not speed up (a guess)."""
@@ -35,7 +35,7 @@ def sparse_points(context: StageContext[Any]) -> int:
     if "ingest" in context.inputs:
         with suppress(StoreError):
             return len(load_points(context.inputs["ingest"]).point_id)
-    return _POINTS_A_FRAME * capture_size(context)[0]
+    return _POINTS_PER_FRAME * capture_size(context)[0]
 
 
 def pace(threads: int) -> float:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from cleargs.base_model import Unit
 from cleargs.pipeline.stage import Device, Estimate, StageContext, StageResult
 from cleargs.plugins import installed_version
-from cleargs.record import Unit
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE, TrainConfig
 
 from .config import G0_END, TRAINED
@@ -19,7 +19,7 @@ from .config import G0_END, TRAINED
 if TYPE_CHECKING:
     from cleargs.formation.exposure import Exposure
     from cleargs.splat.initialise import SparsePoints
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 
 class G0Config(TrainConfig):
@@ -89,7 +89,7 @@ def estimate(context: StageContext[G0Config]) -> Estimate:
     """Steps times a cost a pixel and a Gaussian; memory is the images, the Gaussians and the kernels'
     buffers.
     """
-    from cleargs.splat.effort import training_cost
+    from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace, sparse_points
 
@@ -109,12 +109,12 @@ def run(context: StageContext[G0Config]) -> StageResult:
     from cleargs.formation.capture import CaptureFormation
     from cleargs.formation.exposure import Exposure, write_exposure
     from cleargs.formation.frames import real_views
-    from cleargs.formation.photograph import evaluate_views, pooled_unseen
+    from cleargs.formation.observed import evaluate_views, pooled_unseen
     from cleargs.formation.table import write_formation
     from cleargs.parquet import read_table, write_table
     from cleargs.rva.tables import FRAMES as RVA_FRAMES
     from cleargs.splat.backend import set_threads
-    from cleargs.splat.effort import decided
+    from cleargs.splat.budget import resolve_config
     from cleargs.splat.initialise import SparsePoints, starting_gaussians
     from cleargs.splat.ply import write_ply
     from cleargs.splat.scene import Scene
@@ -132,7 +132,7 @@ def run(context: StageContext[G0Config]) -> StageResult:
     observations = load_observations(ingest)
     sparse = SparsePoints.seen_by(frame_ids, points.point_id, points.xyz, points.rgb, observations)
 
-    config = decided(config, views)
+    config = resolve_config(config, views)
     gaussians = starting_gaussians(
         sparse,
         views,
@@ -182,7 +182,9 @@ def run(context: StageContext[G0Config]) -> StageResult:
     )
 
 
-def _exposure(config: G0Config, views: list[View], sparse: SparsePoints) -> tuple[Exposure | None, float]:
+def _exposure(
+    config: G0Config, views: list[TrainingView], sparse: SparsePoints
+) -> tuple[Exposure | None, float]:
     """Affines to learn, or None; and the measured spread of the frames' gains."""
     from cleargs.formation.exposure import Exposure, frame_gains, gain_spread
 

@@ -64,7 +64,7 @@ LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "numpy", "scipy
 # megapixel, since each feature is compared with each; of at most so many features a megapixel.
 _FEATURES_S, _FEATURES_S_PER_MEGAPIXEL = 0.015, 0.7
 _PAIR_S, _PAIR_S_PER_SQUARE_MEGAPIXEL = 0.0025, 0.15
-_FEATURES_A_MEGAPIXEL = 7000
+_FEATURES_PER_MEGAPIXEL = 7000
 # And of one core: until COLMAP's process is there; then a megapixel of a frame, to read and undistort it, to
 # map it without and with a pose.
 _START_S = 1.0
@@ -98,17 +98,17 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
     distant = count * (2 * config.overlap + config.loop_candidates)
     pairs = count * (count - 1) / 2 if count < config.exhaustive_below else distant
     megapixels = megapixels_at(max(config.feature_size, config.max_size))
-    found_anew = capture.model is None
+    needs_poses = capture.model is None
     alone = _FRAME_S * megapixels * count
     parallel = 0.0
-    if found_anew:
+    if needs_poses:
         alone += _START_S
         parallel += count * (_FEATURES_S + _FEATURES_S_PER_MEGAPIXEL * megapixels)
-        matched = min(megapixels, config.max_features / _FEATURES_A_MEGAPIXEL)
+        matched = min(megapixels, config.max_features / _FEATURES_PER_MEGAPIXEL)
         parallel += pairs * (_PAIR_S + _PAIR_S_PER_SQUARE_MEGAPIXEL * matched**2)
         alone += (_TRIANGULATION_S if capture.posed else _MAPPING_S) * megapixels * count
     seconds = parallel * pace(context.threads) + alone
-    disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if found_anew else 0.0)
+    disk = count * 2 * 1.6e-3 * megapixels + (0.0005 * count if needs_poses else 0.0)
     return Estimate(
         minutes=seconds / 60,
         memory_gb=0.4 + 0.001 * count,
@@ -120,7 +120,7 @@ def estimate(context: StageContext[IngestConfig]) -> Estimate:
 
 def run(context: StageContext[IngestConfig]) -> StageResult:
     """Choose frames, make them upright and small, find or take their poses, undistort, publish."""
-    from cleargs.capture.choice import held_out, holdout_hash, sharpest
+    from cleargs.capture.choice import held_out, holdout_hash, select_sharp_frames
     from cleargs.capture.prepare import prepare
     from cleargs.capture.publish import publish
     from cleargs.capture.sfm import reconstruct
@@ -141,7 +141,7 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
             "highlights compressed; record in SDR where colours must be exact"
         )
     long_side = max(config.feature_size, config.max_size)
-    capture = sharpest(capture, work, long_side, reporter)
+    capture = select_sharp_frames(capture, work, long_side, reporter)
     frames = prepare(capture, work, long_side, reporter)
     scene = reconstruct(frames, capture.model, work, config, context.seed, context.threads, reporter)
     registered = {image.name for image in scene.model.images.values()}

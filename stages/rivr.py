@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from cleargs.base_model import Settings
 from cleargs.errors import StoreError
 from cleargs.pipeline.stage import Estimate, StageContext, StageResult
 from cleargs.random_streams import Stream
-from cleargs.record import Settings
 from cleargs.rivr.gates import GateConfig
 from cleargs.rivr.harm import HarmConfig
 from cleargs.splat.config import Quality, TrainConfig
@@ -22,11 +22,11 @@ from .config import G0_END, MAX_ROUNDS, REPAIR_LIBRARIES, ROUNDS_END, TRAINED, D
 from .config import other_libraries as other_libraries
 
 if TYPE_CHECKING:
-    from cleargs.rivr.distillation import Snapshot
+    from cleargs.rivr.distillation import TrainedScene
     from cleargs.rivr.rounds import Rules
     from cleargs.rivr.tables import Selection
     from cleargs.rivr.targets import Supervision
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 
 class RoundsConfig(DistilConfig):
@@ -159,7 +159,7 @@ def estimate(context: StageContext[RivrConfig]) -> Estimate:
     """Undoing motion takes about 3 s a megapixel, restoring 1 s (40 s where the expert is not the embedded
     one), making and scoring candidates 2 s (two cores). Every group leaves a scene.
     """
-    from cleargs.splat.effort import training_cost
+    from cleargs.splat.budget import training_cost
 
     from .cost import capture_size, pace
 
@@ -200,7 +200,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
     from cleargs.models.expert import load_expert
     from cleargs.models.onnx import network_device
     from cleargs.models.scorer import load_scorer
-    from cleargs.rivr.distillation import Snapshot, publish
+    from cleargs.rivr.distillation import TrainedScene, publish
     from cleargs.rivr.harm import judge_harm
     from cleargs.rivr.rounds import Rules, forget_others
     from cleargs.rivr.sheets import SHEET_FRAMES, write_candidates_sheet
@@ -229,7 +229,7 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
         margin=config.margin,
         gate=config.gate,
     )
-    g0 = Snapshot(context.inputs["g0"], context.device)
+    g0 = TrainedScene(context.inputs["g0"], context.device)
     rows, trainings, current = _repair_and_distil(context, supervision, targets, rules, g0)
     write_selection(context.out / "selection.parquet", rows)
     if 2 * (refused := refused_repairs(rows)) > len(rows):
@@ -238,9 +238,9 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
             "raw frame nor the render (candidates.png shows some); the renders stand in for them"
         )
 
-    before = g0.fidelity(supervision.judges, rules.primary, threads)
-    after = current.fidelity(supervision.judges, rules.primary, threads)
-    verdict = judge_harm(supervision.held_back, before, after, config.harm)
+    before = g0.fidelity(supervision.holdout_views, rules.primary, threads)
+    after = current.fidelity(supervision.holdout_views, rules.primary, threads)
+    verdict = judge_harm(supervision.holdout_ids, before, after, config.harm)
     if verdict.harm is not None:
         reporter.warn(f"the distilled scene is rejected, G0 stays: {verdict.harm} on the held-back frames")
     final, rejected = (current, None) if verdict.harm is None else (g0, current)
@@ -263,14 +263,14 @@ def run(context: StageContext[RivrConfig]) -> StageResult:
 def _repair_and_distil(
     context: StageContext[RivrConfig],
     supervision: Supervision,
-    targets: Sequence[View],
+    targets: Sequence[TrainingView],
     rules: Rules,
-    g0: Snapshot,
-) -> tuple[list[Selection], list[Path], Snapshot]:
+    g0: TrainedScene,
+) -> tuple[list[Selection], list[Path], TrainedScene]:
     """Every round along the trajectory, group by group: what each frame got, the folders of the trainings,
     and the last scene.
     """
-    from cleargs.rivr.distillation import superseded
+    from cleargs.rivr.distillation import drop_state
     from cleargs.rivr.rounds import pseudo_view, run_round
     from cleargs.rivr.tables import kept_raw, repaired_share
     from cleargs.rivr.targets import trajectory_groups
@@ -319,6 +319,6 @@ def _repair_and_distil(
             )
             done, steps = done + steps, 0
             if trainings:
-                superseded(trainings[-1])
+                drop_state(trainings[-1])
             trainings.append(current.folder)
     return rows, trainings, current

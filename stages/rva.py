@@ -23,7 +23,7 @@ OUTPUTS = ("frames.parquet", "bins.parquet")
 LEFTOVERS: tuple[str, ...] = ()
 LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "torch", "transformers")
 
-_SECONDS_A_MEGAPIXEL = 0.1  # on one core, decoding included
+_SECONDS_PER_MEGAPIXEL = 0.1  # on one core, decoding included
 _REPLIES_PER_MINUTE = 20  # of a vision-language model, one at a time: a guess, since the server is unknown
 
 
@@ -50,7 +50,7 @@ def estimate(context: StageContext[RvaConfig]) -> Estimate:
     config = context.config
     frames, megapixels = capture_size(context)
     if config.evaluator != "qwen3-vl":
-        seconds = _SECONDS_A_MEGAPIXEL * megapixels * frames / context.threads
+        seconds = _SECONDS_PER_MEGAPIXEL * megapixels * frames / context.threads
         return Estimate(minutes=seconds / 60, memory_gb=0.3, disk_gb=0.001)
     at_once = 1 if config.qwen.model_dir else config.qwen.concurrency
     folders = externals(config, context.source).values()
@@ -70,7 +70,7 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     from cleargs.capture.tables import load_frames, load_observations
     from cleargs.parquet import write_table
     from cleargs.rva.assessment import Observations, assess, bins_table, frames_table, poses_from, summary
-    from cleargs.rva.evaluator import View, label
+    from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
     from cleargs.rva.tables import BINS, FRAMES
 
@@ -78,9 +78,9 @@ def run(context: StageContext[RvaConfig]) -> StageResult:
     frames = [frame for frame in load_frames(ingest) if frame.split == "train"]
     observations = Observations(*load_observations(ingest))
 
-    evaluator = make_evaluator(config, seed=context.seed, device=context.device, cache=context.kept)
+    evaluator = make_evaluator(config, seed=context.seed, device=context.device, cache=context.cache)
     views = [
-        View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
+        EvaluatedFrame(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=context.threads, reporter=context.reporter)

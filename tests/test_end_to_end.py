@@ -32,7 +32,7 @@ SETTINGS = {
     "rivr.distil.steps": "20",
     "consolidate.distil.steps": "20",
 }
-KILLS_A_STAGE = 2
+KILLS_PER_STAGE = 2
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_killed_at_any_moment_it_ends_with_the_same_digests(
     _copy_before(stage, finished, run)
     seconds = json.loads((finished / stage / "manifest.json").read_text())["seconds"]
     moments = random.Random(stage)
-    for _ in range(KILLS_A_STAGE):
+    for _ in range(KILLS_PER_STAGE):
         _kill_inside(command(capture, run, "--until", stage), f"{stage}: starts", moments.uniform(0, seconds))
     finish(capture, run, "--until", stage)
     files = json.loads((run / stage / "manifest.json").read_text())["files"]

@@ -18,12 +18,12 @@ def test_the_rate_is_that_of_the_last_seconds(monkeypatch: pytest.MonkeyPatch) -
     now, done = 1000.0, 0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     rate = Rate()
-    assert rate.a_second(0) is None
-    assert rate.a_second(0) is None  # no time has passed, and nothing is divided by it
+    assert rate.per_second(0) is None
+    assert rate.per_second(0) is None  # no time has passed, and nothing is divided by it
     for seconds, speed in ((20, 10), (100, 1)):
         for _ in range(seconds):
             now, done = now + 1.0, done + speed
-            shown = rate.a_second(done)
+            shown = rate.per_second(done)
         assert shown == pytest.approx(speed)
 
 
@@ -34,7 +34,7 @@ def test_a_rate_changes_within_twice_its_seconds(monkeypatch: pytest.MonkeyPatch
     for speed in (4, 2):
         for _ in range(40):
             now, done = now + 1.0, done + speed
-            shown.append(rate.a_second(done))
+            shown.append(rate.per_second(done))
     settled = int(2 * Rate.SECONDS)
     assert shown[1:40] == [4.0] * 39
     assert shown[40 + settled :] == [2.0] * (40 - settled)
@@ -83,7 +83,7 @@ def test_a_run_of_the_library_logs(
         say("as in run.toml")
         raise InputError("stop", hint="here")
 
-    monkeypatch.setattr(api, "asked_run", asked)
+    monkeypatch.setattr(api, "resolve_run", asked)
     with pytest.raises(InputError):
         api.run(tmp_path / "photos", tmp_path / "run")
     assert caplog.messages == ["as in run.toml"]

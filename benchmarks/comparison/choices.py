@@ -7,19 +7,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.images import read_rgb_float
+from cleargs.base_model import FrozenModel
 from cleargs.capture.tables import load_frames
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.parquet import read_table
-from cleargs.record import Record
 from cleargs.rivr.tables import read_selection
 from cleargs.synth.synthetic_capture import FRAMES
+from cleargs.types import ImageF32
 
-Image = NDArray[np.float32]
-Distance = Callable[[Image, Image], float]
+Distance = Callable[[ImageF32, ImageF32], float]
 
 RAW = "observed"
 """The layer of the raw frame, which a method that keeps frames may choose too."""
@@ -28,7 +27,7 @@ _MIN_ERROR = 1e-10
 """Equal images have a PSNR of 100 dB, not an infinite one."""
 
 
-class Choice(Record):
+class ChoiceRow(FrozenModel):
     """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
 
     round: int
@@ -53,16 +52,16 @@ class Choice(Record):
         return max(self.psnr.values()) - self.psnr[self.chosen]
 
 
-class Choices(Record):
+class Choices(FrozenModel):
     """All rows of one scene."""
 
     column: str
     sample: str
     variant: str
-    rows: tuple[Choice, ...]
+    rows: tuple[ChoiceRow, ...]
 
 
-class Agreement(Record):
+class ChoiceAgreement(FrozenModel):
     """How well choices agree with the truth.
 
     Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept
@@ -81,14 +80,14 @@ class Agreement(Record):
     """Mean over the repaired rows, dB."""
 
 
-def agreement(rows: Sequence[Choice]) -> Agreement:
+def agreement(rows: Sequence[ChoiceRow]) -> ChoiceAgreement:
     """The figures of some rows."""
     repaired = [row for row in rows if row.chosen != RAW]
 
     def mean(values: Iterable[float]) -> float | None:
         return math.fsum(values) / len(repaired) if repaired else None
 
-    return Agreement(
+    return ChoiceAgreement(
         kept=len(rows) - len(repaired),
         repaired=len(repaired),
         by_psnr=mean(row.best_by_psnr for row in repaired),
@@ -98,7 +97,7 @@ def agreement(rows: Sequence[Choice]) -> Agreement:
     )
 
 
-def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choice]:
+def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[ChoiceRow]:
     """Every row of a finished RIVR against ``capture/truth/observed``; none where ``capture`` has no truth.
 
     A candidate has the exposure of its frame, so the truth is given the frame's true exposure error first:
@@ -121,7 +120,7 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
         if any(image.shape != truth.shape for image in candidates.values()):
             continue
         found.append(
-            Choice(
+            ChoiceRow(
                 round=row.round,
                 frame_id=row.frame_id,
                 chosen=row.chosen,
@@ -132,19 +131,19 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     return found
 
 
-def exposed(image: Image, stops: float) -> Image:
+def exposed(image: ImageF32, stops: float) -> ImageF32:
     """An sRGB image as a camera would give it that is off by so many stops."""
     light = linear_from_srgb(image) * np.float32(2.0**stops)
     return np.asarray(srgb_from_linear(np.clip(light, 0.0, 1.0)), np.float32)
 
 
-def _psnr(image: Image, truth: Image) -> float:
+def _psnr(image: ImageF32, truth: ImageF32) -> float:
     """PSNR of unrounded images, dB: candidates that look equal in 8 bits still differ."""
     error = float(np.square(image - truth).mean(dtype=np.float64))
     return -10.0 * math.log10(max(error, _MIN_ERROR))
 
 
-def _candidates(exr: Path, chosen: str) -> Mapping[str, Image]:
+def _candidates(exr: Path, chosen: str) -> Mapping[str, ImageF32]:
     """What could have been chosen, and the raw frame."""
     layers = read_exr(exr).layers
     names = [name for name in ("render", "restored", "fused", RAW) if name in layers]

@@ -30,7 +30,7 @@ from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from benchmarks.comparison.scenes import Made, Recipe
+    from benchmarks.comparison.scenes import Made, SceneRecipe
     from benchmarks.comparison.variants import Variant
 
 
@@ -139,7 +139,7 @@ def compare(
     """
     from benchmarks.comparison.findings import compare_scenes
     from benchmarks.comparison.pictures import comparison_sheet, plot_comparison
-    from benchmarks.comparison.scenes import Recipe, Sample, existing, make_scenes
+    from benchmarks.comparison.scenes import Sample, SceneRecipe, existing, make_scenes
     from benchmarks.comparison.tables import markdown, training_lines
     from cleargs.files import write_bytes, write_json
 
@@ -161,7 +161,9 @@ def compare(
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
     place = resolve_device(device, reporter.info)
-    recipe = Recipe(dag, workflow, (*quality, *overrides), place, threads_or_all(threads), options, steps)
+    recipe = SceneRecipe(
+        dag, workflow, (*quality, *overrides), place, threads_or_all(threads), options, steps
+    )
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             _check_names([run.resolve().name for run in runs], "runs")
@@ -206,7 +208,7 @@ def compare(
     return DONE_IN_PART if compared.failures else 0
 
 
-def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: Recipe) -> list[str]:
+def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: SceneRecipe) -> list[str]:
     """What the tables were made with, in lines."""
     from cleargs.manifest import versions
 

@@ -19,7 +19,7 @@ from cleargs.pipeline.dag import Dag
 
 
 @dataclass(frozen=True)
-class Work:
+class EqualWork:
     """What every variant of a sample gets."""
 
     steps: int
@@ -59,7 +59,7 @@ def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
     )
 
 
-def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
+def decide_work(config: Config, ingest: Path, steps: int | None) -> EqualWork:
     """The work of all variants of a capture, from the finished folder of its ingest.
 
     ``config`` is that of the comparison's recipe, ``steps`` what the user asked for. Settings that the recipe
@@ -72,7 +72,7 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> Work:
     frames = [frame for frame in load_frames(ingest) if frame.registered and frame.split == "train"]
     g0: Any = config.sections["g0"]
     pixels = sum(frame.width * frame.height for frame in frames)
-    return Work(
+    return EqualWork(
         steps=steps or steps_of(config, len(frames)).total,
         frames=len(frames),
         budget=g0.budget or budget_from_pixels(pixels, g0.max_budget, g0.quality),
@@ -105,7 +105,7 @@ def variant_config(
     recipe: str,
     overrides: Sequence[str],
     seed: int,
-    work: Work | None = None,
+    work: EqualWork | None = None,
 ) -> Config:
     """The configuration of a variant; with ``work`` equal to that of all others.
 
@@ -127,7 +127,7 @@ def variant_config(
     return check_document(dag, document)
 
 
-def _settings(plain: Config, variant: Variant, work: Work) -> list[str]:
+def _settings(plain: Config, variant: Variant, work: EqualWork) -> list[str]:
     """What equal work changes; schedules run by share of the steps."""
     own = steps_of(plain, work.frames)
     spent = split(own, variant.stage, work.steps)

@@ -20,19 +20,19 @@ from pydantic import Field, ValidationError, model_validator
 
 from benchmarks.comparison.equal_work import steps_of, variant_config
 from benchmarks.comparison.findings import Compared, compare_scenes
-from benchmarks.comparison.scenes import Recipe, Sample, make_scenes
+from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes
 from benchmarks.comparison.splat_world import scene_setting
 from benchmarks.comparison.variants import find_variants
+from cleargs.base_model import FrozenModel
 from cleargs.errors import CleargsError, ConfigError, InputError
 from cleargs.pipeline.config import load_config
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.record import Record
-from cleargs.splat.effort import training_cost
+from cleargs.safe_io import FAULTS, cause, read_text
+from cleargs.splat.budget import training_cost
 from cleargs.synth.synthetic_capture import make_capture
-from cleargs.untrusted import FAULTS, cause, read_text
 
 WORLD_SETTINGS = (
     "rva.enabled=false",
@@ -46,7 +46,7 @@ WORLD_SETTINGS = (
 Seed = Annotated[int, Field(ge=0)]
 
 
-class TestSet(Record):
+class TestSet(FrozenModel):
     """What no default may be chosen on."""
 
     __test__ = False  # no test of pytest's
@@ -57,13 +57,13 @@ class TestSet(Record):
     videos: tuple[str, ...]
 
 
-class TuningSet(Record):
+class TuningSet(FrozenModel):
     """What defaults may be chosen on."""
 
     rooms_below: int = Field(ge=1)
 
 
-class Section(Record):
+class Section(FrozenModel):
     """One comparison of the page."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*$")
@@ -86,7 +86,7 @@ class Section(Record):
     judge as it is, so none of it counts again in the page's summary."""
 
 
-class Evidence(Record):
+class Evidence(FrozenModel):
     """``evidence.toml``."""
 
     test: TestSet
@@ -111,7 +111,7 @@ class Evidence(Record):
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureEntry:
     """A capture of a section, or why it cannot be made."""
 
     name: str
@@ -121,7 +121,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SectionOutcome:
     """What became of a section."""
 
     section: Section
@@ -132,13 +132,13 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Workshop:
+class EvidenceContext:
     """Where evidence is made, and with what."""
 
     out: Path
     captures: Path | None
     """Folder of the real captures."""
-    recipe: Recipe
+    recipe: SceneRecipe
     store: Store
     reporter: Reporter
 
@@ -157,36 +157,36 @@ def read_evidence(path: Path | None = None) -> Evidence:
         raise ConfigError(f"cannot read the list of evidence: {cause(error)}", hint=hint) from error
 
 
-def make_section(section: Section, shop: Workshop) -> Outcome:
+def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
     """Make the captures of a section, all of its scenes, and judge them."""
     missing: list[str] = []
     samples: list[Sample] = []
-    for capture in _captures(section, shop):
+    for capture in _captures(section, context):
         if capture.missing:
-            shop.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
+            context.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
             missing.append(f"{capture.name}: {capture.missing}")
         samples += capture.samples
     found = Compared()
     for factor in section.factors if samples else ():
         recipe = replace(
-            shop.recipe,
-            overrides=(*shop.recipe.overrides, *_settings(section)),
+            context.recipe,
+            overrides=(*context.recipe.overrides, *_settings(section)),
             steps=section.steps * factor,
-            options=shop.recipe.options.model_copy(update={"align_colour": section.align_colour}),
+            options=context.recipe.options.model_copy(update={"align_colour": section.align_colour}),
         )
         made = make_scenes(
-            shop.out, samples, find_variants(section.variants), recipe, shop.store, shop.reporter
+            context.out, samples, find_variants(section.variants), recipe, context.store, context.reporter
         )
         try:
-            one = compare_scenes(shop.out, made, recipe, shop.store, shop.reporter)
+            one = compare_scenes(context.out, made, recipe, context.store, context.reporter)
         except InputError as error:
             missing.append(str(error))
             continue
         found.add(one if len(section.factors) == 1 else one.in_columns(f"{factor}x"))
-    return Outcome(section, found if found.cells else None, (*missing, *found.failures))
+    return SectionOutcome(section, found if found.cells else None, (*missing, *found.failures))
 
 
-def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
+def minutes(sections: Iterable[Section], context: EvidenceContext) -> list[float]:
     """Rough time of each section on two quiet cores, everything still to be made; what a section before it
     has made takes no time.
     """
@@ -197,15 +197,15 @@ def minutes(sections: Iterable[Section], shop: Workshop) -> list[float]:
         made.add(what)
         return not known
 
-    return [_seconds(section, shop, first) / 60 for section in sections]
+    return [_seconds(section, context, first) / 60 for section in sections]
 
 
-def _seconds(section: Section, shop: Workshop, first: Callable[..., bool]) -> float:
+def _seconds(section: Section, context: EvidenceContext, first: Callable[..., bool]) -> float:
     megapixels = section.size[0] * section.size[1] / 1e6
     variants = []
     for variant in find_variants(section.variants):
         with suppress(ConfigError):  # its recipe is not there: it takes no time
-            config = variant_config(shop.recipe.dag, variant, shop.recipe.workflow, section.settings, 0)
+            config = variant_config(context.recipe.dag, variant, context.recipe.workflow, section.settings, 0)
             g0: Any = config.sections["g0"]
             variants.append((variant, steps_of(config, section.frames), g0))
     seconds = 0.0
@@ -245,45 +245,52 @@ def _settings(section: Section) -> tuple[str, ...]:
     return (*(limits if section.kind == "video" else ()), *section.settings)
 
 
-def _captures(section: Section, shop: Workshop) -> Iterator[Capture]:
+def _captures(section: Section, context: EvidenceContext) -> Iterator[CaptureEntry]:
     """The captures of a section as soon as they are there."""
     if section.kind == "video":
         for name in section.captures:
             try:
-                place = _real(name, shop)
+                place = _real(name, context)
             except CleargsError as error:
-                yield Capture(name, missing=str(error))
+                yield CaptureEntry(name, missing=str(error))
             else:
-                yield Capture(name, tuple(Sample(place, seed, None) for seed in section.seeds))
+                yield CaptureEntry(name, tuple(Sample(place, seed, None) for seed in section.seeds))
         return
     for world in section.captures if section.kind == "world" else (None,):
         for protocol in section.protocols:
             label = protocol if world is None else f"{world}, {protocol}"
             try:
-                scene = None if world is None else _world(world, shop)
-                places = [_synthetic(section, protocol, seed, world, scene, shop) for seed in section.seeds]
+                scene = None if world is None else _world(world, context)
+                places = [
+                    _synthetic(section, protocol, seed, world, scene, context) for seed in section.seeds
+                ]
             except CleargsError as error:
-                yield Capture(label, missing=str(error))
+                yield CaptureEntry(label, missing=str(error))
             else:
                 pairs = zip(places, section.seeds, strict=True)
-                yield Capture(label, tuple(Sample(place, seed, None) for place, seed in pairs))
+                yield CaptureEntry(label, tuple(Sample(place, seed, None) for place, seed in pairs))
 
 
-def _real(name: str, shop: Workshop) -> Path:
-    if shop.captures is None:
+def _real(name: str, context: EvidenceContext) -> Path:
+    if context.captures is None:
         raise InputError("it is a real capture, and --captures was not given", hint="give --captures DIR")
-    if not (shop.captures / name).exists():
+    if not (context.captures / name).exists():
         raise InputError(f"the folder of --captures holds no {name}", hint="put it there")
-    return shop.captures / name
+    return context.captures / name
 
 
 def _synthetic(
-    section: Section, protocol: str, seed: int, world: str | None, scene: Path | None, shop: Workshop
+    section: Section,
+    protocol: str,
+    seed: int,
+    world: str | None,
+    scene: Path | None,
+    context: EvidenceContext,
 ) -> Path:
     """The folder of a synthetic capture, made where it is not there yet."""
     width, height = section.size
     parts = [protocol, *([] if world is None else [world]), f"{section.frames}x{width}x{height}", str(seed)]
-    place = shop.out / "captures" / "-".join(parts)
+    place = context.out / "captures" / "-".join(parts)
     if not place.is_dir():
         beside = place.with_name(
             f".{os.getpid()}-{place.name}"
@@ -296,19 +303,19 @@ def _synthetic(
             width=width,
             height=height,
             seed=seed,
-            reporter=shop.reporter,
+            reporter=context.reporter,
             setting=None if scene is None else scene_setting(scene, None, section.frames, width, height),
         )
         beside.rename(place)
     return place
 
 
-def _world(name: str, shop: Workshop) -> Path:
+def _world(name: str, context: EvidenceContext) -> Path:
     """The scene of a real capture, trained on every frame where it is not there yet."""
-    recipe, folder = shop.recipe, shop.out / "worlds" / name
+    recipe, folder = context.recipe, context.out / "worlds" / name
     config = load_config(recipe.dag, recipe.workflow, WORLD_SETTINGS)
-    run = Run(folder, _real(name, shop).absolute(), config, shop.store.root, recipe.device)
-    Runner(recipe.dag, run, shop.store, recipe.threads, shop.reporter).run_until("g0")
+    run = RunSpec(folder, _real(name, context).absolute(), config, context.store.root, recipe.device)
+    Runner(recipe.dag, run, context.store, recipe.threads, context.reporter).run_until("g0")
     return folder / "g0" / "scene.ply"
 
 

@@ -16,7 +16,7 @@ from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from benchmarks.comparison.evidence import Outcome, Workshop
+    from benchmarks.comparison.evidence import EvidenceContext, SectionOutcome
 
 RECIPE = "default"
 
@@ -71,11 +71,17 @@ def evidence(
     resumes where it stopped. What cannot be made (a missing capture, say) is named on the page with
     the reason.
     """
-    from benchmarks.comparison.evidence import Workshop, chosen_sections, make_section, minutes, read_evidence
-    from benchmarks.comparison.kept_sections import keep_section, kept_sections
+    from benchmarks.comparison.evidence import (
+        EvidenceContext,
+        chosen_sections,
+        make_section,
+        minutes,
+        read_evidence,
+    )
     from benchmarks.comparison.origin import version_of_source
     from benchmarks.comparison.results_page import Origin, results_page
-    from benchmarks.comparison.scenes import Recipe
+    from benchmarks.comparison.saved_sections import read_sections, save_section
+    from benchmarks.comparison.scenes import SceneRecipe
     from cleargs.files import write_bytes
 
     lists = read_evidence(listed)
@@ -85,14 +91,16 @@ def evidence(
     beside = page.parent / "results"
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
-    recipe = Recipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options)
+    recipe = SceneRecipe(
+        dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options
+    )
     command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
     origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
     version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"
     whole = True
     with opened_store(out / STORE_FOLDER) as store:
-        shop = Workshop(out, captures.absolute() if captures else None, recipe, store, reporter)
-        plan = list(zip(chosen, minutes(chosen, shop), strict=True))
+        context = EvidenceContext(out, captures.absolute() if captures else None, recipe, store, reporter)
+        plan = list(zip(chosen, minutes(chosen, context), strict=True))
         for section, cost in plan:
             click.echo(f"{section.name:12} {cost:6.1f} min  {section.title}")
         click.echo(f"{'in all':12} {sum(cost for _, cost in plan):6.1f} min  on two quiet cores")
@@ -100,11 +108,11 @@ def evidence(
             return 0
         for section, _ in plan:
             started = time.monotonic()
-            found = make_section(section, shop)
+            found = make_section(section, context)
             reporter.info(f"section {section.name}: {(time.monotonic() - started) / 60:.1f} min")
-            _write_pictures(found, shop, beside)
-            keep_section(beside, found, version, machine)
-            kept = kept_sections(beside, origin.sections, reporter)
+            _write_pictures(found, context, beside)
+            save_section(beside, found, version, machine)
+            kept = read_sections(beside, origin.sections, reporter)
             write_bytes(page, results_page(kept, origin).encode())
             whole = whole and not found.missing
     click.echo(f"written: {page}")
@@ -122,7 +130,7 @@ def _command(*, quick: bool, captures: bool, listed: bool) -> str:
     return " ".join(word for word in words if word)
 
 
-def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
+def _write_pictures(found: SectionOutcome, context: EvidenceContext, folder: Path) -> None:
     from benchmarks.comparison.pictures import comparison_sheet, plot_comparison
     from benchmarks.comparison.variants import WHOLE
 
@@ -133,4 +141,4 @@ def _write_pictures(found: Outcome, shop: Workshop, folder: Path) -> None:
     plot_comparison(folder / f"{found.section.name}.png", cells, labels)
     shown = [name for name in (cells.variants()[0], "rva", WHOLE) if name in labels]
     captures = {scene.sample.name: scene.sample.capture for scene in found.compared.scenes}
-    comparison_sheet(folder / f"{found.section.name}-sheet.jpg", shop.out, cells, labels, shown, captures)
+    comparison_sheet(folder / f"{found.section.name}-sheet.jpg", context.out, cells, labels, shown, captures)

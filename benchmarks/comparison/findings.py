@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells
-from benchmarks.comparison.choices import Choice, Choices, judge_choices
+from benchmarks.comparison.choices import ChoiceRow, Choices, judge_choices
 from benchmarks.comparison.roles import Roles, count_roles
-from benchmarks.comparison.scenes import EVALUATION_VERSION, Made, Recipe, judge
+from benchmarks.comparison.scenes import EVALUATION_VERSION, Made, SceneRecipe, judge
 from benchmarks.comparison.tables import Results
 from cleargs.digest import json_digest
 from cleargs.errors import CleargsError, InputError
@@ -21,7 +21,7 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.files import write_bytes
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 T = TypeVar("T", Cell, Roles, Choices)
 
@@ -77,7 +77,7 @@ class Compared:
 
 
 def compare_scenes(
-    out: Path, made: Iterable[Made | str], recipe: Recipe, store: Store, reporter: Reporter
+    out: Path, made: Iterable[Made | str], recipe: SceneRecipe, store: Store, reporter: Reporter
 ) -> Compared:
     """Judge every scene; a line in place of one says why it could not be made.
 
@@ -133,11 +133,11 @@ def choices_of(out: Path, made: Made, store: Store) -> Choices | None:
     }
     path = out / "choices" / f"{json_digest(parts)}.json"
     try:
-        rows = TypeAdapter(tuple[Choice, ...]).validate_json(read_bytes(path))
+        rows = TypeAdapter(tuple[ChoiceRow, ...]).validate_json(read_bytes(path))
     except (OSError, ValidationError):  # not made yet, or damaged
         rows = tuple(judge_choices(made.run, made.sample.capture, distances.get("lpips_alex")))
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, TypeAdapter(tuple[Choice, ...]).dump_json(rows))
+        write_bytes(path, TypeAdapter(tuple[ChoiceRow, ...]).dump_json(rows))
     if not rows:
         return None
     return Choices(column=made.sample.column, sample=made.sample.name, variant=made.variant.name, rows=rows)

@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader
-from numpy.typing import NDArray
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
 from benchmarks.comparison.findings import Compared
@@ -37,7 +35,7 @@ from cleargs.evaluate.references import ReferenceView, reference_of, stem_of
 from cleargs.files import whole_folder
 from cleargs.media.image import read_rgb
 from cleargs.progress import SilentReporter
-from cleargs.report.frames import Picture, side_of, write_jpeg
+from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import page_environment, write_page
 from cleargs.report.report_json import page_of
 
@@ -50,20 +48,18 @@ BYTES = 20_000_000
 
 REFERENCE, FILMED = "reference", "filmed"
 _FOLDER = "poses"
-_SAID = ("psnr", "lpips_vgg", "lpips_alex")
-
-Image = NDArray[np.uint8]
+_SHOWN_METRICS = ("psnr", "lpips_vgg", "lpips_alex")
 
 
 @dataclass(frozen=True)
-class Pose:
+class PageView:
     """One place from which a capture's scenes are shown."""
 
     number: int
     views: ViewSet
     name: str
     size: tuple[int, int]
-    pictures: Mapping[str, Picture]
+    pictures: Mapping[str, ImageFile]
     """Layer -> picture: `REFERENCE`, `FILMED` where a frame was filmed there, then the variants' renders."""
     notes: Mapping[str, str]
     """Layer of a render -> its figures in short."""
@@ -72,13 +68,13 @@ class Pose:
 
 
 @dataclass
-class Capture:
+class CaptureResults:
     """One column of the tables: what its scenes are worth on each set of views, and what they look like."""
 
     name: str
     tables: list[tuple[ViewSet, str, str, Table]] = field(default_factory=list)
     """Set of views, its title, what to know of it, values by variant and metric."""
-    poses: list[Pose] = field(default_factory=list)
+    poses: list[PageView] = field(default_factory=list)
 
 
 def write_comparison(
@@ -163,7 +159,7 @@ class _Shot:
     """Layer, cell and figures of every variant."""
 
 
-def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, str]) -> list[Capture]:
+def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, str]) -> list[CaptureResults]:
     cells, labels = compared.results.cells, compared.labels
     columns = list(dict.fromkeys(cell.column for cell in cells.cells))
     sets = len({(cell.column, cell.views) for cell in cells.cells})
@@ -173,7 +169,7 @@ def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, 
     (folder / _FOLDER).mkdir()
     captures, numbers = [], 0
     for column, found in shots.items():
-        capture = Capture(column)
+        capture = CaptureResults(column)
         for views in cells.view_sets():
             if column in cells.columns(views):
                 values = _values(cells, labels, views, column)
@@ -233,7 +229,9 @@ def _evenly(views: Sequence[ReferenceView], wanted: int) -> list[ReferenceView]:
     return [views[(2 * place + 1) * len(views) // (2 * wanted)] for place in range(wanted)]
 
 
-def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]) -> Pose:
+def _pose(
+    shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]
+) -> PageView:
     """Write the pictures of a pose."""
     reference = shot.view.load()[0]
     height, width = reference.shape[:2]
@@ -252,7 +250,7 @@ def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, label
         for metric, value in image.values.items():
             if value is not None:
                 figures.setdefault(metric, []).append((labels[cell.variant], number(value, metric)))
-    return Pose(
+    return PageView(
         place,
         shot.views,
         shot.view.name,
@@ -268,8 +266,8 @@ def _pose(shot: _Shot, place: int, pictures: int, out: Path, folder: Path, label
 
 def _note(values: Mapping[str, float | None]) -> str:
     """PSNR and one LPIPS, as far as they were measured."""
-    said = [metric for metric in _SAID if values.get(metric) is not None][:2]
-    texts = {metric: number(values[metric] or 0.0, metric) for metric in said}
+    shown = [metric for metric in _SHOWN_METRICS if values.get(metric) is not None][:2]
+    texts = {metric: number(values[metric] or 0.0, metric) for metric in shown}
     return " · ".join(
         f"{text} dB" if metric == "psnr" else f"{NAMES[metric]} {text}" for metric, text in texts.items()
     )
@@ -281,7 +279,7 @@ def _layer_names(layers: Mapping[str, str], labels: Mapping[str, str]) -> dict[s
 
 
 def _data(
-    captures: Sequence[Capture], layers: Mapping[str, str], labels: Mapping[str, str], subject: str
+    captures: Sequence[CaptureResults], layers: Mapping[str, str], labels: Mapping[str, str], subject: str
 ) -> dict[str, Any]:
     """What the script of the page knows."""
     return {

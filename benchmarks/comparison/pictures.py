@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
 from benchmarks.comparison.tables import TITLES, metric_title
@@ -17,6 +16,7 @@ from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import atomic_path
 from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.image import write_rgb
+from cleargs.types import ImageF32
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -123,7 +123,7 @@ def comparison_sheet(
             if (cell.views, cell.sample) == (views, first.sample) and cell.variant in variants
         }
         capture = captures[first.sample]
-        name = _telling(out, first, capture)
+        name = _typical_frame(out, first, capture)
         tiles = [
             Tile(_find(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
             Tile(_find(capture / "images", name), "input"),
@@ -134,7 +134,7 @@ def comparison_sheet(
     write_rgb(path, contact_sheet(rows, tile_width=320))
 
 
-def _telling(out: Path, cell: Cell, capture: Path) -> str:
+def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     """The frame to show: a bad one, but not the worst. At the upper quartile of the input's error against the
     truth; where there is no such pair, at the lower quartile of the scene's PSNR.
     """
@@ -151,7 +151,7 @@ def _telling(out: Path, cell: Cell, capture: Path) -> str:
     return ordered[3 * len(ordered) // 4]
 
 
-def _find(folder: Path, stem: str) -> NDArray[np.float32] | None:
+def _find(folder: Path, stem: str) -> ImageF32 | None:
     """The image of that stem as sRGB in [0, 1]; None without one."""
     found = [path for path in image_files(folder) if path.stem == stem] if folder.is_dir() else []
     return read_rgb_float(max(found)) if found else None

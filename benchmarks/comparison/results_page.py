@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.comparison.cells import Cells, ViewSet
 from benchmarks.comparison.evidence import Section
 from benchmarks.comparison.gaps import VERDICTS, Gap, compared_with, is_behind, losses_table
-from benchmarks.comparison.kept_sections import KeptSection
+from benchmarks.comparison.saved_sections import SavedSection
 from benchmarks.comparison.tables import (
     COMPARED,
     NAMES,
@@ -44,14 +44,14 @@ class Origin:
     """All that its list has."""
 
 
-def made(origin: Origin, found: Sequence[KeptSection]) -> str:
+def made(origin: Origin, found: Sequence[SavedSection]) -> str:
     """The line under a table: the command that makes these sections, and the versions that made them."""
     names = [] if len(found) == len(origin.sections) else [kept.section.name for kept in found]
     command = " ".join((origin.command, *(f"--section {name}" for name in names)))
     return f"`{command}`, version {_all(kept.version for kept in found)}"
 
 
-def results_page(found: Sequence[KeptSection], origin: Origin) -> str:
+def results_page(found: Sequence[SavedSection], origin: Origin) -> str:
     """The whole page as Markdown; pictures are expected in ``results/`` beside it, by the sections' names."""
     template = Path(__file__).with_name("results.md").read_text(encoding="utf-8")
     nets = {metric for kept in found for metric in kept.results.cells.metrics()}
@@ -76,7 +76,7 @@ def results_page(found: Sequence[KeptSection], origin: Origin) -> str:
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], template).rstrip() + "\n"
 
 
-def gaps(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
+def gaps(kept: Sequence[SavedSection]) -> list[tuple[str, Gap]]:
     """Sections, and the whole method against every other variant in each of their cells."""
     once = _Once()
     return [
@@ -88,18 +88,18 @@ def gaps(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
     ]
 
 
-def _as_they_are(kept: Sequence[KeptSection]) -> list[KeptSection]:
+def _as_they_are(kept: Sequence[SavedSection]) -> list[SavedSection]:
     """The sections whose images were judged as they are: they hold all scenes."""
     return [one for one in kept if not one.section.align_colour]
 
 
-def losses(kept: Sequence[KeptSection]) -> list[tuple[str, Gap]]:
+def losses(kept: Sequence[SavedSection]) -> list[tuple[str, Gap]]:
     """Those in which the whole method is behind, the sure ones first."""
     found = [(section, gap) for section, gap in gaps(kept) if is_behind(gap.difference, gap.metric)]
     return sorted(found, key=lambda item: VERDICTS.index(item[1].verdict))
 
 
-def losses_found(kept: Sequence[KeptSection]) -> str:
+def losses_found(kept: Sequence[SavedSection]) -> str:
     """The losses, and of how many comparisons they are."""
     found, labels = losses(kept), _labels()
     compared = len(gaps(kept))
@@ -113,7 +113,7 @@ def losses_found(kept: Sequence[KeptSection]) -> str:
     return f"{line}\n\n{rows.markdown()}" if found else line
 
 
-def answers_table(kept: Sequence[KeptSection]) -> str:
+def answers_table(kept: Sequence[SavedSection]) -> str:
     """For each question and metric, in how many columns the answer is better, worse or none."""
     rows, once = [], _Once()
     for question, variant, against in QUESTIONS:
@@ -197,7 +197,7 @@ def _variant_rows() -> list[str]:
     return rows
 
 
-def _section(kept: KeptSection, origin: Origin) -> str:
+def _section(kept: SavedSection, origin: Origin) -> str:
     """Tables and pictures of a section, and what of it is missing."""
     section, line = kept.section, made(origin, [kept])
     parts = [f"## {section.title}", _setting(section)]

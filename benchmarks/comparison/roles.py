@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+from cleargs.base_model import FrozenModel
 from cleargs.parquet import read_table
-from cleargs.record import Record
 from cleargs.rva.allocation import Role, Rule
 from cleargs.rva.tables import FRAMES
 
@@ -16,7 +16,7 @@ KINDS = (Role.STRONG, Role.GEOMETRIC, Role.AUXILIARY, FOR_COVERAGE, FOR_SHARE, R
 """What a frame can be; reactivated ones by the rule that woke them."""
 
 
-class Roles(Record):
+class Roles(FrozenModel):
     """The training frames of one scene by role."""
 
     column: str

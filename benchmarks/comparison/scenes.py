@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from benchmarks.comparison.cells import Cell, ViewSet
-from benchmarks.comparison.equal_work import Work, decide_work, variant_config
+from benchmarks.comparison.equal_work import EqualWork, decide_work, variant_config
 from benchmarks.comparison.variants import Variant
 from cleargs.digest import json_digest
 from cleargs.errors import CleargsError, InputError
@@ -24,15 +24,15 @@ from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation
 from cleargs.files import write_bytes
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.parquet import damage_told
+from cleargs.parquet import read_errors
 from cleargs.pipeline.config import Config, load_config, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import RUN_FILE, Device, Run, read_run_file
+from cleargs.pipeline.run_file import RUN_FILE, Device, RunSpec, read_run_file
 from cleargs.pipeline.runner import Runner
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.safe_io import read_bytes, read_json
 from cleargs.splat.ply import read_ply
-from cleargs.untrusted import read_bytes, read_json
 
 EVALUATION_VERSION = 3
 """Raised when an evaluation of equal inputs would give other figures."""
@@ -68,7 +68,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SceneRecipe:
     """What all runs of a comparison have in common."""
 
     dag: Dag
@@ -89,7 +89,7 @@ class Recipe:
 
 
 @dataclass
-class Ledger:
+class ChargedStages:
     """Which stages of a sample are made and paid for."""
 
     keys: set[str] = field(default_factory=set)
@@ -123,7 +123,7 @@ def make_scenes(
     out: Path,
     samples: Sequence[Sample],
     variants: Sequence[Variant],
-    recipe: Recipe,
+    recipe: SceneRecipe,
     store: Store,
     reporter: Reporter,
 ) -> Iterator[Made | str]:
@@ -135,7 +135,7 @@ def make_scenes(
     for sample in samples:
         _require_reference(sample, load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed))
     for sample in samples:
-        ledger, work = Ledger(), None
+        charged, work = ChargedStages(), None
         for variant in variants:
             reporter.info(f"{sample.name}, {variant.label}")
             try:
@@ -154,7 +154,7 @@ def make_scenes(
                 lacking = ", ".join((*manifests[-1].inherited, *manifests[-1].missing))
                 yield f"{sample.name}, {variant.label}: {lacking}"
                 continue
-            made = Made(sample, variant, runner.run.folder, *ledger.charge(manifests), manifests)
+            made = Made(sample, variant, runner.run.folder, *charged.charge(manifests), manifests)
             if (trained := trained_steps(made)) != work.steps:
                 reporter.warn(
                     f"{sample.name}, {variant.label}: {trained} of {work.steps} steps, since no repair was "
@@ -168,25 +168,25 @@ def _runner(
     sample: Sample,
     variant: Variant,
     config: Config,
-    recipe: Recipe,
+    recipe: SceneRecipe,
     store: Store,
     reporter: Reporter,
 ) -> Runner:
     folder = out / sample.name / variant.name
-    run = Run(folder, sample.capture.absolute(), config, store.root, recipe.device)
+    run = RunSpec(folder, sample.capture.absolute(), config, store.root, recipe.device)
     return Runner(recipe.dag, run, store, recipe.threads, reporter)
 
 
 def _work_of(
-    out: Path, sample: Sample, variant: Variant, recipe: Recipe, store: Store, reporter: Reporter
-) -> Work:
+    out: Path, sample: Sample, variant: Variant, recipe: SceneRecipe, store: Store, reporter: Reporter
+) -> EqualWork:
     """What all variants of a sample get, from its ingest, which is made in the run of the first of them."""
     config = load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed)
     runner = _runner(out, sample, variant, config, recipe, store, reporter)
     return decide_work(config, runner.run_until("ingest")[-1].folder, recipe.steps)
 
 
-def judge(out: Path, made: Made, recipe: Recipe, store: Store, reporter: Reporter) -> list[Cell]:
+def judge(out: Path, made: Made, recipe: SceneRecipe, store: Store, reporter: Reporter) -> list[Cell]:
     """The cells of one scene, one a set of views. Raises InputError when there is nothing to compare with."""
     cells = []
     gaussians = read_ply(made.scene).gaussians
@@ -270,7 +270,7 @@ def _without_reference(sample: Sample) -> InputError:
 
 
 def evaluated(
-    out: Path, made: Made, view_set: Views, recipe: Recipe, store: Store, reporter: Reporter
+    out: Path, made: Made, view_set: Views, recipe: SceneRecipe, store: Store, reporter: Reporter
 ) -> tuple[Evaluation, Path]:
     """The evaluation of a scene on a set of views, and the folder that keeps it with the renders.
 
@@ -336,15 +336,15 @@ def trained_steps(made: Made) -> int:
     logs = [made.run / manifest.stage / "train.parquet" for manifest in made.manifests]
     steps = 0
     for log in filter(Path.is_file, logs):
-        with damage_told(log):
+        with read_errors(log):
             steps += parquet.read_metadata(log).num_rows
     return steps
 
 
 def _all_noted(combine: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
     """The combined values; None where one is missing."""
-    noted = [value for value in values if value is not None]
-    return combine(noted) if noted and len(noted) == len(values) else None
+    known = [value for value in values if value is not None]
+    return combine(known) if known and len(known) == len(values) else None
 
 
 def _matrices(folder: Path) -> list[Any]:

@@ -20,8 +20,9 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
-from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter
-from cleargs.synth.path import Setting
+from cleargs.synth.optics import PINHOLE, Aperture, Lens, Shutter
+from cleargs.synth.path import SceneSetup
+from cleargs.types import ArrayF64
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a depth."""
@@ -41,12 +42,12 @@ class SplatWorld:
         self._scene = scene
         self._engine = rasteriser_for()
 
-    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
         """The mean over the samples. Off the optical axis the principal point moves with the lens, so that
         what is in focus stays where it is.
         """
         points = np.broadcast_to(aperture.points, (shutter.samples, 2))
-        shares: defaultdict[tuple[int, float, float], Array] = defaultdict(lambda: np.zeros(lens.height))
+        shares: defaultdict[tuple[int, float, float], ArrayF64] = defaultdict(lambda: np.zeros(lens.height))
         for row_poses, (right, down) in zip(shutter.index, points, strict=True):
             for number in np.unique(row_poses):
                 shares[int(number), float(right), float(down)] += (row_poses == number) / shutter.samples
@@ -64,7 +65,7 @@ class SplatWorld:
             total[rows] += share[rows, None, None] * linear_from_srgb(picture[rows])
         return total
 
-    def depth(self, pose: Array, lens: Lens) -> Array:
+    def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
         """The expected depth of the render; 0 where it is mostly transparent.
 
         Raises InputError where all of it is transparent.
@@ -80,7 +81,7 @@ class SplatWorld:
         mean = rendered.depth.numpy() / np.maximum(alpha, OPAQUE)
         return np.where(alpha >= OPAQUE, mean, 0.0)
 
-    def _rendered(self, pose: Array, lens: Lens, *, depth: bool = False) -> Render:
+    def _rendered(self, pose: ArrayF64, lens: Lens, *, depth: bool = False) -> Render:
         scene, camera = self._scene, _camera(pose, lens)
         return self._engine.forward(
             scene.gaussians, camera, background=scene.background, antialias=scene.antialias, depth=depth
@@ -98,19 +99,19 @@ class CameraCourse:
     spacing: float
     """Median distance of neighbouring cameras of the course, world units."""
 
-    def poses(self, shares: Array) -> Array:
+    def poses(self, shares: ArrayF64) -> ArrayF64:
         raw = np.asarray(self.spline(shares * self.steps), np.float64).reshape(-1, 3, 4)
         u, _, vt = np.linalg.svd(raw[:, :, :3])
         return np.concatenate([u @ vt, raw[:, :, 3:]], 2)
 
-    def novel(self, share: float, rng: np.random.Generator) -> Array:
+    def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
         """Off by up to one and a half spacings in each of the camera's axes."""
-        pose: Array = self.poses(np.array([share]))[0]
+        pose: ArrayF64 = self.poses(np.array([share]))[0]
         pose[:, 3] += pose[:, :3] @ rng.uniform(-1.5, 1.5, 3) * self.spacing
         return pose
 
 
-def camera_course(cameras: Sequence[Array], frames: int) -> CameraCourse:
+def camera_course(cameras: Sequence[ArrayF64], frames: int) -> CameraCourse:
     """The course along ``frames`` consecutive ``cameras`` [3, 4] whose longest step is the shortest.
 
     So that neighbours overlap as in the real capture, and the walk never crosses a gap that another stretch
@@ -138,7 +139,7 @@ def camera_course(cameras: Sequence[Array], frames: int) -> CameraCourse:
     return CameraCourse(spline, float(frames - 1), spacing)
 
 
-def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> Setting:
+def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> SceneSetup:
     """The scene in ``path``, in its own units, and a walk along ``frames`` of its real cameras.
 
     The cameras are those that ``cameras`` names (`_read_cameras`), else those of the run that ``path`` lies
@@ -158,7 +159,7 @@ def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, hei
     real = _read_cameras(run if cameras is None else cameras)
     course = camera_course([pose for _, pose in real], frames)
     name = path.stem if cameras is not None else run.name
-    return Setting(name, world, course, _fitted(real[0][0], width, height))
+    return SceneSetup(name, world, course, _fitted(real[0][0], width, height))
 
 
 def _fitted(lens: Lens, width: int, height: int) -> Lens:
@@ -169,7 +170,7 @@ def _fitted(lens: Lens, width: int, height: int) -> Lens:
     return Lens(width, height, lens.fx * scale, lens.fy * scale, cx, cy)
 
 
-def _read_cameras(source: Path) -> list[tuple[Lens, Array]]:
+def _read_cameras(source: Path) -> list[tuple[Lens, ArrayF64]]:
     """Lens and pose [3, 4] in frame order: of a run, of a transforms.json, or of the folder that holds one.
 
     Raises InputError when there are none.
@@ -209,7 +210,7 @@ def _read_scene(path: Path) -> Scene:
     return scene
 
 
-def _camera(pose: Array, lens: Lens) -> Camera:
+def _camera(pose: ArrayF64, lens: Lens) -> Camera:
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = pose[:, :3].T
     world_to_camera[:3, 3] = -pose[:, :3].T @ pose[:, 3]

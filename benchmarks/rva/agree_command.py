@@ -30,7 +30,7 @@ from cleargs.pipeline.session import DeviceChoice, resolve_device
 from cleargs.progress import Reporter
 
 if TYPE_CHECKING:
-    from benchmarks.rva.agreement import Agreement, EvaluatorCues
+    from benchmarks.rva.agreement import EvaluatorCues, RankAgreement
     from cleargs.capture.tables import Frame
 
 FOLDER = "agree"
@@ -176,19 +176,19 @@ def _cues_of(
 ) -> EvaluatorCues:
     """Score the frames, or take what RUN/agree keeps of an earlier call."""
     from benchmarks.rva.agreement import EvaluatorCues
-    from cleargs.rva.evaluator import View, label
+    from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
 
     evaluator = make_evaluator(config, seed=seed, device=device, cache=run / FOLDER / "scores")
     views = [
-        View(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
+        EvaluatedFrame(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
     cues = evaluator.evaluate(views, threads=threads_or_all(threads), reporter=reporter)
     return EvaluatorCues(label(evaluator), cues)
 
 
-def _write_sheet(path: Path, agreement: Agreement, frames: Sequence[Frame], ingest: Path) -> Path:
+def _write_sheet(path: Path, agreement: RankAgreement, frames: Sequence[Frame], ingest: Path) -> Path:
     """The frames of the widest gaps, each with what both say of it."""
     from benchmarks.images import read_rgb_float
     from cleargs.media.contact_sheet import Tile, contact_sheet

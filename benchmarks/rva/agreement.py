@@ -10,9 +10,9 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 from cleargs.rva.allocation import appearance_scores, is_reliable
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import AssessmentConfig
 from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.types import ArrayF64
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class EvaluatorCues:
 
     evaluator: str
     """Its label in the tables."""
-    cues: Floats  # [n, 11], NaN where it could not score a frame
+    cues: ArrayF64  # [n, 11], NaN where it could not score a frame
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Disagreement:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class RankAgreement:
     """Two evaluators side by side, over the frames that both scored."""
 
     evaluators: tuple[str, str]
@@ -71,7 +71,9 @@ class Agreement:
         }
 
 
-def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int) -> Agreement:
+def compare(
+    first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int
+) -> RankAgreement:
     """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
 
     Frames that one of them could not score are left out.
@@ -85,7 +87,7 @@ def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfi
     a, b = sides
     columns = ("R", "B", "R-B", *CUE_COLUMNS)
     in_a, in_b = (is_reliable(side[:, 0], side[:, 1], config) for side in sides)
-    return Agreement(
+    return RankAgreement(
         evaluators=(first.evaluator, second.evaluator),
         frames=len(rows),
         spearman={name: spearman(a[:, k], b[:, k]) for k, name in enumerate(columns)},
@@ -99,7 +101,7 @@ def compare(first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfi
     )
 
 
-def spearman(x: Floats, y: Floats) -> float | None:  # [n] each
+def spearman(x: ArrayF64, y: ArrayF64) -> float | None:  # [n] each
     """Rank correlation with mean ranks for ties, in [-1, 1]; None where it is not defined."""
     if len(x) < 2 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
@@ -109,8 +111,8 @@ def spearman(x: Floats, y: Floats) -> float | None:  # [n] each
 
 def _disagreements(
     rows: npt.NDArray[np.intp],  # [m] rows of the capture
-    a: Floats,  # [m, 3+] R, B, R - B
-    b: Floats,  # [m, 3+]
+    a: ArrayF64,  # [m, 3+] R, B, R - B
+    b: ArrayF64,  # [m, 3+]
     most: int,
 ) -> tuple[Disagreement, ...]:
     means = [rankdata(-side[:, 2]) for side in (a, b)]

@@ -66,9 +66,9 @@ def _check(run: Path, dag: Dag) -> Check:
 
     from benchmarks.rva.truth import Faults, check
     from cleargs.parquet import read_table
-    from cleargs.rva.arrays import Floats
     from cleargs.rva.tables import B_CUES, FRAMES
     from cleargs.synth.synthetic_capture import FRAMES as TRUE_FRAMES
+    from cleargs.types import ArrayF64
 
     source = read_run_file(run, dag).source
     if linked_manifest(run, "rva") is None:
@@ -90,7 +90,7 @@ def _check(run: Path, dag: Dag) -> Check:
     scored = np.flatnonzero(~np.isnan(np.asarray(judged["R"].to_numpy(), dtype=np.float64)))
     order = np.array([row[names[k]] for k in scored], dtype=np.intp)
 
-    def column(name: str) -> Floats:
+    def column(name: str) -> ArrayF64:
         return np.asarray(judged[name].to_numpy(), dtype=np.float64)[scored]
 
     return check(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.rva.agreement import spearman
-from cleargs.rva.arrays import Bools, Floats
+from cleargs.types import ArrayBool, ArrayF64
 
 MIN_BLUR_PX = 1.0
 """px: a shorter motion is no fault, and all such frames are equal."""
@@ -21,9 +21,9 @@ MIN_DEFOCUS_PX = 0.1
 class Faults:
     """What is wrong with n frames: the columns of ``truth/frames.parquet`` of the same names."""
 
-    blur_px: Floats
-    defocus_px: Floats
-    exposure_ev: Floats
+    blur_px: ArrayF64
+    defocus_px: ArrayF64
+    exposure_ev: ArrayF64
 
     def noticeable(self) -> Faults:
         """The same with 0 for what is too small to be a fault, and exposure errors without sign."""
@@ -53,10 +53,10 @@ class Check:
 
 
 def check(
-    R: Floats,  # [n]
-    B: Floats,  # [n]
-    cues: dict[str, Floats],  # b_motion_blur, b_defocus, b_exposure_failure -> [n]
-    reliable: Bools,  # [n]
+    R: ArrayF64,  # [n]
+    B: ArrayF64,  # [n]
+    cues: dict[str, ArrayF64],  # b_motion_blur, b_defocus, b_exposure_failure -> [n]
+    reliable: ArrayBool,  # [n]
     faults: Faults,
 ) -> Check:
     """Spearman's rank correlations (average ranks for ties) of scores and cues with the true faults."""

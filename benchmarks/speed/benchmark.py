@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed import torch_tiles
-from benchmarks.speed.benchmark_plan import Case, Plan
+from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
 from benchmarks.speed.benchmark_results import (
     Benchmark,
     Rasterisers,
+    ResultRow,
     Rooflines,
-    Row,
     ScalingPoint,
     TorchTimes,
     describe_machine,
@@ -58,7 +58,7 @@ def run(plan: Plan, reporter: Reporter) -> Benchmark:
     return Benchmark(describe_machine(load), plan.threads, rows, roofs, scaling)
 
 
-def measure(case: Case, plan: Plan) -> Row:
+def measure(case: BenchmarkCase, plan: Plan) -> ResultRow:
     """Times, memory and errors of one case; the pure-torch rasteriser's too where the plan compares it."""
     use_threads(max(plan.threads))
     iteration = _iteration(case)
@@ -68,7 +68,7 @@ def measure(case: Case, plan: Plan) -> Row:
         {str(count): partial(iteration.run_on, count, plan.repetitions) for count in plan.threads},
         plan.rounds,
     )
-    return Row(
+    return ResultRow(
         case=case,
         pairs=size.pairs,
         contributions=size.contributions,
@@ -138,7 +138,7 @@ class TorchRasteriser:
         return image.detach(), Gaussians(*gradients)
 
 
-def measure_roofline(case: Case, plan: Plan) -> Rooflines:
+def measure_roofline(case: BenchmarkCase, plan: Plan) -> Rooflines:
     """The machine's peaks, and every kernel's share of what they allow."""
     iteration = _iteration(case)
     size = size_of(projected_frame(iteration.gaussians, iteration.camera))
@@ -152,7 +152,7 @@ def measure_roofline(case: Case, plan: Plan) -> Rooflines:
     return Rooflines(case, size, peaks, kernels)
 
 
-def measure_scaling(series: dict[str, Sequence[Case]], plan: Plan) -> dict[str, list[ScalingPoint]]:
+def measure_scaling(series: dict[str, Sequence[BenchmarkCase]], plan: Plan) -> dict[str, list[ScalingPoint]]:
     """Forward and backward pass of every case, all in turn, on the most threads; and their memory."""
     iterations = {case: _iteration(case) for cases in series.values() for case in cases}
     threads = max(plan.threads)
@@ -172,7 +172,7 @@ def measure_scaling(series: dict[str, Sequence[Case]], plan: Plan) -> dict[str, 
     return {name: [points[case] for case in cases] for name, cases in series.items()}
 
 
-def _iteration(case: Case) -> Iteration:
+def _iteration(case: BenchmarkCase) -> Iteration:
     return Iteration(*random_scene(case.gaussians, case.width, case.height, sigma=case.sigma))
 
 

@@ -9,7 +9,7 @@ MEDIAN_SIGMA = 1.8
 """Median standard deviation of the projected splats, px: about five tiles per splat with its tails."""
 
 
-class Case(NamedTuple):
+class BenchmarkCase(NamedTuple):
     """A random scene in a view."""
 
     gaussians: int
@@ -27,20 +27,20 @@ class Case(NamedTuple):
 class Plan:
     """A benchmark. Cases are timed on every number of threads in turn."""
 
-    cases: tuple[Case, ...]
+    cases: tuple[BenchmarkCase, ...]
     threads: tuple[int, ...]
     rounds: int = 7
     repetitions: int = 3  # iterations a round
     torch_rounds: int = 3  # of the comparison with torch, one iteration a round
-    torch_largest: Case | None = None  # up to this many splats and pixels pure torch runs
-    roofline: Case | None = None
-    more_splats: tuple[Case, ...] = ()  # scaling: the number of splats grows
-    larger_splats: tuple[Case, ...] = ()  # scaling: each splat grows
+    torch_largest: BenchmarkCase | None = None  # up to this many splats and pixels pure torch runs
+    roofline: BenchmarkCase | None = None
+    more_splats: tuple[BenchmarkCase, ...] = ()  # scaling: the number of splats grows
+    larger_splats: tuple[BenchmarkCase, ...] = ()  # scaling: each splat grows
     memory: bool = True
     peak_repeats: int = 50
     seed: int = 0
 
-    def compares_torch(self, case: Case) -> bool:
+    def compares_torch(self, case: BenchmarkCase) -> bool:
         """Whether the pure-torch rasteriser runs on this case too."""
         largest = self.torch_largest
         return (
@@ -54,7 +54,7 @@ class Plan:
 class DevicePlan:
     """A benchmark of a GPU."""
 
-    cases: tuple[Case, ...]
+    cases: tuple[BenchmarkCase, ...]
     rounds: int = 7
     repetitions: int = 10  # iterations a round
     seed: int = 0
@@ -64,12 +64,14 @@ def device_plan() -> DevicePlan:
     """100,000 to 3,000,000 splats, 1280x720 and 1920x1080."""
     counts = (100_000, 500_000, 1_000_000, 3_000_000)
     sizes = ((1280, 720), (1920, 1080))
-    return DevicePlan(tuple(Case(count, *size) for size in sizes for count in counts))
+    return DevicePlan(tuple(BenchmarkCase(count, *size) for size in sizes for count in counts))
 
 
 def quick_device_plan() -> DevicePlan:
     """Two small cases: to try the command, not to quote."""
-    return DevicePlan((Case(4_000, 160, 90), Case(20_000, 320, 180)), rounds=3, repetitions=3)
+    return DevicePlan(
+        (BenchmarkCase(4_000, 160, 90), BenchmarkCase(20_000, 320, 180)), rounds=3, repetitions=3
+    )
 
 
 def full_plan(threads: tuple[int, ...]) -> Plan:
@@ -77,28 +79,30 @@ def full_plan(threads: tuple[int, ...]) -> Plan:
     counts = (10_000, 50_000, 200_000, 400_000)
     sizes = ((320, 180), (640, 360), (960, 540), (1280, 720))
     return Plan(
-        cases=tuple(Case(count, *size) for size in sizes for count in counts),
+        cases=tuple(BenchmarkCase(count, *size) for size in sizes for count in counts),
         threads=threads,
-        torch_largest=Case(50_000, 960, 540),
-        roofline=Case(50_000, 960, 540),
+        torch_largest=BenchmarkCase(50_000, 960, 540),
+        roofline=BenchmarkCase(50_000, 960, 540),
         more_splats=tuple(
-            Case(count, 640, 360) for count in (10_000, 20_000, 50_000, 100_000, 200_000, 400_000)
+            BenchmarkCase(count, 640, 360) for count in (10_000, 20_000, 50_000, 100_000, 200_000, 400_000)
         ),
-        larger_splats=tuple(Case(50_000, 640, 360, MEDIAN_SIGMA * factor) for factor in (0.5, 1, 2, 4, 8)),
+        larger_splats=tuple(
+            BenchmarkCase(50_000, 640, 360, MEDIAN_SIGMA * factor) for factor in (0.5, 1, 2, 4, 8)
+        ),
     )
 
 
 def quick_plan(threads: tuple[int, ...]) -> Plan:
     """The same kinds of rows at sizes that take seconds: to try the command, not to quote."""
     return Plan(
-        cases=(Case(1_000, 160, 90), Case(4_000, 160, 90), Case(4_000, 320, 180)),
+        cases=(BenchmarkCase(1_000, 160, 90), BenchmarkCase(4_000, 160, 90), BenchmarkCase(4_000, 320, 180)),
         threads=threads,
         rounds=3,
         repetitions=2,
         torch_rounds=2,
-        torch_largest=Case(4_000, 160, 90),
-        roofline=Case(4_000, 320, 180),
-        more_splats=tuple(Case(count, 160, 90) for count in (1_000, 2_000, 4_000)),
-        larger_splats=tuple(Case(1_000, 160, 90, MEDIAN_SIGMA * factor) for factor in (1, 2, 4)),
+        torch_largest=BenchmarkCase(4_000, 160, 90),
+        roofline=BenchmarkCase(4_000, 320, 180),
+        more_splats=tuple(BenchmarkCase(count, 160, 90) for count in (1_000, 2_000, 4_000)),
+        larger_splats=tuple(BenchmarkCase(1_000, 160, 90, MEDIAN_SIGMA * factor) for factor in (1, 2, 4)),
         peak_repeats=5,
     )

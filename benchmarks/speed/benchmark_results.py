@@ -9,7 +9,7 @@ from importlib.metadata import version
 from typing import Any
 
 import cleargs
-from benchmarks.speed.benchmark_plan import Case
+from benchmarks.speed.benchmark_plan import BenchmarkCase
 from benchmarks.speed.oracle import Accuracy
 from benchmarks.speed.peaks import Peaks
 from benchmarks.speed.roofline import Roof
@@ -50,10 +50,10 @@ class Rasterisers:
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """One case."""
 
-    case: Case
+    case: BenchmarkCase
     pairs: int
     contributions: int
     times: dict[int, Times]  # by the number of threads
@@ -66,7 +66,7 @@ class Row:
 class ScalingPoint:
     """Forward and backward pass on all threads, and peak memory, at one number of pairs."""
 
-    case: Case
+    case: BenchmarkCase
     pairs: int
     milliseconds: Quartiles
     memory: int | None
@@ -76,7 +76,7 @@ class ScalingPoint:
 class Rooflines:
     """The kernels of one case under the machine's roof, by the number of threads."""
 
-    case: Case
+    case: BenchmarkCase
     size: Size
     peaks: dict[int, Peaks]
     kernels: dict[int, list[Roof]]
@@ -88,19 +88,21 @@ class Benchmark:
 
     machine: Machine
     threads: tuple[int, ...]
-    rows: list[Row]
+    rows: list[ResultRow]
     roofline: Rooflines | None
     scaling: dict[str, list[ScalingPoint]]  # series -> points
 
     def as_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists; a Case or a Size becomes an object with named fields."""
+        """Plain dictionaries and lists; a BenchmarkCase or a Size becomes an object with named fields."""
         plain: dict[str, Any] = asdict(self, dict_factory=named)
         return plain
 
 
 def named(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The fields of a dataclass; a Case or a Size becomes an object with named fields too."""
-    return {name: value._asdict() if isinstance(value, Case | Size) else value for name, value in items}
+    """The fields of a dataclass; a BenchmarkCase or a Size becomes an object with named fields too."""
+    return {
+        name: value._asdict() if isinstance(value, BenchmarkCase | Size) else value for name, value in items
+    }
 
 
 def describe_machine(load_before: float) -> Machine:

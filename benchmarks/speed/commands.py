@@ -78,7 +78,7 @@ def splat(
         write_json(out / "splat.json", values)
         plot_speed_error(out / "speed-error.png", benchmark)
         plot_scaling(out / "scaling.png", benchmark)
-    _tell(text, values, out and out / "splat.md", as_json)
+    _answer(text, values, out and out / "splat.md", as_json)
 
 
 def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, quiet: bool) -> None:
@@ -103,7 +103,7 @@ def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, qu
         if out is not None:  # after every case, since time on a GPU may end
             write_bytes(out / "splat-cuda.md", device_markdown(benchmark).encode())
             write_json(out / "splat-cuda.json", benchmark.as_json())
-    _tell(device_markdown(benchmark), benchmark.as_json(), out and out / "splat-cuda.md", as_json)
+    _answer(device_markdown(benchmark), benchmark.as_json(), out and out / "splat-cuda.md", as_json)
 
 
 @click.command(
@@ -135,11 +135,11 @@ def train(
 ) -> None:
     """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error."""
     from benchmarks.speed.benchmark import measure
-    from benchmarks.speed.benchmark_plan import Case, Plan
+    from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
     from benchmarks.speed.iteration import PARTS, WHOLE
 
     count = threads_or_all(threads)
-    case = Case(gaussians, width, height)
+    case = BenchmarkCase(gaussians, width, height)
     plan = Plan(cases=(case,), threads=(count,), rounds=repeats, repetitions=5)
     found = measure(case, plan)
     row: dict[str, float | None] = {part: found.times[count][part].median for part in (*PARTS, WHOLE)}
@@ -184,7 +184,7 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
         write_bytes(out / "formation.md", text.encode())
         write_json(out / "formation.json", values)
         plot_formation(out / "formation.png", benchmark)
-    _tell(text, values, out and out / "formation.md", as_json)
+    _answer(text, values, out and out / "formation.md", as_json)
 
 
 @click.command(
@@ -249,10 +249,10 @@ def quality(
     write_bytes(out / "quality.md", text.encode())
     write_json(out / "quality.json", values)
     plot_quality(out / "quality.png", benchmark)
-    _tell(text, values, out / "quality.md", as_json)
+    _answer(text, values, out / "quality.md", as_json)
 
 
-def _tell(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
+def _answer(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
     """The figures on stdout, or where they were written."""
     if as_json:
         print_json(values)

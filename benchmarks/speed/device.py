@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import cleargs
-from benchmarks.speed.benchmark_plan import Case, DevicePlan
+from benchmarks.speed.benchmark_plan import BenchmarkCase, DevicePlan
 from benchmarks.speed.benchmark_results import Times, named
 from benchmarks.speed.gsplat_cuda import GsplatRasteriser, load_gsplat
 from benchmarks.speed.iteration import Iteration
@@ -41,7 +41,7 @@ class Side:
 class DeviceRow:
     """One case."""
 
-    case: Case
+    case: BenchmarkCase
     pairs: int
     reached: int  # pairs before every pixel of their tile has stopped
     ours: Side
@@ -69,13 +69,13 @@ class DeviceIteration(Iteration):
 
     def differentiate(self, image: Tensor) -> Tensor:
         """See `Iteration`; the loss itself stays on the device."""
-        self._meter.add(len(self._meter), image, self._target, gradient=self._slope)
+        self._losses.add(len(self._losses), image, self._target, gradient=self._slope)
         return self._slope
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
         """Several iterations, then the losses are read."""
         super().run_several(repetitions, clock)
-        self._meter.take()
+        self._losses.take()
 
 
 def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[DeviceBenchmark]:
@@ -95,7 +95,7 @@ def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[
             yield DeviceBenchmark(device_name(device), versions(), missing, list(rows))
 
 
-def measure(case: Case, plan: DevicePlan, device: torch.device, gsplat: Any | None) -> DeviceRow:
+def measure(case: BenchmarkCase, plan: DevicePlan, device: torch.device, gsplat: Any | None) -> DeviceRow:
     """Times, memory and errors of one case; ``gsplat`` takes turns where it is given."""
     gaussians, camera = random_scene(case.gaussians, case.width, case.height, sigma=case.sigma)
     truth = oracle(gaussians, camera, choose_pixels(camera, case.gaussians, plan.seed), plan.seed)
@@ -143,18 +143,18 @@ def peak_memory(device: torch.device, make: Callable[[], DeviceIteration | Gspla
     return torch.cuda.max_memory_allocated(device) - before
 
 
-class _OpenRasteriser(CudaRasteriser):
+class _CountingRasteriser(CudaRasteriser):
     """The GPU rasteriser with a view of how much work a picture was."""
 
     @property
     def work(self) -> tuple[int, int]:
-        assert self._frame is not None
-        return len(self._frame.pair_ids), int(self._frame.deepest.sum())
+        assert self._state is not None
+        return len(self._state.pair_ids), int(self._state.deepest.sum())
 
 
 def count_pairs(gaussians: Gaussians, camera: Camera, device: torch.device) -> tuple[int, int]:
     """(tile, splat) pairs of a view, and those before every pixel of their tile has stopped."""
-    rasteriser = _OpenRasteriser(device)
+    rasteriser = _CountingRasteriser(device)
     rasteriser.forward(gaussians, camera)
     return rasteriser.work
 

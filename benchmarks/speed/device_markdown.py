@@ -33,7 +33,7 @@ def device_markdown(benchmark: DeviceBenchmark) -> str:
             "that of parameters, gradients and what autograd keeps, without moments.",
             table(
                 ["splats", "ours", "gsplat forward", "gsplat backward", "gsplat / ours", "gsplat memory, MB"],
-                [_beside(row) for row in benchmark.rows],
+                [_comparison_row(row) for row in benchmark.rows],
             ),
         ]
     parts += [
@@ -62,7 +62,7 @@ def _iteration(row: DeviceRow) -> list[str]:
     ]
 
 
-def _beside(row: DeviceRow) -> list[str]:
+def _comparison_row(row: DeviceRow) -> list[str]:
     if row.gsplat is None or row.ratio is None:
         return [row.case.title, *[NOT_RUN] * 5]
     passes = sum(row.ours.times[part].median for part in ("forward", "backward"))

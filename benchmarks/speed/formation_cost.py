@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.benchmark_results import Machine, describe_machine
@@ -24,7 +23,7 @@ from benchmarks.speed.random_scenes import surface_scene
 from benchmarks.speed.timing import Quartiles, ratio, take_turns
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
-from cleargs.formation.photograph import FormedView
+from cleargs.formation.observed import FormedView
 from cleargs.formation.warp import (
     displacement_fields,
     linear_curve,
@@ -37,6 +36,7 @@ from cleargs.splat.backend import psnr, rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.rasteriser import Rasteriser
+from cleargs.types import PlaneF32
 
 PLAIN, FORMED = "sharp render", "formation"
 """A step that takes the frame for sharp, and one through `cleargs.formation`."""
@@ -166,10 +166,10 @@ def _median_depth(gaussians: Gaussians, camera: Camera) -> float:
     return float(np.median(_depth(rasteriser_for(), gaussians, camera)))
 
 
-def _depth(engine: Rasteriser, gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
+def _depth(engine: Rasteriser, gaussians: Gaussians, camera: Camera) -> PlaneF32:
     rendered = engine.forward(gaussians, camera, depth=True)
     assert rendered.depth is not None
-    depth: NDArray[np.float32] = rendered.depth.numpy() / np.maximum(rendered.alpha.numpy(), 1e-3)
+    depth: PlaneF32 = rendered.depth.numpy() / np.maximum(rendered.alpha.numpy(), 1e-3)
     return depth
 
 

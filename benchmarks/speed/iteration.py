@@ -8,10 +8,10 @@ from torch import Tensor
 from benchmarks.speed.probe import timed_kernels
 from benchmarks.speed.random_scenes import random_image
 from benchmarks.speed.timing import Clock
-from cleargs.splat.backend import Meter, rasteriser_for, set_threads, step_gaussians
+from cleargs.splat.backend import LossAccumulator, rasteriser_for, set_threads, step_gaussians
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser, Frame
+from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass, CpuRasteriser
 from cleargs.splat.types import Moments
 
 PARTS = ("forward", "loss", "backward", "adam")
@@ -38,7 +38,7 @@ class Iteration:
         self.engine = rasteriser_for(device)
         self._target = random_image(camera.width, camera.height).to(device)
         self._slope = torch.empty_like(self._target)
-        self._meter = Meter(device, SSIM_LAMBDA)
+        self._losses = LossAccumulator(device, SSIM_LAMBDA)
         self._moments = Moments.zeros(self.gaussians)
         self._rates: dict[str, float | Tensor] = dict.fromkeys(self.gaussians.tensors(), 0.0)
         self._step = 0
@@ -66,8 +66,8 @@ class Iteration:
 
     def differentiate(self, image: Tensor) -> Tensor:
         """The gradient of the loss by the image [H, W, 3]."""
-        self._meter.add(0, image, self._target, gradient=self._slope)
-        self._meter.take()
+        self._losses.add(0, image, self._target, gradient=self._slope)
+        self._losses.take()
         return self._slope
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
@@ -90,17 +90,17 @@ class Iteration:
         return image.cpu(), gradients.to("cpu")
 
 
-class _OpenRasteriser(CpuRasteriser):
+class _InspectableRasteriser(CpuRasteriser):
     """The CPU rasteriser with a view of what lies between its passes."""
 
     @property
-    def frame(self) -> Frame:
-        frame: Frame = self._frame
+    def frame(self) -> CpuForwardPass:
+        frame: CpuForwardPass = self._state
         return frame
 
 
-def projected_frame(gaussians: Gaussians, camera: Camera) -> Frame:
+def projected_frame(gaussians: Gaussians, camera: Camera) -> CpuForwardPass:
     """Packed splats, (tile, splat) pairs and each pixel's last contributor of a view (SH degree 3)."""
-    rasteriser = _OpenRasteriser()
+    rasteriser = _InspectableRasteriser()
     rasteriser.forward(gaussians, camera)
     return rasteriser.frame

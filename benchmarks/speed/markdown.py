@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from benchmarks.speed.benchmark_results import Benchmark, Machine, Rooflines, Row, ScalingPoint
+from benchmarks.speed.benchmark_results import Benchmark, Machine, ResultRow, Rooflines, ScalingPoint
 from benchmarks.speed.iteration import PARTS, WHOLE
 from benchmarks.speed.oracle import MARGIN, Accuracy, Error
 from benchmarks.speed.scaling import straight_line
@@ -61,7 +61,7 @@ def machine_line(machine: Machine) -> str:
     )
 
 
-def _iterations(rows: list[Row]) -> list[str]:
+def _iterations(rows: list[ResultRow]) -> list[str]:
     lines = [
         [
             row.case.title,
@@ -85,7 +85,7 @@ def _iterations(rows: list[Row]) -> list[str]:
     ]
 
 
-def _errors(rows: list[Row]) -> list[str]:
+def _errors(rows: list[ResultRow]) -> list[str]:
     lines = [[row.case.title, *accuracy_cells(row.accuracy)] for row in rows]
     left_out = max(row.accuracy.left_out_max for row in rows)
     seeds = ", ".join(sorted({str(row.accuracy.seed) for row in rows}))
@@ -111,7 +111,7 @@ def accuracy_cells(found: Accuracy) -> list[str]:
     ]
 
 
-def _rasterisers(rows: list[Row]) -> list[str]:
+def _rasterisers(rows: list[ResultRow]) -> list[str]:
     lines = []
     for row in rows:
         for threads in row.times:

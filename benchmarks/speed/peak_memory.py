@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from cleargs.children import module_command
+from cleargs.subprocesses import module_command
 
 STATUS = Path("/proc/self/status")
 RESET = Path("/proc/self/clear_refs")

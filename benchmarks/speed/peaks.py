@@ -9,8 +9,9 @@ import numpy as np
 from numba import prange
 
 from benchmarks.speed.iteration import use_threads
-from cleargs.splat.kernels.cpu.jit import Floats, kernel
+from cleargs.splat.kernels.cpu.jit import kernel
 from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, store
+from cleargs.types import ArrayF32
 
 CHAINS = 12
 """Independent multiply-adds in flight: two pipes times the latency of four or five cycles, and some more."""
@@ -33,7 +34,7 @@ class Peaks:
 
 
 @kernel
-def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float32, values: Floats) -> None:
+def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float32, values: ArrayF32) -> None:
     """CHAINS independent chains x = x m + c of LANES lanes on every worker."""
     for worker in prange(workers):
         start = worker * CHAINS * LANES
@@ -80,7 +81,7 @@ def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float3
 
 
 @kernel
-def copy(source: Floats, target: Floats) -> None:
+def copy(source: ArrayF32, target: ArrayF32) -> None:
     """``target`` [n] = ``source`` [n]."""
     n = source.shape[0]
     for block in prange(BLOCKS):

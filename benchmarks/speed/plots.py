@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.speed.benchmark_results import Benchmark, Row
+from benchmarks.speed.benchmark_results import Benchmark, ResultRow
 from benchmarks.speed.iteration import WHOLE
 from benchmarks.speed.scaling import straight_line
 from cleargs.files import atomic_path
@@ -59,7 +59,7 @@ def plot_speed_error(path: Path, benchmark: Benchmark) -> None:
     save(figure, path)
 
 
-def _rasterisers(panel: Axes, rows: list[Row], threads: int) -> None:
+def _rasterisers(panel: Axes, rows: list[ResultRow], threads: int) -> None:
     """A colour for each case, a marker for each rasteriser."""
     compared = [(row, row.rasterisers) for row in rows if row.rasterisers is not None]
     markers: dict[str, str] = {}

@@ -8,7 +8,7 @@ from typing import Literal
 
 from benchmarks.speed.peaks import Peaks
 from benchmarks.speed.timing import Quartiles
-from benchmarks.speed.work import Work
+from benchmarks.speed.work import KernelWork
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Roof:
     fraction: float  # least time / time; above 1 where caches serve bytes faster than memory would
 
 
-def roof(kernel: str, work: Work, milliseconds: float, peaks: Peaks) -> Roof:
+def roof(kernel: str, work: KernelWork, milliseconds: float, peaks: Peaks) -> Roof:
     """The roof of one kernel."""
     by_operations = work.operations / (peaks.gflops * 1e6)
     by_bytes = work.bytes / (peaks.gbytes * 1e6)
@@ -37,6 +37,6 @@ def roof(kernel: str, work: Work, milliseconds: float, peaks: Peaks) -> Roof:
     )
 
 
-def roofline(work: Mapping[str, Work], times: Mapping[str, Quartiles], peaks: Peaks) -> list[Roof]:
+def roofline(work: Mapping[str, KernelWork], times: Mapping[str, Quartiles], peaks: Peaks) -> list[Roof]:
     """Every kernel by the median of its times."""
     return [roof(name, work[name], times[name].median, peaks) for name in work]

@@ -24,7 +24,7 @@ GROUP = 1 << 19
 """(pixel, splat) products of a group of tiles, about: two megabytes a tensor. Of 2^15 to 2^21 the fastest."""
 
 
-class Group(NamedTuple):
+class TileGroup(NamedTuple):
     """Tiles that are rasterised together, their lists padded to one length K."""
 
     tiles: Tensor  # [B] row * tiles across + column
@@ -70,7 +70,7 @@ def _touches(splats: Splats, ids: Tensor, tiles: Tensor, across: int, width: int
     return ((alpha >= constants.ALPHA_CUT) & inside).any(1)
 
 
-def groups(counts: Tensor, ids: Tensor, padding: int) -> list[Group]:
+def groups(counts: Tensor, ids: Tensor, padding: int) -> list[TileGroup]:
     """Stack the tiles that have splats, those with lists of similar length together; ``padding`` is M."""
     offsets = counts.cumsum(0) - counts
     order = torch.argsort(counts, stable=True)
@@ -87,12 +87,12 @@ def groups(counts: Tensor, ids: Tensor, padding: int) -> list[Group]:
         place = torch.arange(longest)
         inside = place < counts[tiles, None]
         rows = ids[(offsets[tiles, None] + place).clamp_max(len(ids) - 1)]
-        stacked.append(Group(tiles, torch.where(inside, rows, padding)))
+        stacked.append(TileGroup(tiles, torch.where(inside, rows, padding)))
         start += len(tiles)
     return stacked
 
 
-def rasterise(splats: Splats, stacked: list[Group], width: int, height: int) -> Tensor:
+def rasterise(splats: Splats, stacked: list[TileGroup], width: int, height: int) -> Tensor:
     """The image [H, W, 3] over black, differentiable in means, conics, colours and opacities."""
     across, down = -(-width // TILE), -(-height // TILE)
     columns = torch.cat([splats.means, splats.conics, splats.opacities[:, None], splats.colours], 1)
@@ -126,7 +126,7 @@ def evaluate(centres: Tensor, means: Tensor, conics: Tensor, opacities: Tensor) 
     return alpha
 
 
-def _blend(group: Group, rows: Tensor, across: int) -> Tensor:
+def _blend(group: TileGroup, rows: Tensor, across: int) -> Tensor:
     """Colours [B, 256, 3] of stacked tiles from their splats' rows [B, K, 9]."""
     means, conics, opacities, colours = torch.split(rows, [2, 3, 1, 3], dim=-1)
     centres = pixel_centres(group.tiles, across, rows.dtype)

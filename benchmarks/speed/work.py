@@ -16,8 +16,8 @@ from numba import prange
 
 from benchmarks.speed.probe import KERNELS
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import Array, Floats, kernel
-from cleargs.splat.kernels.cpu.pipeline import Frame
+from cleargs.splat.kernels.cpu.jit import kernel
+from cleargs.splat.kernels.cpu.pipeline import CpuForwardPass
 from cleargs.splat.kernels.cpu.rasterise import PIECES
 from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.kernels.splat_layout import (
@@ -29,6 +29,7 @@ from cleargs.splat.kernels.splat_layout import (
     SKEW,
     TILE,
 )
+from cleargs.types import AnyArray, ArrayF32
 
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 PIXEL_CENTRE = np.float32(constants.PIXEL_CENTRE)
@@ -54,14 +55,14 @@ class Size(NamedTuple):
     pixels: int
 
 
-class Work(NamedTuple):
+class KernelWork(NamedTuple):
     """Operations and bytes."""
 
     operations: float
     bytes: float
 
 
-def size_of(frame: Frame) -> Size:
+def size_of(frame: CpuForwardPass) -> Size:
     """The size of a view, its contributions counted one by one."""
     camera = frame.camera
     counts = np.zeros((len(frame.tile_offsets) - 1, 2), np.int64)
@@ -77,11 +78,11 @@ def size_of(frame: Frame) -> Size:
 def count_contributions(
     width: int,
     height: int,
-    tile_offsets: Array,
-    pair_ids: Array,
-    splats: Floats,
-    last: Floats,
-    counts: Array,
+    tile_offsets: AnyArray,
+    pair_ids: AnyArray,
+    splats: ArrayF32,
+    last: ArrayF32,
+    counts: AnyArray,
 ) -> None:
     """Contributions and vectors of every tile, [T, 2]: those up to each pixel's last contributor."""
     tiles_x = (width + TILE - 1) // TILE
@@ -103,39 +104,39 @@ def count_contributions(
                     counts[tile, 1] += hits > 0
 
 
-def work_of(size: Size) -> dict[str, Work]:
+def work_of(size: Size) -> dict[str, KernelWork]:
     """Work of every kernel of a training iteration (SH degree 3, no depth), in the order of KERNELS."""
     n, pairs, hits, _, pixels = size
     values = 3 * pixels
     work = {
         # Mostly float64: position 18, quaternion 13, axes 45, Jacobian 24, covariance 63, ellipse 30,
         # direction 12, harmonics 70, colour 96.
-        "projection.project": Work(371 * n, n * (PARAMETERS + SPLAT + 8 + 4)),
-        "binning.pair_ranges": Work(0, n * 16),
+        "projection.project": KernelWork(371 * n, n * (PARAMETERS + SPLAT + 8 + 4)),
+        "binning.pair_ranges": KernelWork(0, n * 16),
         # Counts and depths once (a cache line each), then three passes over keys and numbers.
-        "binning.depth_order": Work(0, n * (8 + SPLAT + 8 + 3 * 16)),
-        "binning.list_pairs": Work(0, n * (SPLAT + 8) + pairs * 4),
+        "binning.depth_order": KernelWork(0, n * (8 + SPLAT + 8 + 3 * 16)),
+        "binning.list_pairs": KernelWork(0, n * (SPLAT + 8) + pairs * 4),
         # Counted, then placed: tiles read twice, Gaussian and slot written.
-        "binning.sort_pairs_by_tile": Work(0, 2 * n * 12 + pairs * 16),
+        "binning.sort_pairs_by_tile": KernelWork(0, 2 * n * 12 + pairs * 16),
         # A pair: its geometry in the tile. A contribution: exponent 4, exp2 15, weight and T 3, cut-offs and
         # the last contributor 9, three colours 6.
-        "rasterise.forward": Work(SET_UP * pairs + 37 * hits, pairs * (4 + SPLAT) + pixels * 20),
+        "rasterise.forward": KernelWork(SET_UP * pairs + 37 * hits, pairs * (4 + SPLAT) + pixels * 20),
         # Planes are padded copies of both images and of the mask.
-        "loss.pad_images": Work(0, values * 20),
+        "loss.pad_images": KernelWork(0, values * 20),
         # Eleven taps each way, 10 operations down and 10 across, then SSIM and its derivatives.
-        "loss.measure": Work(257 * values, values * 24),
+        "loss.measure": KernelWork(257 * values, values * 24),
         # Eleven taps of three maps each way, then the sum.
-        "loss.differentiate": Work(144 * values, values * 28),
+        "loss.differentiate": KernelWork(144 * values, values * 28),
         # A pair: as forward, which pieces it reaches, nine sums over the lanes. A contribution: alpha again
         # 24, T back 2, gain, S and v 12, nine sums 17.
-        "rasterise.backward": Work(
+        "rasterise.backward": KernelWork(
             (SET_UP + PIECES + 9 * (LANES - 1)) * pairs + 55 * hits,
             pairs * (4 + 4 + SPLAT + PAIR_SUMS) + pixels * 20,
         ),
         # Projection once more, then its chain rule, mostly in float64; nine additions a pair.
-        "gradients.backpropagate": Work(
+        "gradients.backpropagate": KernelWork(
             780 * n + 9 * pairs, n * (2 * PARAMETERS + SPLAT + 8) + pairs * PAIR_SUMS
         ),
-        "elementwise.adam": Work(13 * VALUES * n, 28 * VALUES * n),
+        "elementwise.adam": KernelWork(13 * VALUES * n, 28 * VALUES * n),
     }
     return {name: work[name] for name in KERNELS}

@@ -21,18 +21,18 @@ from typing import Literal
 
 from rich.filesize import decimal
 
-from cleargs.batch.sheet import Scene, SheetError
-from cleargs.children import module_command
+from cleargs.batch.sheet import SceneJob, SheetError
 from cleargs.errors import CleargsError, InputError
 from cleargs.files import write_bytes
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Device, Run
+from cleargs.pipeline.run_file import Device, RunSpec
 from cleargs.pipeline.runner import check_same_input
-from cleargs.pipeline.session import asked_run, opened_store, usable_cores
+from cleargs.pipeline.session import opened_store, resolve_run, usable_cores
 from cleargs.progress import Reporter, SilentReporter
+from cleargs.report.formatting import duration
 from cleargs.report.report_json import linked_manifests
-from cleargs.report.words import duration
+from cleargs.subprocesses import module_command
 
 State = Literal["failed", "waiting", "partial", "done"]
 """`waiting`: there are stages to make, and no try has failed."""
@@ -77,7 +77,7 @@ class Batch:
     dag: Dag
     folder: Path
     """Absolute."""
-    scenes: Sequence[Scene]
+    scenes: Sequence[SceneJob]
     device: Device
     until: str | None = None
     overrides: tuple[str, ...] = ()
@@ -85,15 +85,15 @@ class Batch:
     options: tuple[str, ...] = ()
     """Further options of each ``cleargs run``."""
 
-    def run_folder(self, scene: Scene) -> Path:
+    def run_folder(self, scene: SceneJob) -> Path:
         """Return the run folder of ``scene``."""
         return self.folder / "scenes" / scene.name
 
-    def log(self, scene: Scene) -> Path:
+    def log(self, scene: SceneJob) -> Path:
         """Return the file that holds the output of the last try."""
         return self.folder / "logs" / f"{scene.name}.log"
 
-    def arguments(self, scene: Scene) -> list[str]:
+    def arguments(self, scene: SceneJob) -> list[str]:
         """Return the arguments of ``cleargs`` that bring ``scene`` through the stages."""
         settings = [word for text in (*self.overrides, *scene.overrides) for word in ("--set", text)]
         until = ["--until", self.until] if self.until else []
@@ -119,13 +119,13 @@ class Batch:
         if problems:
             raise SheetError(sheet, problems)
 
-    def plan(self, scene: Scene) -> list[StagePlan]:
+    def plan(self, scene: SceneJob) -> list[StagePlan]:
         """Return the state of each stage. Raises CleargsError where the capture cannot be read."""
         run = self._run(scene)
         with opened_store(run.store) as store:
             return Planner(self.dag, run, store, usable_cores(), SilentReporter()).plan(self.until)
 
-    def run(self, scene: Scene, reporter: Reporter) -> None:
+    def run(self, scene: SceneJob, reporter: Reporter) -> None:
         """Run ``scene`` in a process of its own; its words go to its log and to ``reporter``."""
         log = self.log(scene)
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ class Batch:
             if child.wait() < 0:
                 file.write(f"error: ended by signal {-child.returncode}\n")
 
-    def result(self, scene: Scene) -> Result:
+    def result(self, scene: SceneJob) -> Result:
         """Return what is there of ``scene``."""
         made = linked_manifests(self.run_folder(scene), self.dag.names)
         ingest = made["ingest"].summary if "ingest" in made else {}
@@ -171,7 +171,7 @@ class Batch:
             cause=cause,
         )
 
-    def _state(self, scene: Scene) -> tuple[State, str]:
+    def _state(self, scene: SceneJob) -> tuple[State, str]:
         try:
             plans = self.plan(scene)
         except CleargsError as error:
@@ -185,8 +185,8 @@ class Batch:
             return "partial", "; ".join(unfinished.reasons)
         return ("failed", failure) if (failure := last_error(self.log(scene))) else ("waiting", "")
 
-    def _run(self, scene: Scene) -> Run:
-        run = asked_run(
+    def _run(self, scene: SceneJob) -> RunSpec:
+        run = resolve_run(
             self.dag,
             scene.source,
             self.run_folder(scene),

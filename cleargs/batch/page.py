@@ -11,16 +11,16 @@ from urllib.parse import quote
 from rich.filesize import decimal
 
 from cleargs.batch.loop import Batch, Result, State
-from cleargs.batch.sheet import Scene
+from cleargs.batch.sheet import SceneJob
 from cleargs.capture.tables import load_frames
 from cleargs.errors import CleargsError
 from cleargs.files import whole_folder
 from cleargs.manifest import Manifest
 from cleargs.media.image import read_rgb
-from cleargs.report.frames import Picture, side_of, write_jpeg
+from cleargs.report.formatting import count, duration
+from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import write_page
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
-from cleargs.report.words import count, duration
 
 BYTES = 15_000_000
 """About how much all thumbnails together may take."""
@@ -57,7 +57,7 @@ def write_batch(batch: Batch, results: Sequence[Result]) -> Path:
     return page_of(batch.folder)
 
 
-def _card(batch: Batch, scene: Scene, result: Result, report: Path, side: int) -> dict[str, Any]:
+def _card(batch: Batch, scene: SceneJob, result: Result, report: Path, side: int) -> dict[str, Any]:
     """Return what the page says of one scene; an address is "" where there is no such file."""
     run = batch.run_folder(scene)
     made = linked_manifests(run, batch.dag.names)
@@ -76,7 +76,7 @@ def _card(batch: Batch, scene: Scene, result: Result, report: Path, side: int) -
 
 def _picture(
     run: Path, made: Mapping[str, Manifest], report: Path, name: str, side: int
-) -> tuple[Picture | None, str]:
+) -> tuple[ImageFile | None, str]:
     """Return the still of the scene's report, else its first frame; and the subject of the picture."""
     still = run / FOLDER / "after.jpg"
     try:

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
+from cleargs.base_model import FrozenModel
 from cleargs.errors import InputError
 from cleargs.pipeline.config import merge, parse_toml
 from cleargs.pipeline.settings import flattened
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, cause, read_text
+from cleargs.safe_io import FAULTS, cause, read_text
 
 NAMES = "letters, digits, and _ . - after the first, at most 100"
 PLAIN = ("name", "input", "recipe")
@@ -31,7 +31,7 @@ class SheetError(InputError):
         self.problems = problems
 
 
-class Row(Record):
+class SheetRow(FrozenModel):
     """One scene as the sheet gives it, the sheet's own defaults filled in."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")] = Field(
@@ -44,7 +44,7 @@ class Row(Record):
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneJob:
     """One scene to bring through the stages."""
 
     name: str
@@ -58,7 +58,7 @@ class Scene:
     """The place in the sheet."""
 
 
-def read_scenes(path: Path) -> list[Scene]:
+def read_scenes(path: Path) -> list[SceneJob]:
     """Return the scenes of the sheet ``path``: a CSV where its name ends so, TOML otherwise.
 
     Settings and inputs are not checked. Raises SheetError with all mistakes of form, InputError for no sheet.
@@ -67,14 +67,14 @@ def read_scenes(path: Path) -> list[Scene]:
         text = read_text(path)
     except FAULTS as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint="give a sheet, TOML or CSV") from error
-    scenes: dict[str, Scene] = {}
+    scenes: dict[str, SceneJob] = {}
     problems = []
     rows = _csv_rows(path, text) if path.suffix.lower() == ".csv" else _toml_rows(path, text)
     for where, values in rows:
         try:
-            scene = _scene(path.absolute().parent, where, Row.model_validate(values))
+            scene = _scene(path.absolute().parent, where, SheetRow.model_validate(values))
         except ValidationError as error:
-            problems += [f"{where}: {_said(found)}" for found in error.errors(include_url=False)]
+            problems += [f"{where}: {_problem(found)}" for found in error.errors(include_url=False)]
             continue
         if scene.name in scenes:
             problems.append(f"{where}: the name {scene.name!r} is taken by {scenes[scene.name].where}")
@@ -86,20 +86,20 @@ def read_scenes(path: Path) -> list[Scene]:
     return list(scenes.values())
 
 
-def _scene(folder: Path, where: str, row: Row) -> Scene:
+def _scene(folder: Path, where: str, row: SheetRow) -> SceneJob:
     recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
     overrides = tuple(f"{name}={value}" for name, value in row.set.items())
-    return Scene(row.name, folder / row.input, recipe, overrides, where)
+    return SceneJob(row.name, folder / row.input, recipe, overrides, where)
 
 
-def _said(found: Any) -> str:
+def _problem(found: Any) -> str:
     """Return one complaint of pydantic in a line."""
     name = ".".join(map(str, found["loc"]))
     match found["type"]:
         case "missing":
             return f"the scene has no {name}"
         case "extra_forbidden":
-            return f"a scene has no field {name!r}; known: {', '.join(Row.model_fields)}"
+            return f"a scene has no field {name!r}; known: {', '.join(SheetRow.model_fields)}"
         case "string_pattern_mismatch":
             return f"the name {found['input']!r} cannot be used; allowed: {NAMES}"
         case _:

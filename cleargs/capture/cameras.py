@@ -40,7 +40,7 @@ MAX_COORDINATE = 1e100
 
 
 @dataclass(frozen=True)
-class Camera:
+class Intrinsics:
     """Intrinsics in pixels of an image of ``width`` x ``height``; the centre of the first pixel is 0.5."""
 
     model: str
@@ -89,13 +89,13 @@ class Camera:
         distortion = self.params[3:] if self.model in SINGLE_FOCAL else self.params[4:]
         return not any(distortion) and not self.model.endswith("FISHEYE") and self.model != "FOV"
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resized(self, width: int, height: int) -> Intrinsics:
         """The camera of the same picture scaled to another size."""
         if (width, height) == (self.width, self.height):
             return self
         camera = self.colmap()
         camera.rescale(width, height)
-        return Camera(self.model, width, height, tuple(camera.params.tolist()))
+        return Intrinsics(self.model, width, height, tuple(camera.params.tolist()))
 
     def colmap(self) -> pycolmap.Camera:
         """As pycolmap has it (loaded when it is first needed: every run looks up its inputs)."""
@@ -106,17 +106,17 @@ class Camera:
         )
 
 
-def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
+def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
+    return Intrinsics("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
-def guessed_camera(model: str, width: int, height: int) -> Camera:
+def guessed_camera(model: str, width: int, height: int) -> Intrinsics:
     """COLMAP's first guess for a frame that has no camera: focal length 1.2 long sides, no distortion."""
     from cleargs.capture.colmap import pycolmap
 
     focal = 1.2 * max(width, height)
     guess = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
-    return Camera(model, width, height, tuple(guess.params.tolist()))
+    return Intrinsics(model, width, height, tuple(guess.params.tolist()))
 
 
 @dataclass(frozen=True)
@@ -226,10 +226,10 @@ def normalise(poses: Sequence[Pose]) -> Similarity:
             hint="the camera must move, not only turn; check the poses, or set ingest.poses=sfm",
         )
     up = -np.stack([pose.rotation[1] for pose in poses]).mean(axis=0)
-    return Similarity(_upright(up), origin, scale)
+    return Similarity(_up_rotation(up), origin, scale)
 
 
-def _upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _up_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The smallest rotation that takes ``up`` to -y; from nearly +y, the smallest after half a turn about x
     (there the smallest rotation's axis hangs on rounding errors).
     """

@@ -11,7 +11,7 @@ from cleargs.capture.config import CaptureConfig
 from cleargs.files import External as External
 
 if TYPE_CHECKING:
-    from cleargs.capture.cameras import Camera, Pose
+    from cleargs.capture.cameras import Intrinsics, Pose
     from cleargs.capture.model import SparseModel
 
 
@@ -26,7 +26,7 @@ class SourceFrame:
     """Presentation time stamp, for a frame of a video."""
     time_s: float | None = None
     mask: Path | None = None
-    camera: Camera | None = None
+    camera: Intrinsics | None = None
     pose: Pose | None = None
     test: bool = False
     """True where the input itself names it as a test view."""

@@ -20,10 +20,10 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from cleargs.children import module_command
 from cleargs.errors import StageError
 from cleargs.files import disk_error
 from cleargs.progress import Reporter, Task
+from cleargs.subprocesses import module_command
 
 _FULL = 8 * 2**20
 """A disk with fewer free bytes is full: SQLite writes its pages in blocks of up to some MB."""

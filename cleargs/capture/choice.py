@@ -20,7 +20,8 @@ from cleargs.errors import InputError
 from cleargs.files import write_json
 from cleargs.media.video import decode_grey, read_timeline
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
+from cleargs.types import ImageU8
 
 CHOICE = "chosen.json"
 """In the folder of the working images: numbers of the frames that were chosen from the video."""
@@ -28,7 +29,7 @@ CHOICE = "chosen.json"
 _BINOMIAL = np.array([1, 4, 6, 4, 1], np.float32)
 
 
-def sharpest(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
+def select_sharp_frames(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> Capture:
     """Return ``capture`` with each frame of a video exchanged for the sharpest of its stretch of time.
 
     The stretch of a frame is all frames of its video that are nearer to its time than to the time of another
@@ -61,7 +62,7 @@ def _sharpest_of(
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, timeline.pts)
     if len(nearest) == len(times):
         return frames
-    chosen = _left_behind(file, nearest, len(times))
+    chosen = _saved_choice(file, nearest, len(times))
     if chosen is None:
         best = np.full(len(times), -1.0)
         chosen = [0] * len(times)
@@ -83,7 +84,7 @@ def _sharpest_of(
     return [video_frame(video, timeline, number, prefix) for number in chosen]
 
 
-def _left_behind(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
+def _saved_choice(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
     """The choice of a killed run, or None where there is none that fits."""
     try:
         chosen = [int(number) for number in read_json(file)]
@@ -92,7 +93,7 @@ def _left_behind(file: Path, nearest: NDArray[np.intp], count: int) -> list[int]
         return None
 
 
-def sharpness(image: NDArray[np.uint8]) -> float:  # [H, W, 3] RGB, or [H, W] grey
+def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
     """Variance of the Laplacian of the grey image after a binomial filter (5x5, sigma 1 px); 0 and up.
 
     It grows with the texture in view too, so it ranks neighbours, not a whole capture. Unfiltered it would
@@ -108,7 +109,7 @@ def sharpness(image: NDArray[np.uint8]) -> float:  # [H, W, 3] RGB, or [H, W] gr
 
 
 def held_out(
-    rule: str, names: Sequence[str], read: Callable[[int], NDArray[np.uint8]], registered: Sequence[bool]
+    rule: str, names: Sequence[str], read: Callable[[int], ImageU8], registered: Sequence[bool]
 ) -> set[int]:
     """Indices of the test frames by ``ingest.holdout``; ``read`` gives frame i as RGB (for sharpest:N only).
 

@@ -6,13 +6,13 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
+from cleargs.base_model import FrozenModel
 from cleargs.plugins import require_known
-from cleargs.record import Record
 
 SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 
-class CaptureConfig(Record):
+class CaptureConfig(FrozenModel):
     """Reading of an input, and choice of its frames."""
 
     fps: float | None = Field(
@@ -48,7 +48,7 @@ class CaptureConfig(Record):
         return require_known("layouts", name, ("auto",))
 
 
-class SfmConfig(Record):
+class SfmConfig(FrozenModel):
     """Search for poses and sparse points."""
 
     refine_above: float = Field(

@@ -38,7 +38,7 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
         for path in found
         if path.suffix.lower() in IMAGE_SUFFIXES
         and path.is_file()
-        and lies_below(path.relative_to(folder).as_posix())
+        and is_inside(path.relative_to(folder).as_posix())
     ]
 
 
@@ -58,7 +58,7 @@ def folders_to_search(root: Path) -> list[Path]:
     left out.
     """
     named = image_folders(root)
-    others = sorted(path for path in root.iterdir() if path.is_dir() and lies_below(path.name))
+    others = sorted(path for path in root.iterdir() if path.is_dir() and is_inside(path.name))
     folders = [*named, *(path for path in others if path not in named and path.name != "masks"), root]
     return [folder for folder in folders if image_files(folder, below=folder != root)]
 
@@ -112,7 +112,7 @@ def videos_in(folder: Path) -> list[Path]:
     found = [
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and lies_below(path.name)
+        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and is_inside(path.name)
     ]
     return sorted(found, key=lambda path: natural_key(path.name))
 
@@ -137,7 +137,7 @@ def _counted(names: Sequence[str], word: str) -> str:
     return f"{len(names)} {word}{'' if len(names) == 1 else 's'} ({listed})"
 
 
-def lies_below(name: str) -> bool:
+def is_inside(name: str) -> bool:
     """Return True if a listed ``name`` stays in its folder and is not hidden.
 
     Only such files are part of a folder's digest.

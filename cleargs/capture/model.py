@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, Pose, within_reach
+from cleargs.capture.cameras import Intrinsics, Pose, within_reach
 from cleargs.capture.colmap import pycolmap
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
-from cleargs.untrusted import FAULTS, cause, open_regular, read_bytes
+from cleargs.safe_io import FAULTS, cause, open_regular, read_bytes
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, MemoryError, RuntimeError)
 """With those that pybind11 makes of C++ ones."""
@@ -36,7 +36,7 @@ class ModelImage:
     xy: NDArray[np.float64]  # [K, 2] px, the centre of the first pixel is 0.5
     point_ids: NDArray[np.int64]  # [K]
 
-    def kept(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
+    def select(self, which: NDArray[np.bool_]) -> ModelImage:  # [K]
         """With these keypoints alone."""
         return replace(self, xy=self.xy[which], point_ids=self.point_ids[which])
 
@@ -45,7 +45,7 @@ class ModelImage:
 class SparseModel:
     """Registered images, their cameras, and sparse points (sorted by id)."""
 
-    cameras: dict[int, Camera]
+    cameras: dict[int, Intrinsics]
     images: dict[int, ModelImage]
     point_ids: NDArray[np.int64]  # [P]
     xyz: NDArray[np.float64]  # [P, 3]
@@ -53,10 +53,10 @@ class SparseModel:
     dropped: int = 0
     """Points of the file that are not finite, and were left out."""
 
-    def kept(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
+    def select(self, which: NDArray[np.bool_]) -> SparseModel:  # [P]
         """With these points alone, in the images too."""
         ids = self.point_ids[which]
-        images = {key: image.kept(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
+        images = {key: image.select(np.isin(image.point_ids, ids)) for key, image in self.images.items()}
         return replace(self, images=images, point_ids=ids, xyz=self.xyz[which], error=self.error[which])
 
 
@@ -118,7 +118,7 @@ def write_model(folder: Path, model: SparseModel, rgb: NDArray[np.uint8]) -> Non
     write_bytes(folder / "points3D.bin", b"".join(points))
 
 
-def moved(
+def transform_model(
     model: SparseModel,
     *,
     scale: float,
@@ -184,7 +184,7 @@ def _converted(model: pycolmap.Reconstruction) -> SparseModel:
     errors = np.array([point.error for _, point in points], np.float64)
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(errors)
     cameras = {
-        key: Camera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
+        key: Intrinsics(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
         for key, camera in sorted(model.cameras.items())
     }
     images = {

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera
+from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.capture import Capture, SourceFrame
 from cleargs.capture.overlay import still_parts, wraps_around
 from cleargs.errors import InputError
@@ -26,6 +25,7 @@ from cleargs.media.image import (
 )
 from cleargs.media.video import decode_frames
 from cleargs.progress import Reporter
+from cleargs.types import ImageU8, MaskU8
 
 _PANORAMAS = 3
 """Pictures that are looked at for panoramas."""
@@ -44,7 +44,7 @@ class WorkFrame:
     width: int
     height: int
     masked: bool
-    camera: Camera | None
+    camera: Intrinsics | None
     transparent: bool = False
     """True where its mask is the transparency of its image."""
 
@@ -123,12 +123,12 @@ def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = 
         return False
 
 
-def reduced(image: NDArray[np.uint8], long_side: int) -> NDArray[np.uint8]:  # [H, W] or [H, W, 3]
+def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
     """The image with a long side of at most ``long_side`` px, by area averaging."""
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:
         return image
-    smaller: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    smaller: ImageU8 = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     return smaller
 
 
@@ -138,7 +138,7 @@ def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
     """The names and pictures of these frames of videos, one video after the other."""
     for video in dict.fromkeys(frame.path for frame in frames.values()):
         names = {frame.pts: name for name, frame in frames.items() if frame.path == video}
@@ -146,7 +146,7 @@ def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, NDArray[n
         yield from ((names[pts], rgb) for pts, rgb in decode_frames(video, wanted))
 
 
-def read_image(frame: SourceFrame) -> NDArray[np.uint8]:  # [H, W, 3]
+def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
     """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
     return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
@@ -166,7 +166,7 @@ def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
 
 
 def _work_frame(
-    frame: SourceFrame, image: Path, mask: Path, still: NDArray[np.uint8] | None, reporter: Reporter
+    frame: SourceFrame, image: Path, mask: Path, still: MaskU8 | None, reporter: Reporter
 ) -> WorkFrame:
     rgb = read_rgb(image)
     height, width = rgb.shape[:2]
@@ -188,11 +188,11 @@ def _work_frame(
 
 def _stencilled(
     frame: SourceFrame,
-    stencil: NDArray[np.uint8] | None,
-    still: NDArray[np.uint8] | None,
+    stencil: MaskU8 | None,
+    still: MaskU8 | None,
     width: int,
     height: int,
-) -> NDArray[np.uint8]:  # [height, width]
+) -> MaskU8:  # [height, width]
     """The mask of a working image: 0 where its own one, or that of still parts, has 0."""
     mask = np.full((height, width), 255, np.uint8) if still is None else still
     if stencil is None:
@@ -209,7 +209,7 @@ def _stencilled(
     return np.minimum(mask, own)
 
 
-def read_stencil(frame: SourceFrame) -> NDArray[np.uint8] | None:
+def read_stencil(frame: SourceFrame) -> MaskU8 | None:
     """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
     if frame.mask is not None:
         return read_mask(frame.mask)

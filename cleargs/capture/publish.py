@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, guessed_camera
+from cleargs.capture.cameras import Intrinsics, guessed_camera
 from cleargs.capture.model import ModelImage, SparseModel, write_model
 from cleargs.capture.prepare import WorkFrame, resumable
 from cleargs.capture.tables import FRAMES, OBSERVATIONS, POINTS
@@ -21,6 +21,7 @@ from cleargs.files import make_folder, remove
 from cleargs.media.image import read_mask, read_rgb, write_mask, write_rgb
 from cleargs.parquet import write_table
 from cleargs.progress import Reporter
+from cleargs.types import ImageU8
 
 
 def publish(
@@ -47,8 +48,8 @@ def publish(
     for file in (out / "images").iterdir():
         if file.name not in ours:
             remove(file)
-    flat: list[Camera] = []
-    numbers: dict[Camera, int] = {}
+    flat: list[Intrinsics] = []
+    numbers: dict[Intrinsics, int] = {}
     images: dict[int, ModelImage] = {}
     sums = np.zeros((len(model.point_ids), 3))
     samples = np.zeros(len(model.point_ids), np.int64)
@@ -80,7 +81,7 @@ def publish(
         )
     rgb_mean = np.rint(sums[kept] / samples[kept, None]).astype(np.uint8)
     cameras = {number: camera for camera, number in numbers.items()}
-    published = replace(model, cameras=cameras, images=images).kept(kept)
+    published = replace(model, cameras=cameras, images=images).select(kept)
     table = [
         _frame_row(
             index,
@@ -98,7 +99,7 @@ def publish(
     return published
 
 
-def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
+def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Intrinsics]:
     """The camera of each frame; an unregistered one takes its own, else the commonest of its size."""
     by_name = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [by_name.get(frame.image, frame.camera) for frame in frames]
@@ -113,7 +114,7 @@ def _cameras(frames: Sequence[WorkFrame], model: SparseModel) -> list[Camera]:
 
 def _write_picture(
     frame: WorkFrame, undistortion: Undistorter, work: Path, out: Path, reporter: Reporter
-) -> NDArray[np.uint8]:
+) -> ImageU8:
     """Undistort image and mask of a frame (a killed run may have done so) and return the image."""
     target = out / "images" / frame.image
     if resumable(target, reporter):
@@ -131,7 +132,7 @@ def _write_picture(
 def _flattened(image: ModelImage, undistortion: Undistorter) -> ModelImage:
     """The observations in the published image; those in the cropped margin are gone."""
     xy = undistortion.points(image.xy)
-    return replace(image, xy=xy).kept(undistortion.inside(xy))
+    return replace(image, xy=xy).select(undistortion.inside(xy))
 
 
 def _write_points(
@@ -154,7 +155,7 @@ def _write_points(
 
 
 def _frame_row(
-    index: int, frame: WorkFrame, camera: Camera, image: ModelImage | None, split: str, placed: str
+    index: int, frame: WorkFrame, camera: Intrinsics, image: ModelImage | None, split: str, placed: str
 ) -> dict[str, object]:
     (fx, fy), (cx, cy) = camera.focal, camera.centre
     row: dict[str, object] = {

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from cleargs.capture.cameras import Camera, Pose, Similarity, guessed_camera, normalise
+from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_worker import OUTCOME, Job, Outcome
+from cleargs.capture.sfm_worker import OUTCOME, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, cause, read_json
+from cleargs.safe_io import FAULTS, cause, read_json
 
 FARTHEST = 1e9
 """Largest coordinate of a point in the normalised world, in which all cameras lie within 1."""
@@ -42,7 +42,7 @@ class Reconstruction:
 
     model: SparseModel
     similarity: Similarity
-    outcome: Outcome
+    outcome: SfmOutcome
 
 
 def reconstruct(
@@ -65,11 +65,11 @@ def reconstruct(
         model, outcome = _run(job_of(frames, None, folder, config, seed, threads), reporter)
         _check_registered(len(model.images), len(frames), config, reporter)
         similarity = normalise([image.pose for _, image in sorted(model.images.items())])
-        return Reconstruction(_moved(model, similarity), similarity, outcome)
+        return Reconstruction(_transformed(model, similarity), similarity, outcome)
     _check_registered(len(posed), len(frames), config, reporter)
     poses = [frame.source.pose for frame in posed if frame.source.pose is not None]
     similarity = normalise(poses)
-    adopted = None if given is None else _within_reach(_moved(_adopted(given, posed), similarity))
+    adopted = None if given is None else _within_reach(_transformed(_adopted(given, posed), similarity))
     if adopted is not None and adopted.dropped:
         reporter.warn(
             f"{adopted.dropped} points of the input's sparse model are not finite or out of reach: left out"
@@ -78,7 +78,7 @@ def reconstruct(
         missed = float(np.median(adopted.error))
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
-            return Reconstruction(adopted, similarity, Outcome(placed=placed, missed_px=missed))
+            return Reconstruction(adopted, similarity, SfmOutcome(placed=placed, missed_px=missed))
     moved = [similarity.pose(pose) for pose in poses]
     model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
@@ -101,7 +101,7 @@ def reconstruct(
     if adopted is not None and len(adopted.error) and not refined:
         model = adopted
     placed = _placed_by_input(frames, refined)
-    return Reconstruction(model, similarity, Outcome(placed=placed, missed_px=missed, refined=refined))
+    return Reconstruction(model, similarity, SfmOutcome(placed=placed, missed_px=missed, refined=refined))
 
 
 def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
@@ -111,7 +111,7 @@ def _check_registered(registered: int, total: int, config: SfmConfig, reporter: 
         reporter.warn(f"only {registered} of {total} frames have a pose: {_ADVICE}")
 
 
-def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, Outcome]:
+def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
     """Let COLMAP do its work, unless a killed run got as far as the model."""
     if (found := _resumed(job.folder, reporter)) is not None:
         return found
@@ -142,7 +142,7 @@ def job_of(
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
-    cameras: list[Camera] = []
+    cameras: list[Intrinsics] = []
     exif_images: list[Path | None] = []
     for frame in (frames[owners.index(owner)] for owner in numbers):
         known = frame.camera if poses is not None else None
@@ -165,7 +165,7 @@ def job_of(
     )
 
 
-def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | None:
+def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
     """The model that a killed run left in ``folder``, or None.
 
     What is damaged, COLMAP's database too, is thrown away with a warning.
@@ -183,10 +183,10 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, Outcome] | 
     return None
 
 
-def _read(folder: Path) -> tuple[SparseModel, Outcome]:
+def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
     """The model and the outcome that COLMAP's process wrote. Raises InputError where one is damaged."""
     try:
-        return read_model(folder), Outcome.model_validate(read_json(folder / OUTCOME))
+        return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
         raise InputError(f"{OUTCOME} cannot be read: {cause(error)}", hint="run ingest again") from error
 
@@ -196,7 +196,7 @@ def _placed_by_input(frames: Sequence[WorkFrame], refined: bool) -> dict[str, st
     return {frame.image: "no pose in the input" if frame.source.pose is None else found for frame in frames}
 
 
-def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
+def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
     images = {key: replace(image, pose=similarity.pose(image.pose)) for key, image in model.images.items()}
     return replace(model, images=images, xyz=similarity.points(model.xyz))
 
@@ -204,13 +204,13 @@ def _moved(model: SparseModel, similarity: Similarity) -> SparseModel:
 def _within_reach(model: SparseModel) -> SparseModel:
     """The model without the points beyond `FARTHEST`, which single precision may not hold."""
     near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
-    return replace(model.kept(near), dropped=model.dropped + int((~near).sum()))
+    return replace(model.select(near), dropped=model.dropped + int((~near).sum()))
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:
     """The input's own model, restricted to ``frames``: working image names, cameras and pixels."""
     by_name = {image.name: image for image in given.images.values()}
-    cameras: dict[int, Camera] = {}
+    cameras: dict[int, Intrinsics] = {}
     images: dict[int, ModelImage] = {}
     scale = 1.0
     for index, frame in enumerate(frames):

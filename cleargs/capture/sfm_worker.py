@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.capture.cameras import Camera
+from cleargs.base_model import FrozenModel
+from cleargs.capture.cameras import Intrinsics
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
@@ -37,8 +38,7 @@ from cleargs.capture.matching import (
 )
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
-from cleargs.record import Record
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
@@ -53,17 +53,17 @@ _HELD_BY = 15
 
 
 OUTCOME = "outcome.json"
-"""In the folder of the model: its `Outcome`."""
+"""In the folder of the model: its `SfmOutcome`."""
 
 
-class Job(Record):
+class Job(FrozenModel):
     """What COLMAP gets: working images, their cameras, the poses if they are known, and settings."""
 
     folder: Path
     images: Path
     masks: Path | None
     names: list[str]
-    cameras: list[Camera]
+    cameras: list[Intrinsics]
     camera_of: list[int]
     """For each image the number of its camera."""
     poses: list[list[list[float]]] | None
@@ -75,7 +75,7 @@ class Job(Record):
     threads: int
 
 
-class Outcome(Record):
+class SfmOutcome(FrozenModel):
     """Origin of a model."""
 
     placed: Mapping[str, str] = Field(default_factory=dict)
@@ -87,7 +87,7 @@ class Outcome(Record):
 
 
 @dataclass(frozen=True)
-class _Effort:
+class _FeatureSettings:
     """How features are found and matched, and when a frame counts as placed by them."""
 
     reduced: int
@@ -98,9 +98,9 @@ class _Effort:
     again: str = ""
 
 
-_FIRST = _Effort(reduced=1, contrast=0.02 / 3, inliers=30)
+_FIRST = _FeatureSettings(reduced=1, contrast=0.02 / 3, inliers=30)
 """COLMAP's defaults."""
-_SECOND = _Effort(reduced=2, contrast=0.002, inliers=15, again=" again")
+_SECOND = _FeatureSettings(reduced=2, contrast=0.002, inliers=15, again=" again")
 """For frames with a blur of 24 px at 480: at half the size it is half as long, and what contrast it left is
 enough (docs/experiments/poses.md)."""
 
@@ -133,7 +133,7 @@ class _Sfm:
         self._options.triangulation.random_seed = job.seed
 
     def run(self) -> None:
-        """Make the model and its `Outcome`. Raises StageError when the frames give none."""
+        """Make the model and its `SfmOutcome`. Raises StageError when the frames give none."""
         job = self._job
         pycolmap.set_random_seed(job.seed)
         self._import()
@@ -156,15 +156,15 @@ class _Sfm:
         if job.poses is None:
             model = self._map()
             model, placed = self._place_the_rest(model, pairs)
-            outcome = Outcome(placed=placed)
+            outcome = SfmOutcome(placed=placed)
         else:
             model = self._triangulate()
             missed = _median_error(model)
-            outcome = Outcome(missed_px=missed)
+            outcome = SfmOutcome(missed_px=missed)
             if missed > job.config.refine_above:
                 adjusted = self._refine(copy.deepcopy(model))
                 if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
-                    model, outcome = adjusted, Outcome(missed_px=missed, refined=True)
+                    model, outcome = adjusted, SfmOutcome(missed_px=missed, refined=True)
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())
@@ -198,18 +198,18 @@ class _Sfm:
                 frame.add_data_id(shot.data_id)
                 opened.write_frame(frame, use_frame_id=True)
 
-    def _extract(self, database: Path, names: Sequence[str], effort: _Effort) -> None:
+    def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
         """SIFT on the working images; frames that have features already are skipped by COLMAP."""
         job = self._job
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         largest = max(max(camera.width, camera.height) for camera in job.cameras)
-        options.max_image_size = largest // effort.reduced
+        options.max_image_size = largest // settings.reduced
         options.sift.max_num_features = job.config.max_features
-        options.sift.peak_threshold = effort.contrast
+        options.sift.peak_threshold = settings.contrast
         reader = pycolmap.ImageReaderOptions()
         if job.masks is not None:
             reader.mask_path = job.masks
-        self._report(phase=f"finding features{effort.again}", total=len(names))
+        self._report(phase=f"finding features{settings.again}", total=len(names))
         size = 4 * job.threads
         for start in range(0, len(names), size):
             block = list(names[start : start + size])
@@ -218,10 +218,10 @@ class _Sfm:
             )
             self._report(done=start + len(block))
 
-    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], effort: _Effort) -> None:
+    def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
         """Match and verify pairs of frames; pairs that were matched before are skipped."""
         job = self._job
-        self._report(phase=f"matching{effort.again}", total=len(pairs))
+        self._report(phase=f"matching{settings.again}", total=len(pairs))
         match_pairs(
             database, job.names, pairs, job.seed, job.threads, lambda through: self._report(done=through)
         )

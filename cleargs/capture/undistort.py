@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera, pinhole
+from cleargs.capture.cameras import Intrinsics, pinhole
 from cleargs.capture.prepare import reduced, reduced_size
 from cleargs.errors import InputError
+from cleargs.types import ImageU8, MaskU8, PlaneF32
 
 MAX_TANGENT = 1.75
 """A pinhole image reaches at most 60 degrees off its axis: fisheye images are cropped there."""
@@ -22,20 +23,20 @@ _EDGE_SAMPLES = 256
 class Undistorter:
     """The way of one camera's images to a pinhole."""
 
-    pinhole: Camera
+    pinhole: Intrinsics
     """Camera of the published image."""
-    _lens: Camera
-    _map: tuple[NDArray[np.float32], NDArray[np.float32]] | None
+    _lens: Intrinsics
+    _map: tuple[PlaneF32, PlaneF32] | None
     """Where each pixel of the flat image, which is not reduced yet, lies in the lens's; None without
     distortion."""
 
-    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W, 3]
+    def image(self, rgb: ImageU8) -> ImageU8:  # [H, W, 3]
         """Bicubic into the flat image, then area averaging to the published size; sRGB throughout."""
         if self._map is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         return reduced(rgb, max(self.pinhole.width, self.pinhole.height))
 
-    def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:  # [H, W]
+    def mask(self, mask: MaskU8) -> MaskU8:  # [H, W]
         """The same way for a mask, nearest pixels throughout."""
         if self._map is not None:
             mask = np.asarray(cv2.remap(mask, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
@@ -54,7 +55,7 @@ class Undistorter:
         return np.asarray(((xy >= 0) & (xy < size)).all(axis=1))
 
 
-def undistorter(lens: Camera, max_size: int) -> Undistorter:
+def undistorter(lens: Intrinsics, max_size: int) -> Undistorter:
     """Prepare the undistortion of a camera's images to a long side of at most ``max_size`` px.
 
     The pinhole keeps the lens's focal lengths, so that the image's centre keeps its scale, and shows the
@@ -82,7 +83,7 @@ def undistorter(lens: Camera, max_size: int) -> Undistorter:
     return Undistorter(flat.resized(*reduced_size(width, height, max_size)), lens, maps)
 
 
-def _covered(lens: Camera) -> tuple[float, float, float, float]:
+def _covered(lens: Intrinsics) -> tuple[float, float, float, float]:
     """Left, top, right and bottom (tangents) of the rectangle that the lens's image covers wholly."""
     t = np.linspace(0, 1, _EDGE_SAMPLES)
     zero, one = np.zeros_like(t), np.ones_like(t)

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from cleargs.batch.loop import Batch, Result, write_summary
-from cleargs.batch.sheet import Scene, SheetError, read_scenes
+from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.common import (
     json_option,
     output_option,
@@ -150,7 +150,7 @@ def _print_plans(batch: Batch, as_json: bool) -> None:
         click.echo(f"{plan['scene']}: {cost}; {plan['note']}")
 
 
-def _plan_json(batch: Batch, scene: Scene) -> dict[str, Any]:
+def _plan_json(batch: Batch, scene: SceneJob) -> dict[str, Any]:
     try:
         plans = batch.plan(scene)
         to_do = [plan.stage for plan in plans if plan.state != "done"]

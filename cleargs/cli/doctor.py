@@ -17,7 +17,7 @@ from cleargs.cli.common import answer, json_option
 from cleargs.models.onnx import installed_runtimes
 from cleargs.pipeline.session import UNUSED_GPU, cuda_obstacle, usable_cores
 from cleargs.splat.kernels.memory import available_memory
-from cleargs.splat.pace import remembered_pace
+from cleargs.splat.pace import cached_pace
 
 LIBRARIES = (
     "torch",
@@ -50,7 +50,7 @@ def doctor(folder: Path, as_json: bool) -> int:
 
     FOLDER is where runs would be kept. Exit code 1 when something would keep a run from working.
     """
-    obstacle, pace = cuda_obstacle(), remembered_pace()
+    obstacle, pace = cuda_obstacle(), cached_pace()
     device = f"cpu; {UNUSED_GPU}" if obstacle is None else f"cpu ({obstacle})"
     speed = "not measured yet" if pace is None else f"takes {pace:.2f} of the reference machine's time"
     findings = [

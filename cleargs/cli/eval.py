@@ -172,7 +172,7 @@ def eval(
     if output is None and run is not None and renders is None:
         name = reference.name if poses == "reference" or directory is None else f"{reference.name}-given"
         output = run / "eval" / name / "eval.json"
-        write_report(output, report.beside(_older(run, output)))
+        write_report(output, report.merged_with(_older(run, output)))
     elif output is not None:
         write_report(output, report)
     if as_json:

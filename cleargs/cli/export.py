@@ -103,7 +103,7 @@ def export(
             raise InputError(f"{file} exists already", hint="choose another name, or give --force")
     stage = scene_stage(dag, run, chosen)
     from cleargs.capture.cameras import Similarity
-    from cleargs.capture.model import moved, read_model, write_model
+    from cleargs.capture.model import read_model, transform_model, write_model
     from cleargs.capture.tables import load_frames, load_points
     from cleargs.files import write_json
     from cleargs.formation.frames import view_of
@@ -124,9 +124,9 @@ def export(
             "translation": world_of.origin,
         }
     elif up is not None:
-        from cleargs.splat.transforms import upright
+        from cleargs.splat.transforms import orient_up
 
-        similarity = upright(named[0][1], up)
+        similarity = orient_up(named[0][1], up)
 
     scene = read_ply(run / stage / SCENE)
     remarks = []
@@ -150,7 +150,9 @@ def export(
     write_json(cameras, cameras_json(named, **similarity))
     sparse = read_model(ingest / MODEL)
     write_model(
-        model / "sparse" / "0", moved(sparse, **similarity) if similarity else sparse, load_points(ingest).rgb
+        model / "sparse" / "0",
+        transform_model(sparse, **similarity) if similarity else sparse,
+        load_points(ingest).rgb,
     )
     for remark in remarks:
         click.echo(remark)

@@ -16,14 +16,14 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import real_views
-from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.observed import evaluate_views
 from cleargs.formation.table import read_formation
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.pruning import central_box, contributions, inside
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 PRUNE_HINT = "give opacity:O with O from 0 to 1, or contribution:P with P pixels"
 CROP_HINT = "give box:X,Y,Z,X,Y,Z with the lower corner first, or percentile:P with P above 0 and up to 100"
@@ -84,7 +84,7 @@ def pruned(scene: Scene, thresholds: Mapping[str, float], run: Path, stage: str)
     )
 
 
-def _psnr(scene: Scene, views: Sequence[View], folder: Path, seen: Callable[[], None]) -> float:
+def _psnr(scene: Scene, views: Sequence[TrainingView], folder: Path, seen: Callable[[], None]) -> float:
     """Mean over ``views``, through the exposure and the motion that the stage in ``folder`` found, dB."""
     exposure = read_exposure(folder / "exposure.parquet")
     formations, _ = read_formation(folder / "formation.parquet")

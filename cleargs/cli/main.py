@@ -14,7 +14,7 @@ import click
 import cleargs
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag, installed
-from cleargs.untrusted import printable, require_utf8
+from cleargs.safe_io import printable, require_utf8
 
 INTERRUPTED = 130
 
@@ -154,7 +154,7 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             context = getattr(error, "ctx", None)
             command = context.command_path if context is not None else "cleargs"
             return error.exit_code, _one_line(error.format_message()), f"see {command} --help"
-        case _ if _lacks_memory(error):
+        case _ if _is_out_of_memory(error):
             return 1, "out of memory", "lower ingest.max_size or ingest.max_frames, or close other programs"
         case OSError() if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return 1, "no space left on the disk", "free some space (cleargs gc), or choose another --store"
@@ -169,21 +169,21 @@ def explanation(error: Exception) -> tuple[int, str, str]:
             return 1, cause, "run it again with --debug for the traceback, and please report it"
 
 
-def _lacks_memory(error: BaseException | None) -> bool:
+def _is_out_of_memory(error: BaseException | None) -> bool:
     """Whether memory ran out, which threads and libraries that are being loaded say in words of their own.
 
     A package whose library cannot be loaded may put words of its own over the cause.
     """
-    said = str(error)
+    text = str(error)
     match error:
         case MemoryError():
             return True
         case RuntimeError():
             return any(
-                words in said for words in ("can't start new thread", "can't allocate memory")
-            ) or _lacks_memory(error.__cause__ or error.__context__)
+                words in text for words in ("can't start new thread", "can't allocate memory")
+            ) or _is_out_of_memory(error.__cause__ or error.__context__)
         case ImportError() | OSError():
-            return any(words in said for words in ("failed to map segment", "Cannot allocate memory"))
+            return any(words in text for words in ("failed to map segment", "Cannot allocate memory"))
         case _:
             return False
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cleargs.progress import CountedTask, Reporter, SilentReporter, Task
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -25,7 +25,7 @@ def make_reporter(quiet: bool = False) -> Reporter:
     """The reporter that suits stderr; ``quiet`` leaves the warnings only."""
     if quiet:
         return QuietReporter()
-    return BarReporter() if sys.stderr.isatty() else LineReporter()
+    return BarReporter() if sys.stderr.isatty() else PlainTextReporter()
 
 
 class QuietReporter(SilentReporter):
@@ -35,7 +35,7 @@ class QuietReporter(SilentReporter):
         click.echo(f"warning: {printable(text)}", err=True)
 
 
-class LineReporter(QuietReporter):
+class PlainTextReporter(QuietReporter):
     """Plain lines for a log."""
 
     @contextmanager

@@ -22,7 +22,7 @@ from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import InputError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
-from cleargs.report.words import count as count_of
+from cleargs.report.formatting import count as count_of
 from cleargs.run_results import scene_stage
 
 SECONDS = 10.0

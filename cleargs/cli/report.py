@@ -24,7 +24,7 @@ from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner
 from cleargs.pipeline.run_file import read_run_file
-from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.session import opened_store
 
 
@@ -51,7 +51,7 @@ def report(dag: Dag, run: Path, threads: int | None, store: Path | None, as_json
     answer(as_json, {"report": str(page)}, f"report: {page}")
 
 
-def report_on(planner: Planner, outcomes: Sequence[Outcome]) -> Path | None:
+def report_on(planner: Planner, outcomes: Sequence[StageOutcome]) -> Path | None:
     """The report at the end of a run; None where there is nothing to report on, or it could not be written.
 
     A report that shows these results already stays.

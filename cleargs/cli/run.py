@@ -30,10 +30,10 @@ from cleargs.cli.report import older_report, report_on
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
-from cleargs.pipeline.runner import Outcome, Runner, check_same_input
-from cleargs.pipeline.session import DeviceChoice, asked_run, opened_store, resolve_device
-from cleargs.report.words import duration
-from cleargs.untrusted import printable
+from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device, resolve_run
+from cleargs.report.formatting import duration
+from cleargs.safe_io import printable
 
 Summaries = Mapping[str, Mapping[str, Any]]
 """Stage -> the figures of its manifest."""
@@ -113,7 +113,7 @@ def run(
     """
     dag.until(until)
     reporter = make_reporter(quiet)
-    settings = asked_run(
+    settings = resolve_run(
         dag,
         source,
         folder,
@@ -215,12 +215,12 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
 # -- what became of stages, or would become of them ----------------------------------------------------------
 
 
-def exit_code(outcomes: Sequence[Outcome]) -> int:
+def exit_code(outcomes: Sequence[StageOutcome]) -> int:
     """0, or 3 where something is missing."""
     return DONE_IN_PART if any(outcome.manifest.status == "partial" for outcome in outcomes) else 0
 
 
-def print_outcomes(outcomes: Sequence[Outcome], run: Path, report: Path | None = None) -> None:
+def print_outcomes(outcomes: Sequence[StageOutcome], run: Path, report: Path | None = None) -> None:
     """What is missing (on stderr); then at most five lines: what was made, how good it is, how long it took,
     what to look at (the ``report``, a picture), the next command.
     """
@@ -279,7 +279,7 @@ def _quality(summaries: Summaries) -> str:
     return f"{text}. Rejected: {harm}" if harm else text
 
 
-def _times(outcomes: Sequence[Outcome]) -> str:
+def _times(outcomes: Sequence[StageOutcome]) -> str:
     """How long this call worked, stage by stage, and what it found."""
     made = [outcome for outcome in outcomes if outcome.how == "made"]
     found = [outcome.stage for outcome in outcomes if outcome.how == "found"]
@@ -302,7 +302,7 @@ def _next(summaries: Summaries, run: Path, scene: bool) -> str:
     return f"cleargs export {quote(str(run))} -o {quote(f'{run.name}.ply')}"
 
 
-def outcome_json(outcome: Outcome) -> dict[str, Any]:
+def outcome_json(outcome: StageOutcome) -> dict[str, Any]:
     """One outcome as JSON values."""
     facts = {"stage": outcome.stage, "how": outcome.how, "folder": str(outcome.folder)}
     return {**facts, **manifest_json(outcome.manifest)}

@@ -20,8 +20,8 @@ from cleargs.errors import InputError
 from cleargs.manifest import Manifest
 from cleargs.parquet import read_any_table
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.live import at_work, preview_of
-from cleargs.pipeline.run_file import Run, read_run_file
+from cleargs.pipeline.live import preview_of, running_stage
+from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
 MAX_LISTED = 16
@@ -161,7 +161,7 @@ def show(
         _show_stage(run, done, stage, rows, columns, as_json)
 
 
-def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
+def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
     """Print a line per stage, and the present work with its preview."""
     rows = []
     for name, manifest in manifests.items():
@@ -176,7 +176,7 @@ def _print_run(run: Run, manifests: Mapping[str, Manifest | None]) -> None:
     _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
     if None in manifests.values():
         click.echo(f"not done: see cleargs status {quote(str(run.folder))}")
-    if work := at_work(run.folder, run.store):
+    if work := running_stage(run.folder, run.store):
         count = f"{work.done} of {work.total}" if work.total else str(work.done or "")
         click.echo(f"\n{work.stage} is at work: {', '.join(filter(None, (work.label, count, work.note)))}")
         if preview := preview_of(work, run.store):

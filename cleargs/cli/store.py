@@ -13,13 +13,13 @@ from cleargs.digest import named_files
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest, damages, read_manifest
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.run_file import Run, read_run_file
+from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.pipeline.session import opened_store
 from cleargs.pipeline.store import ROOTS, Store
-from cleargs.report.words import count
+from cleargs.report.formatting import count
 
 
-class Fault(NamedTuple):
+class StoreFault(NamedTuple):
     """A damaged result or a changed input."""
 
     kind: Literal["damaged", "changed"]
@@ -45,7 +45,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     the next `cleargs run`. Exit code 1 when something is damaged or changed.
     """
     settings = read_run_file(run, dag, store=store)
-    faults: list[Fault] = []
+    faults: list[StoreFault] = []
     stages: list[str] = []
     files = 0
     with opened_store(settings.store) as opened:
@@ -58,12 +58,12 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
                 manifest = read_manifest(folder)
             except (OSError, ValueError) as error:
                 text = "it is no longer in the store" if isinstance(error, OSError) else str(error)
-                faults.append(Fault("damaged", name, text))
+                faults.append(StoreFault("damaged", name, text))
                 continue
             files += len(manifest.files)
             place = folder.resolve()
-            lines = damages(place, manifest, manifest.files, opened.memo, afresh=True)
-            faults += [Fault("damaged", name, line) for line in lines]
+            lines = damages(place, manifest, manifest.files, opened.memo, rehash=True)
+            faults += [StoreFault("damaged", name, line) for line in lines]
             faults += _changed_inputs(dag, settings, opened, manifest)
     if not stages:
         raise InputError(f"{run} has no results yet", hint=f"first: cleargs run {settings.source} -o {run}")
@@ -79,7 +79,7 @@ def verify(dag: Dag, run: Path, store: Path | None, as_json: bool) -> int:
     return 1 if faults else 0
 
 
-def _changed_inputs(dag: Dag, run: Run, store: Store, manifest: Manifest) -> Iterator[Fault]:
+def _changed_inputs(dag: Dag, run: RunSpec, store: Store, manifest: Manifest) -> Iterator[StoreFault]:
     """What differs between the files outside the store that a stage was made from, and those there now."""
     stage = manifest.stage
     for role, place in dag.load(stage).externals(run.config.sections[stage], run.source).items():
@@ -95,12 +95,12 @@ def _changed_inputs(dag: Dag, run: Run, store: Store, manifest: Manifest) -> Ite
                 change = " is new"
             else:
                 try:
-                    if store.memo.digests_of(files[name], afresh=True)[""] != before[name]:
+                    if store.memo.digests_of(files[name], rehash=True)[""] != before[name]:
                         change = " has other content"
                 except InputError as error:
                     change = f": {error}"
             if change:
-                yield Fault("changed", stage, f"{role} {name}".rstrip() + change)
+                yield StoreFault("changed", stage, f"{role} {name}".rstrip() + change)
 
 
 @click.command(

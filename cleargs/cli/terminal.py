@@ -11,7 +11,7 @@ import threading
 import time
 from types import FrameType
 
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 GRACE_S = 1.0
 """Time that the ordinary way out may take after Ctrl-C."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from cleargs.record import Record
+from cleargs.base_model import FrozenModel
 
 LpipsNet = Literal["alex", "vgg"]
 
@@ -18,7 +18,7 @@ SCORERS = ("clarity-net", "naturalness-stats", *INSTALLABLE)
 """No-reference scorers: the two that ship with ClearGS, and the two of the paper where they are installed."""
 
 
-class EvalOptions(Record):
+class EvalOptions(FrozenModel):
     """Which metrics to take besides PSNR and SSIM. Adjustments are off unless asked for, and recorded."""
 
     lpips: tuple[LpipsNet, ...] = Field(LPIPS_NETS, description="Backbones of LPIPS v0.1.")

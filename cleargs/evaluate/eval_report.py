@@ -12,12 +12,12 @@ from typing import Any, Literal
 import pyarrow as pa
 from pydantic import ConfigDict, Field, ValidationError
 
+from cleargs.base_model import FrozenModel
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.files import disk_errors, write_json
 from cleargs.parquet import column, write_table
-from cleargs.record import Record
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 PosesFrom = Literal["reference", "given"]
 World = Literal["scene", "ingest", "umeyama"]
@@ -39,7 +39,7 @@ LOWER_IS_BETTER = frozenset({"lpips_alex", "lpips_vgg"})
 """All other metrics are better the higher they are."""
 
 
-class Figures(Record):
+class Figures(FrozenModel):
     """A record whose JSON writes an infinite figure, as the PSNR of a perfect image, as ``"Infinity"``: JSON
     has no number for it. Read back, it is a number again.
     """
@@ -130,7 +130,7 @@ class Report(Figures):
     schema_version: Literal[1] = 1
     evaluations: tuple[Evaluation, ...]
 
-    def beside(self, older: Report) -> Report:
+    def merged_with(self, older: Report) -> Report:
         """These evaluations, then those of ``older`` on the same references that none of these replaces."""
         here = {(found.subject, found.poses, found.options) for found in self.evaluations}
         splits = {found.split for found in self.evaluations}

@@ -19,9 +19,7 @@ from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
 from cleargs.evaluate.metrics import (
-    Mask,
     MetricSet,
-    Pixels,
     apply_affine,
     clipped_pixels,
     depth_of_points,
@@ -43,6 +41,7 @@ from cleargs.splat.backend import rasteriser_for, set_threads
 from cleargs.splat.camera import Camera
 from cleargs.splat.ply import read_ply
 from cleargs.splat.scene import Scene
+from cleargs.types import ImageU8, MaskBool, PlaneF32
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 
@@ -53,11 +52,11 @@ class _Prediction:
 
     image: NDArray[np.float64]  # [H, W, 3] sRGB in [0, 1]
     refinement: Refinement | None = None
-    far: Mask | None = None
+    far: MaskBool | None = None
     """Where a scene shows something behind the sparse points; None where these are not known."""
 
 
-Predict = Callable[[ReferenceView, Pixels, Mask | None], _Prediction]
+Predict = Callable[[ReferenceView, ImageU8, MaskBool | None], _Prediction]
 
 
 def evaluate_scene(
@@ -109,7 +108,7 @@ def evaluate_images(
     names = matching(files, [view.name for view in reference.views], "name the images like the references")
     matched = tuple(view for view in reference.views if view.name in names)
 
-    def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
+    def predict(view: ReferenceView, target: ImageU8, mask: MaskBool | None) -> _Prediction:
         image = read_rgb(files[view.name])
         if image.shape != target.shape:
             raise InputError(
@@ -141,12 +140,12 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
         pixels: NDArray[np.float64] = image.numpy().astype(np.float64).clip(0.0, 1.0)
         return pixels
 
-    def depth_and_alpha(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def depth_and_alpha(camera: Camera) -> tuple[PlaneF32, PlaneF32]:
         rendered = engine.forward(scene.gaussians, camera, antialias=scene.antialias, depth=True)
         assert rendered.depth is not None  # asked for
         return rendered.depth.numpy(), rendered.alpha.numpy()
 
-    def predict(view: ReferenceView, target: Pixels, mask: Mask | None) -> _Prediction:
+    def predict(view: ReferenceView, target: ImageU8, mask: MaskBool | None) -> _Prediction:
         camera, refinement, far = view.camera, None, None
         if refine_steps:
             depth = _median_depth(*depth_and_alpha(camera))
@@ -159,7 +158,7 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
     return predict
 
 
-def _median_depth(depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> float:
+def _median_depth(depth: PlaneF32, alpha: PlaneF32) -> float:
     """Median depth of what a view shows; 1 where it shows nothing."""
     shown = alpha > 0.5
     return float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
@@ -224,8 +223,8 @@ def _measure(
     options: EvalOptions,
     name: str,
     prediction: _Prediction,
-    target: Pixels,
-    mask: Mask | None,
+    target: ImageU8,
+    mask: MaskBool | None,
     save: Path | None,
 ) -> ImageResult:
     image, affine = prediction.image, None
@@ -249,7 +248,7 @@ def _measure(
     )
 
 
-def _digest(pixels: Pixels, mask: Mask | None = None) -> str:
+def _digest(pixels: ImageU8, mask: MaskBool | None = None) -> str:
     """SHA-256 of decoded pixels: the same for every lossless way to store them."""
     digest = hashlib.sha256(f"{pixels.shape}".encode())
     digest.update(np.ascontiguousarray(pixels).tobytes())

@@ -19,10 +19,7 @@ from cleargs.models.lpips import load_lpips, weights_file
 from cleargs.models.registry import file_digest, model_dir
 from cleargs.models.scorer import Scorer, load_scorer
 from cleargs.splat.camera import Camera
-
-Pixels = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.float32]
+from cleargs.types import ImageF32, ImageU8, MaskBool, PlaneF32
 
 WINDOW = 11
 SIGMA = 1.5
@@ -41,9 +38,9 @@ CLIPPED = 254
 
 
 def psnr(
-    image: Pixels,  # [H, W, 3]
-    reference: Pixels,  # [H, W, 3]
-    mask: Mask | None = None,  # [H, W] True = counts
+    image: ImageU8,  # [H, W, 3]
+    reference: ImageU8,  # [H, W, 3]
+    mask: MaskBool | None = None,  # [H, W] True = counts
 ) -> float | None:
     """Peak signal-to-noise ratio in dB; infinite for equal images, None when no pixel counts."""
     difference = image.astype(np.int64) - reference
@@ -56,9 +53,9 @@ def psnr(
 
 
 def ssim(
-    image: Pixels,  # [H, W, 3]
-    reference: Pixels,  # [H, W, 3]
-    mask: Mask | None = None,  # [H, W] True = counts
+    image: ImageU8,  # [H, W, 3]
+    reference: ImageU8,  # [H, W, 3]
+    mask: MaskBool | None = None,  # [H, W] True = counts
 ) -> float | None:
     """Mean structural similarity (Wang et al., 2004) over pixels and channels; 1 for equal images.
 
@@ -91,7 +88,7 @@ def _windowed(values: NDArray[np.float64]) -> NDArray[np.float64]:
 class MetricSet:
     """The metrics of an evaluation, ready to be asked from several threads at once."""
 
-    lpips: Mapping[str, Callable[[Image, Image], float]]
+    lpips: Mapping[str, Callable[[ImageF32, ImageF32], float]]
     """Metric -> distance of two float32 sRGB images."""
     scorers: Mapping[str, Scorer]
     weights: Mapping[str, str]
@@ -101,9 +98,9 @@ class MetricSet:
 
     def measure(
         self,
-        image: Pixels,  # [H, W, 3]
-        reference: Pixels,  # [H, W, 3]
-        mask: Mask | None,  # [H, W] True = counts
+        image: ImageU8,  # [H, W, 3]
+        reference: ImageU8,  # [H, W, 3]
+        mask: MaskBool | None,  # [H, W] True = counts
     ) -> dict[str, float | None]:
         """All metrics of an image; those that cannot be had are None.
 
@@ -124,7 +121,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
 
     Raises InputError for a scorer of an unknown name or an unusable file.
     """
-    lpips: dict[str, Callable[[Image, Image], float]] = {}
+    lpips: dict[str, Callable[[ImageF32, ImageF32], float]] = {}
     scorers: dict[str, Scorer] = {}
     weights: dict[str, str] = {}
     unavailable: dict[str, str] = {}
@@ -144,7 +141,7 @@ def load_metrics(options: EvalOptions) -> MetricSet:
     return MetricSet(lpips, scorers, weights, unavailable)
 
 
-def _floats(image: Pixels) -> Image:
+def _floats(image: ImageU8) -> ImageF32:
     return image.astype(np.float32) / np.float32(255)
 
 
@@ -154,7 +151,7 @@ def _floats(image: Pixels) -> Image:
 def fit_affine(
     image: NDArray[np.float64],  # [H, W, 3] sRGB in [0, 1]
     reference: NDArray[np.float64],  # [H, W, 3]
-    mask: Mask | None,  # [H, W] True = counts
+    mask: MaskBool | None,  # [H, W] True = counts
 ) -> NDArray[np.float64]:  # [3, 4]
     """Matrix and offset of least squares over the pixels that count; the identity when none does."""
     x = image.reshape(-1, 3) if mask is None else image[mask]
@@ -192,20 +189,20 @@ def depth_of_points(
 
 
 def far_pixels(
-    depth: NDArray[np.float32],  # [H, W] summed with the weights of blending
-    alpha: NDArray[np.float32],  # [H, W]
+    depth: PlaneF32,  # [H, W] summed with the weights of blending
+    alpha: PlaneF32,  # [H, W]
     farthest: float,
-) -> Mask:
+) -> MaskBool:
     """Where a scene shows something behind ``farthest``, or hardly anything."""
     return np.asarray((alpha < 0.5) | (depth > farthest * alpha))
 
 
-def clipped_pixels(reference: Pixels) -> Mask:
+def clipped_pixels(reference: ImageU8) -> MaskBool:
     """Where a channel is at its upper end."""
     return np.asarray((reference >= CLIPPED).any(axis=-1))
 
 
-def region(image: Pixels, reference: Pixels, part: Mask, mask: Mask | None) -> Region:
+def region(image: ImageU8, reference: ImageU8, part: MaskBool, mask: MaskBool | None) -> Region:
     """What an image is like in ``part`` of those pixels that ``mask`` lets count."""
     counting = part if mask is None else part & mask
     pixels = part.size if mask is None else int(mask.sum())

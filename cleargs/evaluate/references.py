@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.capture.cameras import Camera as Lens
+from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.folders import chosen, name_below_images, natural_key
@@ -24,7 +24,6 @@ from cleargs.capture.undistort import Undistorter, undistorter
 from cleargs.digest import tree_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.eval_report import Alignment, PosesFrom
-from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.evaluate.refinement import rotation_between
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
@@ -33,6 +32,7 @@ from cleargs.media import IMAGE_SUFFIXES
 from cleargs.models.tiling import MIN_SIDE
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
+from cleargs.types import ImageU8, MaskBool
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ class ReferenceView:
     """Stem of its file: what it is matched by."""
     camera: Camera
     """Pinhole of the image, in the scene's world."""
-    load: Callable[[], tuple[Pixels, Mask | None]]
+    load: Callable[[], tuple[ImageU8, MaskBool | None]]
     """Gives the image [H, W, 3] and its mask [H, W] (True counts; None: all do). Raises InputError."""
 
     @property
@@ -117,7 +117,7 @@ def reference_of(
         found = _held_out(ingest, frames)
     else:
         listed = _listed(directory)
-        own = _by_stem((stem_of(frame.name), _own_pose(frame)) for frame in frames if frame.registered)
+        own = _by_stem((stem_of(frame.name), _run_pose(frame)) for frame in frames if frame.registered)
         hint = f"name the references like the frames (cleargs show {run} ingest)"
         alignment = Alignment(world="ingest", matched=len(listed.keys() & own.keys()))
         if poses == "given":
@@ -179,7 +179,7 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         reporter.info(text)
 
 
-def _own_pose(frame: Frame) -> Pose:
+def _run_pose(frame: Frame) -> Pose:
     """The pose that the run has of a registered frame."""
     values = (frame.qw, frame.qx, frame.qy, frame.qz, frame.tx, frame.ty, frame.tz)
     numbers = np.array([value for value in values if value is not None], np.float64)
@@ -295,7 +295,7 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
 
 
 def _about_there(camera: Camera, frame: Frame) -> bool:
-    pose = _own_pose(frame)
+    pose = _run_pose(frame)
     near = np.linalg.norm(camera.centre - pose.centre) < SAME_VIEW
     return bool(near) and rotation_between(camera.world_to_camera[:3, :3], pose.rotation) < np.degrees(
         SAME_VIEW
@@ -330,7 +330,7 @@ def _listed(directory: Path) -> dict[str, ReferenceView]:
     return _by_stem(views)
 
 
-def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[Pixels, Mask | None]:
+def _load(frame: SourceFrame, lens: Lens, way: Undistorter) -> tuple[ImageU8, MaskBool | None]:
     """The pinhole image of a reference, and its mask."""
     image, stencil = read_image(frame), read_stencil(frame)
     if image.shape[1::-1] != (lens.width, lens.height):

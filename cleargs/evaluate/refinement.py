@@ -11,15 +11,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cleargs.evaluate.eval_report import Refinement
-from cleargs.evaluate.metrics import Mask, Pixels
 from cleargs.splat.camera import Camera
+from cleargs.types import ArrayF64, ImageU8, MaskBool
 
-Floats = NDArray[np.float64]
-Render = Callable[[Camera], Floats]
+Render = Callable[[Camera], ArrayF64]
 """Gives [H, W, 3] sRGB in [0, 1]."""
 
 LONG_SIDE = 320
@@ -33,8 +31,8 @@ def refine_pose(
     render: Render,
     camera: Camera,
     depth: float,
-    reference: Pixels,  # [H, W, 3]
-    mask: Mask | None,  # [H, W] True = counts
+    reference: ImageU8,  # [H, W, 3]
+    mask: MaskBool | None,  # [H, W] True = counts
     steps: int,
 ) -> tuple[Camera, Refinement]:
     """The camera with the pose that lowers the mean squared difference, after ``steps`` steps.
@@ -51,11 +49,11 @@ def refine_pose(
         counts = (np.asarray(covered) > 0.999).astype(np.float64)
     pixel = np.repeat([1.0 / small.fx, depth / small.fx], 3)  # of turning (rad) and of moving (scene units)
 
-    def difference(pose: Camera) -> Floats:
+    def difference(pose: Camera) -> ArrayF64:
         masked = (render(pose) - target) * counts[..., None]
         return np.asarray(cv2.GaussianBlur(masked, (0, 0), _BLUR), np.float64).ravel()
 
-    def loss(residual: Floats) -> float:
+    def loss(residual: ArrayF64) -> float:
         return float((residual * residual).sum() / max(1.0, 3.0 * counts.sum()))
 
     pose, residual = small, difference(small)
@@ -66,7 +64,7 @@ def refine_pose(
         if normal is None or gradient is None:
             jacobian = np.stack(
                 [
-                    difference(moved(pose, axis)) - difference(moved(pose, -axis))
+                    difference(apply_twist(pose, axis)) - difference(apply_twist(pose, -axis))
                     for axis in np.diag(pixel * _DIFFERENCE)
                 ]
             ) / (2.0 * _DIFFERENCE)
@@ -74,7 +72,7 @@ def refine_pose(
             normal = np.einsum("im,jm->ij", jacobian, jacobian)
             gradient = np.einsum("im,m->i", jacobian, residual)
         damped = normal + np.diag(damping * normal.diagonal() + 1e-12)
-        candidate = moved(pose, -np.linalg.solve(damped, gradient) * pixel)
+        candidate = apply_twist(pose, -np.linalg.solve(damped, gradient) * pixel)
         tried = difference(candidate)
         if loss(tried) < lowest:
             pose, residual, lowest = candidate, tried, loss(tried)
@@ -90,7 +88,7 @@ def refine_pose(
     )
 
 
-def moved(camera: Camera, twist: Floats) -> Camera:
+def apply_twist(camera: Camera, twist: ArrayF64) -> Camera:
     """``camera`` turned (``twist[:3]``, rotation vector) and moved (``twist[3:]``) in its own axes."""
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
@@ -98,6 +96,6 @@ def moved(camera: Camera, twist: Floats) -> Camera:
     return replace(camera, world_to_camera=step @ camera.world_to_camera)
 
 
-def rotation_between(a: Floats, b: Floats) -> float:  # [3, 3] each
+def rotation_between(a: ArrayF64, b: ArrayF64) -> float:  # [3, 3] each
     """Angle between two rotations, degrees."""
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))

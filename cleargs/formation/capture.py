@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cleargs.formation.exposure import AffineOptimiser, Exposure
-from cleargs.formation.frame import FrameFormation, explain, packed, unpacked
-from cleargs.formation.photograph import FormedView, pixel_weights
+from cleargs.formation.frame import FrameFormation, fit_motion, packed, unpacked
+from cleargs.formation.observed import FormedView, pixel_weights
 from cleargs.splat.config import FormationConfig
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import group
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 SEARCH_EVERY = 4
 """One in so many fits of a frame begins from scratch."""
@@ -56,7 +56,7 @@ class CaptureFormation:
 
     def __init__(
         self,
-        views: Sequence[View],
+        views: Sequence[TrainingView],
         config: FormationConfig,
         *,
         exposure: Exposure | None = None,
@@ -112,7 +112,7 @@ class CaptureFormation:
 
     def form(
         self,
-        view: View,
+        view: TrainingView,
         factor: float,
         progress: float,
         target: Tensor,
@@ -127,7 +127,7 @@ class CaptureFormation:
         def explained() -> FrameFormation:
             """How the frame was taken, in the light of the scene as it is."""
             frame = self._frames[frame_id]
-            return explain(
+            return fit_motion(
                 frame,
                 self._config,
                 camera,
@@ -159,11 +159,11 @@ class CaptureFormation:
             weight = self.weight(frame_id)
             if frame.model != "none":
                 motion = frame
-        doubt = None
+        robust_mask = None
         if begun and self._config.unexplained > 0.0:
             tolerance = self._config.unexplained
-            doubt = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
-        if motion is None and affine is None and doubt is None:
+            robust_mask = partial(pixel_weights, target=target, mask=mask, tolerance=tolerance)
+        if motion is None and affine is None and robust_mask is None:
             return None
         return FormedView(
             camera,
@@ -173,7 +173,7 @@ class CaptureFormation:
             affines=affines,
             formation=motion,
             factor=factor,
-            doubt=doubt,
+            robust_mask=robust_mask,
         )
 
     def digest(self) -> str:
@@ -215,7 +215,7 @@ def _tested_frames(count: int) -> list[int]:
     return [(2 * k + 1) * count // (2 * tested) for k in range(tested)]
 
 
-def _affines(exposure: Exposure, views: Sequence[View], rate: float) -> AffineOptimiser:
+def _affines(exposure: Exposure, views: Sequence[TrainingView], rate: float) -> AffineOptimiser:
     """Affines for every frame given or seen; the median counts the weights of the real views."""
     frame_ids = np.union1d(exposure.frame_ids, [view.frame_id for view in views]).astype(np.int32)
     weights: NDArray[np.float64] = np.zeros(len(frame_ids))

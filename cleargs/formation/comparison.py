@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cleargs.formation.motion import Floats, FrameMotion, Model, Vector, flow_basis, widened
+from cleargs.formation.motion import FrameMotion, Model, flow_basis, widened
 from cleargs.formation.warp import samples
 from cleargs.media.colour import LUMA, linear_from_srgb
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels.cpu import backend as cpu
 from cleargs.splat.kernels.warp_layout import MAX_NEARNESS, MIN_COVERED
+from cleargs.types import ArrayF32, ArrayF64, MaskBool
 
 LEVELS = ((160, 6), (320, 5), (640, 3))
 """Longest side in pixels and Gauss-Newton steps, from coarse to fine."""
@@ -39,29 +40,29 @@ OUTLIER, LIMIT = 0.03, 0.1
 MIN_MISFIT = 5e-4
 """Misfit, in linear light, below which there is nothing to explain: what rounding to eight bits leaves."""
 
-JUDGE_BLOCK, JUDGE_EVERY = 16, 4
+HOLDOUT_BLOCK, HOLDOUT_EVERY = 16, 4
 """Side in pixels of the blocks of which every fourth judges."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FramePair:
     """A raw frame and the render that should explain it.
 
     ``luminance``, ``depth`` and ``alpha`` of the render are larger than the frame by ``margin`` pixels on
     every side; ``camera`` is the frame's.
     """
 
-    luminance: Floats  # [H + 2 margin, W + 2 margin] linear light
-    depth: Floats
-    alpha: Floats
-    observed: Floats  # [H, W] linear luminance
-    weight: Floats  # [H, W] 0 where a pixel does not count
+    luminance: ArrayF32  # [H + 2 margin, W + 2 margin] linear light
+    depth: ArrayF32
+    alpha: ArrayF32
+    observed: ArrayF32  # [H, W] linear luminance
+    weight: ArrayF32  # [H, W] 0 where a pixel does not count
     camera: Camera
     margin: int
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class MotionFit:
     """A model of a frame, and how well it explains it."""
 
     model: Model
@@ -82,7 +83,7 @@ def explained_share(misfit: float, misfit_still: float) -> float:
     return 1.0 - misfit / misfit_still if misfit_still > MIN_MISFIT else 0.0
 
 
-def luminance(image: Floats) -> Floats:
+def luminance(image: ArrayF32) -> ArrayF32:
     """Linear luminance [H, W] of an sRGB image."""
     kr, kb = LUMA["bt709"]
     # einsum, not BLAS, whose order of summation may depend on its threads.
@@ -90,9 +91,9 @@ def luminance(image: Floats) -> Floats:
     return np.asarray(np.einsum("hwc,c->hw", linear_from_srgb(image), weights))
 
 
-def scales(sight: Sight) -> list[float]:
+def scales(pair: FramePair) -> list[float]:
     """The sizes at which a frame is compared, as shares of its own, the coarsest first."""
-    longest = max(sight.observed.shape)
+    longest = max(pair.observed.shape)
     sizes = [size for size, _ in LEVELS if size < longest] or [longest]
     if sizes[-1] < longest < NEAR_SIZE * sizes[-1]:
         sizes[-1] = longest
@@ -106,11 +107,11 @@ class SearchKernels(Protocol):
 
     def misfit(
         self,
-        image: Floats,
-        observed: Floats,
-        weight: Floats,
-        fields: tuple[Floats, Floats, Floats],
-        samples: Floats,
+        image: ArrayF32,
+        observed: ArrayF32,
+        weight: ArrayF32,
+        fields: tuple[ArrayF32, ArrayF32, ArrayF32],
+        samples: ArrayF32,
         limit: float,
     ) -> float:
         """Return the sum of weight * min(|observed - exposed image|, limit)."""
@@ -118,17 +119,17 @@ class SearchKernels(Protocol):
 
     def normal_equations(
         self,
-        stack: Floats,
-        observed: Floats,
-        weight: Floats,
-        basis: Floats,
-        down: Floats,
-        offset: Floats,
-        sweep: Floats,
-        times: Floats,
+        stack: ArrayF32,
+        observed: ArrayF32,
+        weight: ArrayF32,
+        basis: ArrayF32,
+        down: ArrayF32,
+        offset: ArrayF32,
+        sweep: ArrayF32,
+        times: ArrayF32,
         outlier: float,
         active: NDArray[np.int64],
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
         ...
 
@@ -136,58 +137,58 @@ class SearchKernels(Protocol):
 class Level:
     """The problem at one size."""
 
-    def __init__(self, sight: Sight, scale: float, kernels: SearchKernels = cpu) -> None:
+    def __init__(self, pair: FramePair, scale: float, kernels: SearchKernels = cpu) -> None:
         self._kernels = kernels
-        margin = sight.margin
-        height, width = sight.luminance.shape
+        margin = pair.margin
+        height, width = pair.luminance.shape
         size = max(2, round(scale * width)), max(2, round(scale * height))
 
-        def reduced(image: Floats) -> Floats:
+        def reduced(image: ArrayF32) -> ArrayF32:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
         inner = np.s_[margin : height - margin, margin : width - margin]
         # Beyond the frame's border the render stands in, so that both are high-passed alike there.
-        observed, weight = sight.luminance.copy(), np.zeros_like(sight.luminance)
-        observed[inner], weight[inner] = sight.observed, sight.weight
-        self._image, self._observed = _high_passed(reduced(sight.luminance)), _high_passed(reduced(observed))
+        observed, weight = pair.luminance.copy(), np.zeros_like(pair.luminance)
+        observed[inner], weight[inner] = pair.observed, pair.weight
+        self._image, self._observed = _high_passed(reduced(pair.luminance)), _high_passed(reduced(observed))
         counted = (reduced(weight) > 0.99).astype(np.float32)
-        judging = _judging(counted.shape)
-        self._fitting, self._judging = counted * ~judging, counted * judging
-        if not self._judging.any():  # an image of a few blocks
-            self._judging = self._fitting = counted
-        self._total = float(self._judging.sum(dtype=np.float64))
-        depth, alpha = reduced(sight.depth), reduced(sight.alpha)
-        self.median = _median_depth(sight)
+        holdout = _holdout_mask(counted.shape)
+        self._fitting, self._holdout = counted * ~holdout, counted * holdout
+        if not self._holdout.any():  # an image of a few blocks
+            self._holdout = self._fitting = counted
+        self._total = float(self._holdout.sum(dtype=np.float64))
+        depth, alpha = reduced(pair.depth), reduced(pair.alpha)
+        self.median = _median_depth(pair)
         self.nearness = _nearness(depth, alpha, self.median)
-        self._basis = flow_basis(widened(sight.camera, margin), self.nearness)
+        self._basis = flow_basis(widened(pair.camera, margin), self.nearness)
         self.scale = size[0] / width
         rows = (np.arange(size[1]) + 0.5) * height / size[1] - margin
-        self._down = (rows / sight.camera.height - 0.5).astype(np.float32)
+        self._down = (rows / pair.camera.height - 0.5).astype(np.float32)
         slopes = [cv2.Sobel(self._image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
         self._stack = np.ascontiguousarray(np.stack([self._image, *slopes], -1), np.float32)
 
-    def judged(self, model: Model, motion: FrameMotion) -> Explanation:
+    def evaluate(self, model: Model, motion: FrameMotion) -> MotionFit:
         """How well a motion explains the pixels that judge."""
         total = max(self._total, 1.0)
-        still = self._misfit(FrameMotion(), FINE, self._judging) / total
+        still = self._misfit(FrameMotion(), FINE, self._holdout) / total
         misfit = still
         if model != "none":
             times = DISC if model == "defocus" else FINE
-            misfit = self._misfit(motion, times, self._judging) / total
-        return Explanation(model, motion, misfit, still)
+            misfit = self._misfit(motion, times, self._holdout) / total
+        return MotionFit(model, motion, misfit, still)
 
-    def cost(self, motion: FrameMotion, times: Floats = FINE) -> float:
+    def cost(self, motion: FrameMotion, times: ArrayF32 = FINE) -> float:
         """What is left on the pixels that fit."""
         return self._misfit(motion, times, self._fitting)
 
-    def _misfit(self, motion: FrameMotion, times: Floats, weight: Floats) -> float:
+    def _misfit(self, motion: FrameMotion, times: ArrayF32, weight: ArrayF32) -> float:
         fields = self.fields(motion)
         return self._kernels.misfit(self._image, self._observed, weight, fields, times, LIMIT)
 
-    def fields(self, motion: FrameMotion) -> tuple[Floats, Floats, Floats]:
+    def fields(self, motion: FrameMotion) -> tuple[ArrayF32, ArrayF32, ArrayF32]:
         """Offset, sweep and radius: see `DisplacementFields`."""
 
-        def flow(twist: Vector) -> Floats:
+        def flow(twist: ArrayF64) -> ArrayF32:
             if not twist.any():
                 return np.zeros(self._basis.shape[1:], np.float32)
             # einsum, for its fixed order of summation.
@@ -197,7 +198,7 @@ class Level:
         radius = np.abs(self.nearness - np.float32(motion.focus)) * np.float32(motion.disc_px * self.scale)
         return offset, flow(motion.blur), radius
 
-    def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[Vector, Vector]:
+    def normal_equations(self, motion: FrameMotion, active: NDArray[np.int64]) -> tuple[ArrayF64, ArrayF64]:
         """Matrix and right side of a Gauss-Newton step over the ``active`` numbers of the motion."""
         offset, sweep, _ = self.fields(motion)
         return self._kernels.normal_equations(
@@ -214,19 +215,19 @@ class Level:
         )
 
 
-def _judging(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _holdout_mask(shape: tuple[int, ...]) -> MaskBool:
     """True in every fourth block, no two of which share a side: bool [H, W]."""
-    row, column = (np.arange(side) // JUDGE_BLOCK for side in shape)
-    return np.asarray((column[None] + 2 * row[:, None]) % JUDGE_EVERY == 0)
+    row, column = (np.arange(side) // HOLDOUT_BLOCK for side in shape)
+    return np.asarray((column[None] + 2 * row[:, None]) % HOLDOUT_EVERY == 0)
 
 
-def _median_depth(sight: Sight) -> float:
-    depth, alpha = sight.depth[::4, ::4], sight.alpha[::4, ::4]
+def _median_depth(pair: FramePair) -> float:
+    depth, alpha = pair.depth[::4, ::4], pair.alpha[::4, ::4]
     seen = (alpha > MIN_COVERED) & (depth > 0.0)
     return float(np.median(depth[seen] / alpha[seen])) if seen.any() else 1.0
 
 
-def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
+def _nearness(depth: ArrayF32, alpha: ArrayF32, median: float) -> ArrayF32:
     """As in the kernel `displacements`."""
     seen = (alpha > MIN_COVERED) & (depth > 0.0)
     near = np.ones_like(depth)
@@ -234,5 +235,5 @@ def _nearness(depth: Floats, alpha: Floats, median: float) -> Floats:
     return near
 
 
-def _high_passed(image: Floats) -> Floats:
+def _high_passed(image: ArrayF32) -> ArrayF32:
     return np.asarray(image - cv2.GaussianBlur(image, (0, 0), HIGH_PASS), np.float32)

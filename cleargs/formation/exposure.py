@@ -22,7 +22,7 @@ from cleargs.parquet import read_table, write_table
 from cleargs.splat.backend import backend_for
 from cleargs.splat.initialise import SparsePoints
 from cleargs.splat.tables import EXPOSURE
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 IDENTITY = np.eye(3, 4)
 """The affine that changes nothing, [3, 4]: matrix and offset."""
@@ -79,7 +79,7 @@ def centred(affines: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArr
     return np.asarray(affines - (median - IDENTITY), np.float64)
 
 
-def frame_gains(views: Sequence[View], sparse: SparsePoints) -> NDArray[np.float64]:
+def frame_gains(views: Sequence[TrainingView], sparse: SparsePoints) -> NDArray[np.float64]:
     """How much brighter than average each view shows the sparse points: gains [V], NaN where unknown.
 
     The median, over the points that a view observes, of its pixel at the point's projection over the point's

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.comparison import Explanation, Sight, explained_share, luminance
+from cleargs.formation.comparison import FramePair, MotionFit, explained_share, luminance
 from cleargs.formation.exposure import apply_affine
 from cleargs.formation.motion import MODELS, TWIST, FrameMotion, Model, widened
 from cleargs.formation.search import preferred, refine, search
@@ -41,7 +41,7 @@ class FrameFormation:
     motion: FrameMotion = field(default_factory=FrameMotion)
     model: Model = "none"
     misfit: float = 0.0
-    """Mean difference of high-passed linear luminance that the model leaves, see `comparison.Explanation`."""
+    """Mean difference of high-passed linear luminance that the model leaves, see `comparison.MotionFit`."""
     misfit_still: float = 0.0
     blur_px: float = 0.0
     """Mean length of the pixels' paths while they were exposed."""
@@ -70,7 +70,7 @@ def described(frame: FrameFormation) -> str:
     return ", ".join(f"{part} {lengths[part]:.1f} px" for part in parts if part in lengths) or "nothing"
 
 
-def explain(
+def fit_motion(
     frame: FrameFormation,
     config: FormationConfig,
     camera: Camera,
@@ -96,23 +96,23 @@ def explain(
         test_rolling: whether to tell, where they are not, what such a model would explain (`skew_gain`).
     """
     # What was found under the other belief about the shutter is searched for anew.
-    untold = frame.skew_gain is None or frame.skew_gain > config.accept
-    missed = rolling and _admitted(frame.model, rolling=False) and untold
-    warm = warm and _admitted(frame.model, rolling) and not missed
+    unmeasured = frame.skew_gain is None or frame.skew_gain > config.accept
+    untested = rolling and _admitted(frame.model, rolling=False) and unmeasured
+    warm = warm and _admitted(frame.model, rolling) and not untested
     # The motions that a search will find are not known yet.
     reach = frame.reach_px * factor if warm else 0.05 * max(camera.width, camera.height)
     margin = margin_for(reach, camera)
     rendered = render(widened(camera, margin))
-    sight = sight_of(rendered, affine, target, mask, camera, margin)
+    pair = frame_pair(rendered, affine, target, mask, camera, margin)
     known = _scaled(frame.motion, factor)
     if warm:
-        found = refine(sight, frame.model, known, pose=config.pose)
+        found = refine(pair, frame.model, known, pose=config.pose)
         best = found[-1]
     else:
-        found = search(sight, skew=rolling or test_rolling, pose=config.pose)
+        found = search(pair, skew=rolling or test_rolling, pose=config.pose)
         frame = replace(frame, skew_gain=_skew_gain(found) if rolling or test_rolling else None)
         if frame.model != "none":
-            found += refine(sight, frame.model, known, pose=config.pose)[1:]
+            found += refine(pair, frame.model, known, pose=config.pose)[1:]
         best = preferred([e for e in found if _admitted(e.model, rolling)])
     # Hysteresis: what was taken before may stay at half the gain that lets a model in.
     if best.explained < config.accept * (0.5 if frame.model == best.model else 1.0):
@@ -124,23 +124,23 @@ def _admitted(model: Model, rolling: bool) -> bool:
     return rolling or model not in ("skew", "both")
 
 
-def _skew_gain(found: list[Explanation]) -> float:
+def _skew_gain(found: list[MotionFit]) -> float:
     """Share of the misfit that is left without a skew and goes with one."""
     still = preferred([e for e in found if _admitted(e.model, rolling=False)])
     rolled = preferred([e for e in found if not _admitted(e.model, rolling=False)])
     return max(0.0, explained_share(rolled.misfit, still.misfit))
 
 
-def sight_of(
+def frame_pair(
     rendered: Render, affine: Tensor | None, target: Tensor, mask: Tensor | None, camera: Camera, margin: int
-) -> Sight:
+) -> FramePair:
     """What a search compares: masked pixels of the frame show the render."""
     assert rendered.depth is not None
     image = rendered.image if affine is None else apply_affine(rendered.image, affine)
     shown, seen = image.clamp(0.0, 1.0).cpu().numpy(), target.cpu().numpy()
     counts = np.ones(seen.shape[:2], np.bool_) if mask is None else mask.cpu().numpy()
     inner = shown[margin : margin + camera.height, margin : margin + camera.width]
-    return Sight(
+    return FramePair(
         luminance(shown),
         rendered.depth.cpu().numpy(),
         rendered.alpha.cpu().numpy(),
@@ -152,7 +152,7 @@ def sight_of(
 
 
 def _described(
-    frame: FrameFormation, best: Explanation, factor: float, camera: Camera, rendered: Render, margin: int
+    frame: FrameFormation, best: MotionFit, factor: float, camera: Camera, rendered: Render, margin: int
 ) -> FrameFormation:
     """The frame with a new explanation; lengths in pixels of the full image."""
     motion = _scaled(best.motion, 1.0 / factor)

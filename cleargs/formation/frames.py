@@ -12,10 +12,11 @@ import numpy as np
 from cleargs.capture.tables import Frame
 from cleargs.errors import StageError
 from cleargs.splat.camera import Camera
-from cleargs.splat.views import Mask, Pixels, View
+from cleargs.splat.views import TrainingView
+from cleargs.types import AnyImage, MaskBool
 
 
-def view_of(frame: Frame, folder: Path, weight: float) -> View:
+def view_of(frame: Frame, folder: Path, weight: float) -> TrainingView:
     """The view of a registered frame, whose files lie in ``folder`` (the ingest folder)."""
     quaternion = np.array([frame.qw, frame.qx, frame.qy, frame.qz], np.float64)
     translation = np.array([frame.tx, frame.ty, frame.tz], np.float64)
@@ -31,10 +32,10 @@ def view_of(frame: Frame, folder: Path, weight: float) -> View:
     pose[:3, 3] = translation
     camera = Camera(frame.width, frame.height, frame.fx, frame.fy, frame.cx, frame.cy, pose)
     image, mask = folder / frame.image, folder / frame.mask if frame.mask else None
-    return View(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
+    return TrainingView(frame.frame_id, camera, weight, "real", partial(_load, image, mask))
 
 
-def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[View]:
+def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Path) -> list[TrainingView]:
     """The active frames, by frame_id: registered, not held out, weight above 0. Decodes nothing."""
     active = [
         frame
@@ -46,7 +47,7 @@ def real_views(frames: Iterable[Frame], weights: Mapping[int, float], folder: Pa
     ]
 
 
-def _load(image: Path, mask: Path | None) -> tuple[Pixels, Mask | None]:
+def _load(image: Path, mask: Path | None) -> tuple[AnyImage, MaskBool | None]:
     """Decode a PNG and its mask (0 = ignore)."""
     pixels = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
     ignored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask is not None else None

@@ -6,12 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.splat.camera import Camera
-
-Floats = NDArray[np.float32]
-Vector = NDArray[np.float64]
+from cleargs.types import ArrayF32, ArrayF64
 
 TWIST = 6
 """Numbers of a twist: translation by x, y, z, then rotation about them, in camera axes."""
@@ -22,7 +19,7 @@ Model: TypeAlias = Literal["none", "blur", "skew", "both", "defocus"]
 MODELS: tuple[Model, ...] = ("none", "blur", "skew", "both", "defocus")
 
 
-def _still() -> Vector:
+def _still() -> ArrayF64:
     return np.zeros(TWIST)
 
 
@@ -34,11 +31,11 @@ class FrameMotion:
     They are in pixels: a rotation by angle a is fx * a, a translation by d is fx * d / median depth.
     """
 
-    blur: Vector = field(default_factory=_still)
+    blur: ArrayF64 = field(default_factory=_still)
     """From the start to the end of a row's exposure."""
-    skew: Vector = field(default_factory=_still)
+    skew: ArrayF64 = field(default_factory=_still)
     """From the first to the last row's exposure: the rolling shutter. The middle row has the frame's pose."""
-    pose: Vector = field(default_factory=_still)
+    pose: ArrayF64 = field(default_factory=_still)
     """From the frame's pose as given to that at the middle of its exposure."""
     disc_px: float = 0.0
     """Radius of the disc of defocus, pixels per unit of nearness beyond the focus."""
@@ -47,11 +44,11 @@ class FrameMotion:
     median_depth: float = 1.0
 
     @property
-    def vector(self) -> Vector:
+    def vector(self) -> ArrayF64:
         """Pose, blur and skew, [18]."""
         return np.concatenate([self.pose, self.blur, self.skew])
 
-    def with_vector(self, vector: Vector) -> FrameMotion:
+    def with_vector(self, vector: ArrayF64) -> FrameMotion:
         """This motion with another pose, blur and skew [18]."""
         pose, blur, skew = vector.reshape(3, TWIST)
         return replace(self, pose=pose, blur=blur, skew=skew)
@@ -72,8 +69,8 @@ def widened(camera: Camera, margin: int) -> Camera:
 
 def flow_basis(
     camera: Camera,
-    nearness: Floats,  # [H, W] median depth over depth
-) -> Floats:
+    nearness: ArrayF32,  # [H, W] median depth over depth
+) -> ArrayF32:
     """Where a pixel looks in the still image under each component of a twist of the scene past the camera:
     [6, 2, H, W] pixels per unit. It is the flow that the same motion of the camera gives.
 

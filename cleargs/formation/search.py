@@ -16,14 +16,15 @@ from cleargs.formation.comparison import (
     COARSE,
     DISC,
     LEVELS,
-    Explanation,
+    FramePair,
     Level,
+    MotionFit,
     SearchKernels,
-    Sight,
     scales,
 )
-from cleargs.formation.motion import TWIST, FrameMotion, Model, Vector
+from cleargs.formation.motion import TWIST, FrameMotion, Model
 from cleargs.splat.kernels.cpu import backend as cpu
+from cleargs.types import ArrayF64
 
 WARM_STEPS = 2
 """Gauss-Newton steps of a fit that starts from the last one."""
@@ -40,14 +41,14 @@ RADII = (1.0, 2.0, 3.0, 4.5, 7.0)
 NARROWING = (0.25, 0.12, 0.06)
 """Steps of its pattern search, as shares of the radius and of the range of nearness."""
 
-PRICE = 0.005
+MODEL_PENALTY = 0.005
 """Share of the misfit that each further motion must explain to be preferred to a simpler model."""
 
 DAMPING, MORE_DAMPING = 1e-2, 6.0
-FLOOR = 1e-4
+DAMPING_FLOOR = 1e-4
 """Damping of every direction, as a share of the stiffest: what the image does not show stays near zero."""
 CONVERGED = 1e-3
-TRIES = 4
+MAX_TRIES = 4
 
 POSE, BLUR, SKEW = (slice(k * TWIST, (k + 1) * TWIST) for k in range(3))
 _ACTIVE: dict[Model, tuple[slice, ...]] = {"blur": (BLUR,), "skew": (SKEW,), "both": (BLUR, SKEW)}
@@ -55,15 +56,15 @@ _PARTS: dict[Model, int] = {"none": 0, "blur": 1, "skew": 1, "both": 2, "defocus
 
 
 def search(
-    sight: Sight, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
-) -> list[Explanation]:
+    pair: FramePair, *, skew: bool = True, pose: bool = False, kernels: SearchKernels = cpu
+) -> list[MotionFit]:
     """Every model at its best, from scratch. The first is ``none``.
 
     skew: whether models with a rolling shutter are tried too; without them it takes half the time.
     pose: whether a correction of the pose is sought beside each motion.
     kernels: the back end that computes misfits and normal equations.
     """
-    levels = [Level(sight, scale, kernels) for scale in scales(sight)]
+    levels = [Level(pair, scale, kernels) for scale in scales(pair)]
     coarse = levels[0]
     still = FrameMotion(median_depth=coarse.median)
     models: tuple[Model, ...] = ("both", "blur", "skew") if skew else ("blur",)
@@ -78,31 +79,31 @@ def search(
     for level in levels[1:]:
         disc = _narrowed(level, disc)
     found["defocus"] = disc
-    return [levels[-1].judged("none", still), *(levels[-1].judged(name, found[name]) for name in found)]
+    return [levels[-1].evaluate("none", still), *(levels[-1].evaluate(name, found[name]) for name in found)]
 
 
 def refine(
-    sight: Sight,
+    pair: FramePair,
     model: Model,
     motion: FrameMotion,
     *,
     pose: bool = False,
     kernels: SearchKernels = cpu,
-) -> list[Explanation]:
+) -> list[MotionFit]:
     """``model`` again, from the numbers of the last fit, at the finest level; the first is ``none``."""
-    level = Level(sight, scales(sight)[-1], kernels)
+    level = Level(pair, scales(pair)[-1], kernels)
     still = FrameMotion(median_depth=level.median)
     motion = replace(motion, median_depth=level.median)
     if model == "defocus":
         motion = _narrowed(level, motion)
     elif model != "none":
         motion = _best(level, [motion], model, WARM_STEPS, pose)
-    return [level.judged("none", still), level.judged(model, motion)]
+    return [level.evaluate("none", still), level.evaluate(model, motion)]
 
 
-def preferred(found: list[Explanation]) -> Explanation:
+def preferred(found: list[MotionFit]) -> MotionFit:
     """The model with the least misfit on the pixels that judge, simpler ones at a discount."""
-    return min(found, key=lambda e: e.misfit * (1.0 + PRICE * _PARTS[e.model]))
+    return min(found, key=lambda e: e.misfit * (1.0 + MODEL_PENALTY * _PARTS[e.model]))
 
 
 def _restricted(motion: FrameMotion, model: Model) -> FrameMotion:
@@ -170,8 +171,8 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
         diagonal = matrix.diagonal()
         if diagonal.max() <= 0.0:
             break  # nothing to see
-        for _ in range(TRIES):
-            damped = matrix + np.diag(damping * diagonal + FLOOR * diagonal.max())
+        for _ in range(MAX_TRIES):
+            damped = matrix + np.diag(damping * diagonal + DAMPING_FLOOR * diagonal.max())
             trial = vector.copy()
             trial[active] += np.linalg.solve(damped, side)
             tried = motion.with_vector(trial)
@@ -187,7 +188,7 @@ def _descend(level: Level, motion: FrameMotion, active: NDArray[np.int64], steps
     return motion
 
 
-def _rotation(length: float, angle: float) -> Vector:
+def _rotation(length: float, angle: float) -> ArrayF64:
     twist = np.zeros(TWIST)
     twist[3], twist[4] = length * math.sin(angle), length * math.cos(angle)
     return twist

@@ -11,12 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cleargs.formation.motion import Floats, FrameMotion
+from cleargs.formation.motion import FrameMotion
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.splat.backend import backend_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.kernels import warp_layout as layout
 from cleargs.splat.kernels.warp_layout import DisplacementFields
+from cleargs.types import ArrayF32
 
 SAMPLES_PER_PIXEL = 1.0
 """Samples per pixel of a blur's length. With 0.7 scenes end less sharp (up to 0.2 dB, a tenth more LPIPS),
@@ -58,7 +59,7 @@ def _within(count: float) -> int:
 
 
 @cache
-def samples(count: int) -> Floats:
+def samples(count: int) -> ArrayF32:
     """``count`` sample times and points of the disc: [count, 3] t, u, v.
 
     The times are the middles of equal parts of an exposure, from -1/2 to 1/2, in the order of `STEPS_APART`.
@@ -136,7 +137,7 @@ def _shortened(fields: DisplacementFields, parts: int) -> DisplacementFields:
     return DisplacementFields(torch.zeros_like(sweep), sweep, torch.zeros_like(fields.radius), reach)
 
 
-def padded(image: Floats) -> Floats:
+def padded(image: ArrayF32) -> ArrayF32:
     """[H, W, 3] with a fourth channel of zeros, as `Warp` takes it."""
     return np.concatenate([image, np.zeros_like(image[..., :1])], axis=2)
 

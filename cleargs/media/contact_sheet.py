@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.media.image import to_uint8
+from cleargs.types import AnyImage, ImageU8
 
 _LABEL_HEIGHT = 22  # px
 _GAP = 4  # px
@@ -21,7 +21,7 @@ _MARKED = (40, 120, 60)
 class Tile(NamedTuple):
     """One image of a sheet with its label above it."""
 
-    image: NDArray[np.float32] | NDArray[np.uint8] | None
+    image: AnyImage | None
     """[H, W, 3] sRGB, floats in [0, 1] or bytes; None leaves the place empty."""
     label: str
     """ASCII; what does not fit is cut off."""
@@ -29,7 +29,7 @@ class Tile(NamedTuple):
     """Whether the label stands on green."""
 
 
-def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> NDArray[np.uint8]:  # [H, W, 3]
+def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> ImageU8:  # [H, W, 3]
     """The rows of tiles below one another, each image resampled to ``tile_width`` px. At least one tile."""
     lines = [[_cell(tile, tile_width) for tile in row] for row in rows]
     heights = [max(len(cell) for cell in line) + _GAP for line in lines]
@@ -41,7 +41,7 @@ def contact_sheet(rows: Sequence[Sequence[Tile]], *, tile_width: int = 480) -> N
     return sheet
 
 
-def _cell(tile: Tile, width: int) -> NDArray[np.uint8]:
+def _cell(tile: Tile, width: int) -> ImageU8:
     """The label above the image."""
     label = np.full((_LABEL_HEIGHT, width, 3), _MARKED if tile.marked else _BACKGROUND, np.uint8)
     cv2.putText(label, tile.label, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)

@@ -13,11 +13,11 @@ import av
 import numpy as np
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import atomic_path
 from cleargs.media.colour import LUMA
+from cleargs.types import ImageU8
 
 Codec = Literal["h264", "av1"]
 
@@ -42,7 +42,7 @@ def require_even(width: int, height: int) -> None:
 
 def write_video(
     path: Path,
-    frames: Iterable[NDArray[np.uint8]],  # [H, W, 3] sRGB each
+    frames: Iterable[ImageU8],  # [H, W, 3] sRGB each
     fps: float,
     bits_per_pixel: float | None = None,
     *,
@@ -95,7 +95,7 @@ def _require_encoder(codec: Codec) -> None:
         ) from None
 
 
-def _planar(rgb: NDArray[np.uint8]) -> VideoFrame:
+def _planar(rgb: ImageU8) -> VideoFrame:
     """RGB as 4:4:4 Y'CbCr; swscale only thins out the chroma, since its matrix is several levels off."""
     kr, kb = LUMA["bt709"]
     red, green, blue = np.moveaxis(rgb / 255, -1, 0)

@@ -21,9 +21,9 @@ from cleargs.errors import StoreError
 from cleargs.files import atomic_path
 from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.untrusted import FAULTS, cause, open_regular
+from cleargs.safe_io import FAULTS, cause, open_regular
+from cleargs.types import ImageF32, PlaneF32
 
-Image: TypeAlias = NDArray[np.float32]  # [H, W, 3] sRGB
 Layer: TypeAlias = NDArray[np.float16]  # [H, W, 3] scene-linear Rec.709
 Attribute: TypeAlias = int | float | str
 
@@ -40,12 +40,12 @@ class LayeredImage:
     attributes: Mapping[str, Attribute]
 
 
-def to_layer(image: Image) -> Layer:
+def to_layer(image: ImageF32) -> Layer:
     """The stored form of an sRGB image [H, W, 3]."""
     return linear_from_srgb(image).astype(np.float16)
 
 
-def from_layer(layer: Layer) -> Image:
+def from_layer(layer: Layer) -> ImageF32:
     """The sRGB image [H, W, 3] that a stored layer stands for: what whoever reads the file works with."""
     return srgb_from_linear(layer.astype(np.float32))
 
@@ -65,9 +65,9 @@ def write_exr(path: Path, image: LayeredImage, *, shown: str | None = None) -> N
 
 def write_view(
     path: Path,
-    image: Image,
-    alpha: NDArray[np.float32],  # [H, W]
-    depth: NDArray[np.float32],  # [H, W] along the optical axis
+    image: ImageF32,
+    alpha: PlaneF32,  # [H, W]
+    depth: PlaneF32,  # [H, W] along the optical axis
 ) -> None:
     """Write one picture over black as the channels R, G, B, A (half) and Z (float), atomically.
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import write_bytes
@@ -21,7 +20,8 @@ from cleargs.media.photos import (
     photo_orientation,
     srgb_from_profile,
 )
-from cleargs.untrusted import cause, open_regular, read_bytes
+from cleargs.safe_io import cause, open_regular, read_bytes
+from cleargs.types import AnyImage, ImageU8, MaskU8
 
 _FORMATS = frozenset({"jpeg", "png", "webp", "tiff", "bmp", "jpegxl"})
 """Formats that are read, as OpenImageIO names them."""
@@ -97,7 +97,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
-def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W, 3]
+def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
     """The image in ``path`` as 8-bit sRGB; alpha is dropped, 16 bits are reduced to 8.
 
     ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
@@ -106,7 +106,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> NDArray[np.uint8]:  # [H, W
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
+def read_mask(path: Path) -> MaskU8:  # [H, W]
     """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
 
     The border lies in the middle, of masks of 0 and 1 alone, as some programs write them, above 0.
@@ -116,7 +116,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:  # [H, W]
     return np.asarray(np.where(grey > border, 255, 0), np.uint8)
 
 
-def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:  # [H, W]
+def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
     """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
 
     None where it is opaque all over. ``upright`` turns it as `read_rgb` does. Raises InputError like it.
@@ -132,7 +132,7 @@ def read_alpha(path: Path, *, upright: bool = True) -> NDArray[np.uint8] | None:
 
 def write_rgb(
     path: Path,
-    image: NDArray[np.uint8] | NDArray[np.float32],  # [H, W, 3]
+    image: AnyImage,  # [H, W, 3]
     *,
     quality: int | None = None,
 ) -> None:
@@ -146,19 +146,19 @@ def write_rgb(
     write_bytes(path, data.tobytes())
 
 
-def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:  # [H, W]
+def write_mask(path: Path, mask: MaskU8) -> None:  # [H, W]
     """Write a one-channel image atomically. Raises StoreError like `write_rgb`."""
     write_bytes(path, cv2.imencode(path.suffix, mask)[1].tobytes())
 
 
-def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
+def to_uint8(image: AnyImage) -> ImageU8:
     """Floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays as it is."""
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
-def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
+def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
     """The image [H, W, ...] as it is to be seen (``upright``) or as it is stored.
 
     It is decoded from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr.
@@ -185,7 +185,7 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> NDArray[Any]:
     return np.ascontiguousarray(image[::down, ::across])
 
 
-def _stored(path: Path, header: Header, flags: int) -> NDArray[Any]:
+def _stored(path: Path, header: Header, flags: int) -> AnyImage:
     """Return the image as it is stored, in OpenCV's order of channels, as its ``flags`` ask for it."""
     if header.format in _PHOTOS:
         with open_photo(path, header.format) as photo:
@@ -194,7 +194,7 @@ def _stored(path: Path, header: Header, flags: int) -> NDArray[Any]:
         content = read_bytes(path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint=_HINT) from error
-    image: NDArray[Any] | None = None
+    image: AnyImage | None = None
     if header.format == "jpegxl":
         from OpenImageIO import ImageInput, geterror
 
@@ -212,7 +212,7 @@ def _stored(path: Path, header: Header, flags: int) -> NDArray[Any]:
     return image
 
 
-def _as_flags_ask(pixels: NDArray[np.uint8], flags: int) -> NDArray[np.uint8]:  # [H, W, 3 or 4] RGB(A)
+def _as_flags_ask(pixels: ImageU8, flags: int) -> ImageU8:  # [H, W, 3 or 4] RGB(A)
     """Return ``pixels`` as OpenCV's flags of `imdecode` ask for them."""
     alpha = pixels.shape[2] == 4
     if flags == cv2.IMREAD_UNCHANGED:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from cleargs.errors import InputError
-from cleargs.untrusted import FAULTS, cause
+from cleargs.safe_io import FAULTS, cause
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
 """What Pillow raises for a file of the wrong form."""

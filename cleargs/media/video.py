@@ -22,13 +22,13 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.media import MAX_PIXELS
 from cleargs.media.colour import rgb_from_yuv, srgb_from_hdr
 from cleargs.media.image import to_uint8
-from cleargs.untrusted import open_regular
+from cleargs.safe_io import open_regular
+from cleargs.types import ImageF32, ImageU8
 
 _MATRICES = {1: "bt709", 4: "bt601", 5: "bt601", 6: "bt601", 7: "bt709", 9: "bt2020", 10: "bt2020"}
 _TRANSFERS = {16: "pq", 18: "hlg"}
@@ -105,7 +105,7 @@ def video_size(path: Path) -> tuple[int, int]:
         return stream.codec_context.width, stream.codec_context.height
 
 
-def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
     """Decode ``path`` once and yield (pts, RGB [H, W, 3]) of the wanted frames, one in memory at a time.
 
     Raises InputError when a wanted frame cannot be decoded, or has too many pixels.
@@ -115,12 +115,12 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArr
         missing.discard(number)
         wide = max(1, round(aspect * frame.width))
         _require_few(f"{path.name}: a frame would have", wide, frame.height, "square pixels")
-        yield number, _upright(frame, wide)
+        yield number, _oriented(frame, wide)
     if missing:
         raise InputError(f"{path.name}: {len(missing)} of its frames cannot be decoded", hint=_HINT)
 
 
-def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
     """Like `decode_frames`, but grey [H, W] and as the frames are stored: several times as fast. Frames that
     cannot be decoded, as at the start of a clip that was cut out of another, are left out.
     """
@@ -171,7 +171,7 @@ def _require_few(subject: str, width: int, height: int, what: str = "pixels") ->
         raise InputError(f"{subject} {width}x{height} {what}; at most {MAX_PIXELS} are read", hint=_HINT)
 
 
-def _upright(frame: VideoFrame, width: int) -> NDArray[np.uint8]:  # [H, W, 3]
+def _oriented(frame: VideoFrame, width: int) -> ImageU8:  # [H, W, 3]
     """A decoded frame as upright sRGB; ``width`` is that with square pixels, before it is turned."""
     rgb = frame.to_ndarray(format="rgb24") if frame.format.is_rgb else to_uint8(_signal(frame))
     if width != frame.width:
@@ -179,7 +179,7 @@ def _upright(frame: VideoFrame, width: int) -> NDArray[np.uint8]:  # [H, W, 3]
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
 
 
-def _signal(frame: VideoFrame) -> NDArray[np.float32]:  # [H, W, 3]
+def _signal(frame: VideoFrame) -> ImageF32:  # [H, W, 3]
     """R'G'B' of a Y'CbCr frame, tone-mapped to sRGB where it is HDR.
 
     swscale only brings chroma to full resolution, at the stream's own depth and range: its matrix

@@ -13,8 +13,9 @@ import numpy as np
 
 from cleargs.errors import InputError, StageError
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import Model, load_network
-from cleargs.models.tiling import Image, map_tiled
+from cleargs.models.registry import RegistryEntry, load_network
+from cleargs.models.tiling import map_tiled
+from cleargs.types import ImageF32
 
 
 class Expert(Protocol):
@@ -28,7 +29,7 @@ class Expert(Protocol):
     def digest(self) -> str:
         """Identifies the weights; part of the store key."""
 
-    def restore(self, image: Image, *, threads: int = 1) -> Image:
+    def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
         """The restored image, of the same bits for any ``threads``: [H, W, 3] float32 sRGB in [0, 1]."""
 
 
@@ -60,7 +61,7 @@ class OnnxExpert:
         self.name = name or path.stem
         self.digest = model.digest
 
-    def restore(self, image: Image, *, threads: int = 1) -> Image:
+    def restore(self, image: ImageF32, *, threads: int = 1) -> ImageF32:
         """See `Expert.restore`. Raises StageError when the model returns values that are not finite."""
         restored = map_tiled(
             lambda tiles: self._model.map(self._restore, tiles, threads), image, fixed=self._fixed
@@ -72,7 +73,7 @@ class OnnxExpert:
             )
         return np.clip(restored, np.float32(0.0), np.float32(1.0))
 
-    def _restore(self, tiles: Image) -> Image:
+    def _restore(self, tiles: ImageF32) -> ImageF32:
         """Tiles [N, h, w, 3], restored."""
         batch = tiles.transpose(0, 3, 1, 2) if self._channels_first else tiles
         output = self._model.run(np.ascontiguousarray(batch, np.float32))[0]
@@ -90,7 +91,7 @@ def load_expert(spec: str, device: Device = "cpu") -> Expert:
     also as `OnnxExpert` does.
     """
 
-    def own(path: Path, model: Model | None) -> Expert:
+    def own(path: Path, model: RegistryEntry | None) -> Expert:
         return OnnxExpert(path, None if model is None else spec, device)
 
     return load_network(spec, "expert", device, own)

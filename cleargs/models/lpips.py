@@ -24,7 +24,8 @@ from torch import Tensor, nn
 from cleargs.errors import InputError
 from cleargs.models.registry import model_dir
 from cleargs.models.tiling import MIN_SIDE
-from cleargs.untrusted import FAULTS, cause
+from cleargs.safe_io import FAULTS, cause
+from cleargs.types import ImageF32
 
 Net = Literal["alex", "vgg"]
 NETS: tuple[Net, ...] = get_args(Net)
@@ -75,7 +76,7 @@ class LpipsNetwork(nn.Module):
             taps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
         return taps
 
-    def distance(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    def distance(self, a: ImageF32, b: ImageF32) -> float:
         """LPIPS between two float32 sRGB images [H, W, 3] in [0, 1], at least 32 pixels on each side."""
         if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
             raise InputError(
@@ -187,7 +188,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _planes(image: NDArray[np.float32]) -> Tensor:
+def _planes(image: ImageF32) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)
 
 

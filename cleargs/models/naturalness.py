@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cleargs.models.tiling import Image, mean_over_tiles
-from cleargs.record import Record
+from cleargs.base_model import FrozenModel
+from cleargs.models.tiling import mean_over_tiles
+from cleargs.types import ImageF32
 
 COEFFICIENTS = "naturalness.toml"
 
@@ -33,7 +34,7 @@ _ERROR = 0.07  # scale of the error of the predicted LPIPS; see ``weights/README
 _BT601 = np.array([0.299, 0.587, 0.114], np.float32)
 
 
-class Quadratic(Record):
+class Quadratic(FrozenModel):
     """``weights . [1, z, z_i z_j (i <= j)]`` of the standardised features z."""
 
     mean: tuple[float, ...] = Field(description="Mean of each feature over the training patches.")
@@ -55,7 +56,7 @@ class StatisticsScorer:
         self.digest = hashlib.sha256(source).hexdigest()
         self._predict = Quadratic.model_validate(tomllib.loads(source.decode("utf-8")))
 
-    def score(self, image: Image, *, threads: int = 1) -> float:
+    def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """Between 0 and 100; the order is that of the predictions. See Scorer."""
         with ThreadPoolExecutor(threads) as pool:
             predicted = mean_over_tiles(
@@ -77,7 +78,7 @@ def expected(estimate: float) -> float:
     return float(_ERROR * (below - above))
 
 
-def features(image: Image) -> NDArray[np.float64]:
+def features(image: ImageF32) -> NDArray[np.float64]:
     """Nine figures at full and at half size. [18]
 
     image: [H, W, 3] float32 sRGB in [0, 1]. At each size: logarithms of the variance and the kurtosis of the
@@ -108,7 +109,7 @@ def terms(
     return np.concatenate([np.ones_like(z[..., :1]), z, z[..., i] * z[..., j]], axis=-1)
 
 
-def _scale_features(luma: Image) -> list[float]:
+def _scale_features(luma: ImageF32) -> list[float]:
     mean = _blur(luma)
     contrast = np.sqrt(np.maximum(_blur(luma * luma) - mean * mean, 0.0))
     mscn = ((luma - mean) / (contrast + _STABILISER)).astype(np.float64)
@@ -135,5 +136,5 @@ def _scale_features(luma: Image) -> list[float]:
     ]
 
 
-def _blur(image: Image) -> Image:
+def _blur(image: ImageF32) -> ImageF32:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), _WINDOW_SIGMA), np.float32)

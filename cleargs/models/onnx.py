@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cleargs.errors import InputError, StageError
 from cleargs.plugins import installed_version
-from cleargs.untrusted import cause, read_bytes
+from cleargs.safe_io import cause, read_bytes
 
 Device = Literal["cpu", "cuda"]
 

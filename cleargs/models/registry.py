@@ -13,11 +13,11 @@ from typing import Literal, TypeVar
 
 from pydantic import Field
 
+from cleargs.base_model import FrozenModel
 from cleargs.digest import file_digest as bytes_digest
 from cleargs.errors import InputError, did_you_mean
 from cleargs.plugins import load_part, plugins
-from cleargs.record import Record
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
 T = TypeVar("T")
 
@@ -28,7 +28,7 @@ Converter = Literal["lpips", "spandrel", "musiq", "clip-iqa"]
 _SHA256 = r"^[0-9a-f]{64}$"
 
 
-class Source(Record):
+class Source(FrozenModel):
     """The published file that carries the weights."""
 
     spec: str = Field(
@@ -57,7 +57,7 @@ class Source(Record):
         return f"{self.file} of {self.origin}" if self.origin else self.spec
 
 
-class InstalledFile(Record):
+class InstalledFile(FrozenModel):
     """A file that the installation writes into the model folder."""
 
     name: str = Field(description="File name in the model folder.")
@@ -69,7 +69,7 @@ class InstalledFile(Record):
     )
 
 
-class Model(Record):
+class RegistryEntry(FrozenModel):
     """One entry of ``registry.toml``."""
 
     name: str = Field(description="What commands and settings call it.")
@@ -101,13 +101,13 @@ class Model(Record):
         return f"in a checkout of ClearGS run `make convert-env`, then `{command}`"
 
 
-def load_registry() -> tuple[Model, ...]:
+def load_registry() -> tuple[RegistryEntry, ...]:
     """All models, in the order of the file."""
     text = (files("cleargs.models") / "registry.toml").read_text("utf-8")
-    return tuple(Model.model_validate(entry) for entry in tomllib.loads(text)["model"])
+    return tuple(RegistryEntry.model_validate(entry) for entry in tomllib.loads(text)["model"])
 
 
-def find_model(name: str) -> Model:
+def find_model(name: str) -> RegistryEntry:
     """The model of that name; raises InputError if there is none."""
     models = {model.name: model for model in load_registry()}
     if name not in models:
@@ -128,7 +128,7 @@ def model_dir() -> Path:
     return cache / "cleargs" / "models"
 
 
-def state(model: Model, directory: Path) -> State:
+def state(model: RegistryEntry, directory: Path) -> State:
     """Whether the model can be used, judged by the presence of its files alone."""
     if model.shipped is not None:
         return "shipped"
@@ -138,7 +138,7 @@ def state(model: Model, directory: Path) -> State:
     return "incomplete" if any(present) else "not installed"
 
 
-def registered(name: str, role: Role) -> Model | None:
+def registered(name: str, role: Role) -> RegistryEntry | None:
     """The registry's entry of that name and role."""
     return next((model for model in load_registry() if (model.name, model.role) == (name, role)), None)
 
@@ -173,7 +173,7 @@ def model_file(spec: str, role: Role) -> Path | None:
     )
 
 
-def load_network(spec: str, role: Role, device: str, own: Callable[[Path, Model | None], T]) -> T:
+def load_network(spec: str, role: Role, device: str, own: Callable[[Path, RegistryEntry | None], T]) -> T:
     """The expert or scorer that a setting names: what ``own`` makes of its file, and of its entry in the
     registry, or the part that another package brings.
 
@@ -189,7 +189,7 @@ def load_network(spec: str, role: Role, device: str, own: Callable[[Path, Model 
     return own(path, model)
 
 
-def verify(model: Model, directory: Path) -> None:
+def verify(model: RegistryEntry, directory: Path) -> None:
     """Check the files of an installed model, digest by digest, and that a shipped one is in its place.
 
     Raises InputError at the first one that is missing or differs from what the registry, or the receipt of
@@ -212,7 +212,7 @@ def verify(model: Model, directory: Path) -> None:
             raise InputError(f"{path} is damaged", hint=f"{model.install_hint} again")
 
 
-def read_receipt(model: Model, directory: Path) -> dict[str, str]:
+def read_receipt(model: RegistryEntry, directory: Path) -> dict[str, str]:
     """The digests of the installed files by name; none if there is no readable receipt."""
     try:
         digests = read_json(directory / model.receipt)["files"]

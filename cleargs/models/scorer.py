@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from cleargs.errors import InputError
 from cleargs.models.naturalness import StatisticsScorer
 from cleargs.models.onnx import Device, OnnxModel
-from cleargs.models.registry import Model, find_model, load_network
-from cleargs.models.tiling import Image, mean_over_tiles, require_scorable
+from cleargs.models.registry import RegistryEntry, find_model, load_network
+from cleargs.models.tiling import mean_over_tiles, require_scorable
+from cleargs.types import ImageF32
 
 CLARITY = "clarity-net"
 """The embedded network, meant for the primary role."""
@@ -55,7 +56,7 @@ class Scorer(Protocol):
     def digest(self) -> str:
         """Identifies the weights; part of the store key."""
 
-    def score(self, image: Image, *, threads: int = 1) -> float:
+    def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """0-100, higher is better; bitwise equal for any ``threads``.
 
         image: [H, W, 3] float32 sRGB in [0, 1], at least 32 pixels on each side. Raises InputError for any
@@ -74,18 +75,18 @@ class InformedScorer:
         self.name, self.digest = scorer.name, scorer.digest
         self._scorer = scorer
 
-    def score(self, image: Image, *, threads: int = 1) -> float:
+    def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """See Scorer. Raises InputError, too, when the other scorer gives no number."""
-        said = self._scorer.score(image, threads=threads)
-        if not math.isfinite(said):
+        value = self._scorer.score(image, threads=threads)
+        if not math.isfinite(value):
             raise InputError(
-                f"the scorer {self.name} gave {said} instead of a score",
+                f"the scorer {self.name} gave {value} instead of a score",
                 hint="use another scorer, or export its model again",
             )
-        return min(max(said, 0.0), 100.0) * information(image)
+        return min(max(value, 0.0), 100.0) * information(image)
 
 
-def information(image: Image) -> float:
+def information(image: ImageF32) -> float:
     """The share of an image [H, W, 3], float32 sRGB in [0, 1], that is neither flat nor clipped: 0 to 1.
 
     A scorer guesses the quality of what it sees. Where an image is flat, or clipped to black or white, there
@@ -135,11 +136,11 @@ class LearnedScorer:
         self._model = model
         self._tile = (shape[2] or tile, shape[3] or tile)
 
-    def score(self, image: Image, *, threads: int = 1) -> float:
+    def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """See Scorer."""
         return mean_over_tiles(lambda tiles: self._model.map(self._score, tiles, threads), image, self._tile)
 
-    def _score(self, tiles: Image) -> Image:
+    def _score(self, tiles: ImageF32) -> ImageF32:
         """The scores [N] of tiles [N, h, w, 3]."""
         planes = np.ascontiguousarray(tiles.transpose(0, 3, 1, 2), np.float32)
         return self._model.run(planes)[0].reshape(len(tiles), -1)[:, 0]
@@ -166,13 +167,13 @@ class MusiqScorer:
         self.digest = model.digest
         self._model = model
 
-    def score(self, image: Image, *, threads: int = 1) -> float:
+    def score(self, image: ImageF32, *, threads: int = 1) -> float:
         """The predicted mean opinion score, about 0 to 100. See Scorer."""
         require_scorable(image)
         return float(self._model.run(*patches(image))[0].item())
 
 
-def patches(image: Image) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+def patches(image: ImageF32) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
     """The patches [N, 3, 32, 32] of an sRGB image in [0, 1], in [-1, 1]; cells of the position grid [N] and
     numbers of the sizes [N].
     """
@@ -224,7 +225,7 @@ def load_scorer(spec: str, device: Device = "cpu") -> Scorer:
     Raises InputError for any other name, an unusable file or an installed one that was changed.
     """
 
-    def own(path: Path, model: Model | None) -> Scorer:
+    def own(path: Path, model: RegistryEntry | None) -> Scorer:
         if model is None:
             return LearnedScorer(path, device=device)
         if spec == NATURALNESS:

@@ -10,14 +10,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.errors import InputError
+from cleargs.types import AnyImage, ImageF32
 
-Image: TypeAlias = NDArray[np.float32]
 Sides: TypeAlias = tuple[int | None, int | None]
 """Height and width of the tiles, None where they are free."""
 
@@ -85,11 +85,11 @@ def _blend_weights(padded: int, size: int, starts: tuple[int, ...]) -> NDArray[n
 
 
 def map_tiled(
-    function: Callable[[Sequence[Image]], Iterable[Image]],
-    image: Image,
+    function: Callable[[Sequence[ImageF32]], Iterable[ImageF32]],
+    image: ImageF32,
     *,
     fixed: Sides = (None, None),
-) -> Image:
+) -> ImageF32:
     """The function's result on the whole image [H, W, 3], computed on tiles that it is given together.
 
     function: maps tiles [h, w, 3], all of one size, to as many of the same size, in their order.
@@ -119,7 +119,7 @@ def map_tiled(
 # -- image to figure: tiles that cover it --------------------------------------------------------------------
 
 
-def require_scorable(image: NDArray[Any]) -> None:
+def require_scorable(image: AnyImage) -> None:
     """Raise InputError for anything but [H, W, 3] float32 in [0, 1] of at least 32 pixels on each side.
 
     A scorer would give other types and ranges a score too, a wrong one.
@@ -143,7 +143,7 @@ def require_scorable(image: NDArray[Any]) -> None:
 
 
 def mean_over_tiles(
-    figures: Callable[[Sequence[Image]], Iterable[float]], image: Image, sides: Sides
+    figures: Callable[[Sequence[ImageF32]], Iterable[float]], image: ImageF32, sides: Sides
 ) -> float:
     """The mean of a figure over evenly spaced tiles [h, w, 3] that together cover ``image`` [H, W, 3].
 

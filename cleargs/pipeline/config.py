@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from cleargs.errors import ConfigError, did_you_mean
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.settings import Setting, flattened, settings_of, suggestion
-from cleargs.untrusted import FAULTS, cause, read_text
+from cleargs.safe_io import FAULTS, cause, read_text
 
 RECIPES = "cleargs.workflows"
 """The package that holds the recipes known by name."""

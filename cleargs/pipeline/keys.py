@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from cleargs.manifest import KeyParts
 from cleargs.pipeline.settings import fields_of, flattened
 from cleargs.pipeline.stage import Device, Stage
-from cleargs.plugins import Socket, installed_version, package_of, plugins
+from cleargs.plugins import ExtensionPoint, installed_version, package_of, plugins
 
 UPSTREAM = "of "
 """How the name of a table begins that holds the settings of another stage."""
@@ -59,7 +59,7 @@ def plugin_versions(config: BaseModel) -> dict[str, str]:
     for name, field, value in fields_of(config):
         extra = field.json_schema_extra
         if isinstance(extra, dict) and "plugin" in extra and value != field.default:
-            found = plugins(cast(Socket, extra["plugin"])).get(value)
+            found = plugins(cast(ExtensionPoint, extra["plugin"])).get(value)
             if found is not None:
                 distribution, version = package_of(found)
                 versions[f"{distribution} for {name}={value}"] = version

@@ -13,20 +13,20 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from cleargs.base_model import FrozenModel
 from cleargs.errors import StoreError
 from cleargs.files import write_json
-from cleargs.pipeline.store import writer_lives
+from cleargs.pipeline.store import writer_is_alive
 from cleargs.progress import PREVIEW, CountedTask, Reporter, Show, Task
-from cleargs.record import Record
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
 
-NOTE = ".at_work.json"
+PROGRESS_FILE = ".at_work.json"
 
 EVERY = 2.0
 """Seconds between two notes."""
 
 
-class AtWork(Record):
+class RunningStage(FrozenModel):
     """The progress of a stage."""
 
     stage: str
@@ -42,13 +42,13 @@ class AtWork(Record):
     """Of the present task."""
 
 
-def at_work(run: Path, store: Path) -> AtWork | None:
+def running_stage(run: Path, store: Path) -> RunningStage | None:
     """The progress of the run in the folder ``run``; None when it is not at work, or died."""
     try:
-        found = AtWork.model_validate(read_json(run / NOTE))
+        found = RunningStage.model_validate(read_json(run / PROGRESS_FILE))
     except FAULTS:  # ValidationError is a ValueError
         return None
-    return found if writer_lives(store / "work" / found.work) else None
+    return found if writer_is_alive(store / "work" / found.work) else None
 
 
 class Preview(NamedTuple):
@@ -59,7 +59,7 @@ class Preview(NamedTuple):
     path: Path
 
 
-def preview_of(found: AtWork, store: Path) -> Preview | None:
+def preview_of(found: RunningStage, store: Path) -> Preview | None:
     """The youngest preview that the stage at work left; None where there is none."""
     previews = []
     for path in (store / "work" / found.work / "checkpoints").rglob(PREVIEW):
@@ -70,22 +70,24 @@ def preview_of(found: AtWork, store: Path) -> Preview | None:
 
 
 @contextmanager
-def noted(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[Reporter]:
+def recorded_progress(reporter: Reporter, run: Path, stage: str, work: Path) -> Iterator[Reporter]:
     """A reporter that passes everything on to ``reporter`` and notes in ``run`` the progress of ``stage``.
 
     The note goes when the block ends.
     """
     try:
-        yield _NotingReporter(reporter, run / NOTE, AtWork(stage=stage, work=work.name, label=stage))
+        yield _RecordingReporter(
+            reporter, run / PROGRESS_FILE, RunningStage(stage=stage, work=work.name, label=stage)
+        )
     finally:
         with suppress(OSError):
-            (run / NOTE).unlink(missing_ok=True)
+            (run / PROGRESS_FILE).unlink(missing_ok=True)
 
 
-class _NotingReporter:
+class _RecordingReporter:
     """Passes on, and notes the task that advanced last."""
 
-    def __init__(self, reporter: Reporter, path: Path, first: AtWork) -> None:
+    def __init__(self, reporter: Reporter, path: Path, first: RunningStage) -> None:
         self._reporter, self._path, self._first = reporter, path, first
         self.info, self.warn = reporter.info, reporter.warn
         self._write(first)
@@ -93,20 +95,20 @@ class _NotingReporter:
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         def show(done: int, note: str, left: float | None) -> None:
-            if time.monotonic() - self._noted >= EVERY:
+            if time.monotonic() - self._written >= EVERY:
                 now = {"label": label, "total": total, "done": done, "note": note, "seconds_left": left}
                 self._write(self._first.model_copy(update=now))
 
         with self._reporter.task(label, total) as task:
-            yield _NotingTask(task, total, show)
+            yield _RecordingTask(task, total, show)
 
-    def _write(self, state: AtWork) -> None:
-        self._noted = time.monotonic()
+    def _write(self, state: RunningStage) -> None:
+        self._written = time.monotonic()
         with suppress(StoreError):
             write_json(self._path, state.model_dump())
 
 
-class _NotingTask(CountedTask):
+class _RecordingTask(CountedTask):
     """One task, passed on and noted."""
 
     def __init__(self, task: Task, total: int | None, show: Show) -> None:

@@ -16,11 +16,11 @@ from cleargs.files import External
 from cleargs.manifest import KeyParts, Manifest, last_shown, linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.keys import differences, library_versions, plugin_versions, stage_key_config
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate, StageContext
-from cleargs.pipeline.store import Entry, Store, Work
+from cleargs.pipeline.store import Entry, Store, WorkFolder
 from cleargs.progress import Reporter
-from cleargs.untrusted import require_utf8
+from cleargs.safe_io import require_utf8
 
 MIN_ADDRESS_SPACE_GB = 2.0
 """What the libraries reserve before any work is done."""
@@ -38,7 +38,7 @@ State = Literal["done", "partial", "missing"]
 
 
 @dataclass(frozen=True)
-class Recipe:
+class StageKey:
     """What one stage would be made from, all of it known."""
 
     parts: KeyParts
@@ -64,7 +64,7 @@ class StagePlan:
     """Why it is no hit, or what a partial one lacks."""
     estimate: Estimate | None = None
     """Cost of the work to do; None where there is none."""
-    recipe: Recipe | None = None
+    stage_key: StageKey | None = None
     """None while a stage before it must run first. As keys are made of content, it may be done after all."""
     manifest: Manifest | None = None
     """That of a stage that is done."""
@@ -72,7 +72,7 @@ class StagePlan:
     @property
     def key(self) -> str | None:
         """The key of the stage's results; None while a stage before it must run first."""
-        return self.recipe.key if self.recipe is not None else None
+        return self.stage_key.key if self.stage_key is not None else None
 
 
 @dataclass
@@ -80,21 +80,21 @@ class Planner:
     """Makes recipes and compares them with what the store and the run folder hold. Writes nothing."""
 
     dag: Dag
-    run: Run
+    run: RunSpec
     store: Store
     threads: int
     reporter: Reporter
     _estimates: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False)
 
-    def recipe(self, name: str, done: Mapping[str, Manifest], *, afresh: bool = False) -> Recipe:
+    def stage_key(self, name: str, done: Mapping[str, Manifest], *, rehash: bool = False) -> StageKey:
         """What ``name`` is made from, given the manifests of the stages before it.
 
-        With ``afresh`` every external is read, whatever the memo says of it. Raises InputError when one (the
+        With ``rehash`` every external is read, whatever the memo says of it. Raises InputError when one (the
         capture, a model) cannot be read.
         """
         stage, config = self.dag.load(name), self.run.config.sections[name]
         inputs, origins = self.inputs(name, done)
-        digests = self.external_digests(name, afresh=afresh)
+        digests = self.external_digests(name, rehash=rehash)
         origins.update(digests)
         parts = KeyParts(
             stage=name,
@@ -111,7 +111,7 @@ class Planner:
         for upstream in stage.INPUTS:
             inherited |= dict.fromkeys(done[upstream].inherited)
             inherited |= dict.fromkeys(f"{upstream}: {missing}" for missing in done[upstream].missing)
-        return Recipe(parts, origins, folders, tuple(inherited))
+        return StageKey(parts, origins, folders, tuple(inherited))
 
     def inputs(
         self, name: str, done: Mapping[str, Manifest]
@@ -130,10 +130,10 @@ class Planner:
     def _externals(self, name: str) -> Mapping[str, External]:
         return self.dag.load(name).externals(self.run.config.sections[name], self.run.source)
 
-    def external_digests(self, name: str, *, afresh: bool = False) -> dict[str, dict[str, str]]:
+    def external_digests(self, name: str, *, rehash: bool = False) -> dict[str, dict[str, str]]:
         """Role -> relative path -> digest of what ``name`` reads outside the store.
 
-        With ``afresh`` every file is read. Raises InputError when one cannot be read or holds the run.
+        With ``rehash`` every file is read. Raises InputError when one cannot be read or holds the run.
         """
         places = self._externals(name)
         hint = "choose a folder beside the input with -o"
@@ -144,18 +144,18 @@ class Planner:
         for place in places.values():
             if isinstance(place, Path) and self.run.folder.is_relative_to(place):
                 raise InputError(f"the run folder {self.run.folder} lies inside the input {place}", hint=hint)
-        return {role: self.store.memo.digests_of(place, afresh=afresh) for role, place in places.items()}
+        return {role: self.store.memo.digests_of(place, rehash=rehash) for role, place in places.items()}
 
-    def reasons(self, recipe: Recipe, entry: Entry | None) -> tuple[str, ...]:
-        """Why the results of ``recipe`` are not there, in lines for a reader."""
+    def reasons(self, stage_key: StageKey, entry: Entry | None) -> tuple[str, ...]:
+        """Why the results of ``stage_key`` are not there, in lines for a reader."""
         if entry is not None and entry.damage is not None:
             return (f"damaged: {entry.damage}",)
         if entry is not None and entry.usable is not None:
             return tuple(f"retried, was missing: {missing}" for missing in entry.usable.missing)
-        before = last_shown(self.run.folder, recipe.parts.stage)
+        before = last_shown(self.run.folder, stage_key.parts.stage)
         if before is None:
             return (NOT_MADE,)
-        changes = differences(before.parts, recipe.parts, before.origins, recipe.origins)
+        changes = differences(before.parts, stage_key.parts, before.origins, stage_key.origins)
         return tuple(changes) or ("its results were removed from the store",)
 
     @cached_property
@@ -193,11 +193,11 @@ class Planner:
                 inputs[upstream] = self.store.folder(upstream, done[upstream].key)
             else:
                 expected[upstream] = self._estimate(upstream, done)
-        context = self.context(name, inputs, Work(self.store.root / "work" / "estimate"))
+        context = self.context(name, inputs, WorkFolder(self.store.root / "work" / "estimate"))
         self._estimates[known] = stage.estimate(replace(context, expected=expected))
         return self._estimates[known]
 
-    def context(self, name: str, inputs: Mapping[str, Path], work: Work) -> StageContext[Any]:
+    def context(self, name: str, inputs: Mapping[str, Path], work: WorkFolder) -> StageContext[Any]:
         """All that the stage ``name`` is told."""
         return StageContext(
             config=self.run.config.sections[name],
@@ -207,7 +207,7 @@ class Planner:
             externals=self._externals(name),
             out=work.out,
             checkpoints=work.checkpoints,
-            kept=self.store.kept(name),
+            cache=self.store.cache_folder(name),
             seed=self.run.config.seed,
             device=self.run.device,
             threads=self.threads,
@@ -258,17 +258,17 @@ class Planner:
                 reason = f"waits for {', '.join(waits_for)}"
                 plans.append(StagePlan(name, "missing", (reason,), self.estimate(name, done)))
                 continue
-            recipe = self.recipe(name, done)
-            entry = self.store.find(name, recipe.key)
+            stage_key = self.stage_key(name, done)
+            entry = self.store.find(name, stage_key.key)
             usable = entry.usable if entry is not None else None
             if name in force or usable is None:
-                reasons = ("forced",) if name in force else self.reasons(recipe, entry)
-                plans.append(StagePlan(name, "missing", reasons, self.estimate(name, done), recipe))
+                reasons = ("forced",) if name in force else self.reasons(stage_key, entry)
+                plans.append(StagePlan(name, "missing", reasons, self.estimate(name, done), stage_key))
             elif usable.missing:
-                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), recipe))
+                plans.append(StagePlan(name, "partial", usable.missing, self.estimate(name, done), stage_key))
             else:
                 done[name] = usable
-                plans.append(StagePlan(name, "done", (), None, recipe, usable))
+                plans.append(StagePlan(name, "done", (), None, stage_key, usable))
         return plans
 
 
@@ -289,9 +289,9 @@ def redo_lines(plans: list[StagePlan]) -> list[str]:
     lines = [
         f"{plan.stage} is made again: {'; '.join(plan.reasons)}"
         for plan in plans
-        if plan.recipe is not None and plan.state != "done" and plan.reasons != (NOT_MADE,)
+        if plan.stage_key is not None and plan.state != "done" and plan.reasons != (NOT_MADE,)
     ]
-    after = [plan.stage for plan in plans if plan.recipe is None]
+    after = [plan.stage for plan in plans if plan.stage_key is None]
     return [*lines, f"then {', '.join(after)}"] if lines and after else lines
 
 

@@ -32,7 +32,7 @@ WIDTH = 110
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSpec:
     """A run folder and all that decides its results."""
 
     folder: Path
@@ -45,7 +45,7 @@ class Run:
     device: Device
 
 
-def write_run_file(run: Run) -> None:
+def write_run_file(run: RunSpec) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
     path, text = run.folder / RUN_FILE, _text(run).encode()
     with disk_errors(path):
@@ -54,7 +54,7 @@ def write_run_file(run: Run) -> None:
             write_bytes(path, text)
 
 
-def _text(run: Run) -> str:
+def _text(run: RunSpec) -> str:
     document: Document = {"input": str(run.source), "device": run.device}
     if run.store != run.folder / STORE_FOLDER:
         document["store"] = str(run.store)
@@ -85,7 +85,7 @@ def _toml_line(name: str, value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Noted:
+class RunMetadata:
     """Content of the ``run.toml`` of an earlier call; None for what it does not say or says wrongly."""
 
     settings: Document = field(default_factory=dict)
@@ -97,14 +97,14 @@ class Noted:
     """True when it says one of the three wrongly."""
 
 
-def noted_run(folder: Path) -> Noted:
+def read_metadata(folder: Path) -> RunMetadata:
     """Return what `write_run_file` noted in ``folder``; nothing when there is no run.
 
     Each of input, store and device is read on its own: a damaged one hides no other. Raises ConfigError when
     the file is no TOML.
     """
     if not (folder / RUN_FILE).is_file():
-        return Noted()
+        return RunMetadata()
     document = read_toml(folder / RUN_FILE)
     given = {name: document.pop(name, None) for name in ("input", "store", "device")}
     paths = {
@@ -115,18 +115,20 @@ def noted_run(folder: Path) -> Noted:
     device = given["device"] if given["device"] in ("cpu", "cuda") else None
     read = {*paths, *(["device"] if device else [])}
     damaged = any(value not in (None, "") and name not in read for name, value in given.items())
-    return Noted(document, paths.get("input"), paths.get("store"), device, damaged)
+    return RunMetadata(document, paths.get("input"), paths.get("store"), device, damaged)
 
 
-def noted_source(folder: Path) -> Path | None:
+def read_source(folder: Path) -> Path | None:
     """Return the capture that the run in ``folder`` was made from; None where none can be read."""
     try:
-        return noted_run(folder).source
+        return read_metadata(folder).source
     except ConfigError:
         return None
 
 
-def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None) -> Run:
+def read_run_file(
+    folder: Path, dag: Dag, *, store: Path | None = None, device: Device | None = None
+) -> RunSpec:
     """The run that `write_run_file` noted in ``folder``; ``store`` and ``device`` override what it says.
 
     Raises InputError when there is no run, ConfigError when its file is damaged.
@@ -136,12 +138,12 @@ def read_run_file(folder: Path, dag: Dag, *, store: Path | None = None, device: 
         raise InputError(
             f"{folder} is no run: it has no {RUN_FILE}", hint=f"start one: cleargs run INPUT -o {folder}"
         )
-    noted = noted_run(folder)
-    if noted.source is None or noted.damaged:
+    metadata = read_metadata(folder)
+    if metadata.source is None or metadata.damaged:
         raise damaged_run_file(folder)
-    config = check_document(dag, noted.settings)
-    place = store or noted.store or folder / STORE_FOLDER
-    return Run(folder, noted.source, config, place, device or noted.device or "cpu")
+    config = check_document(dag, metadata.settings)
+    place = store or metadata.store or folder / STORE_FOLDER
+    return RunSpec(folder, metadata.source, config, place, device or metadata.device or "cpu")
 
 
 def damaged_run_file(folder: Path) -> ConfigError:

@@ -23,25 +23,25 @@ from cleargs.manifest import (
     write_manifest,
 )
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.live import noted
+from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import only_one
 from cleargs.pipeline.plan import (
     Planner,
-    Recipe,
+    StageKey,
     StagePlan,
     check_address_space,
     check_disk,
     cost_line,
     redo_lines,
 )
-from cleargs.pipeline.run_file import LOCK, RUN_FILE, Run, noted_source, write_run_file
+from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
 from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StageOutcome:
     """What became of one stage."""
 
     stage: str
@@ -53,7 +53,7 @@ class Outcome:
 class Runner:
     """Runs stages of one run folder. ``store.in_use()`` is held by each public method while it works."""
 
-    def __init__(self, dag: Dag, run: Run, store: Store, threads: int, reporter: Reporter) -> None:
+    def __init__(self, dag: Dag, run: RunSpec, store: Store, threads: int, reporter: Reporter) -> None:
         self.dag = dag
         self.run = run
         self.store = store
@@ -62,7 +62,7 @@ class Runner:
 
     def run_until(
         self, until: str | None = None, *, force: Sequence[str] = (), allow_partial: bool = False
-    ) -> list[Outcome]:
+    ) -> list[StageOutcome]:
         """Bring every stage up to ``until`` to a finished folder; link each into the run.
 
         Stops after a stage that is done only in part unless ``allow_partial``: the last outcome then says
@@ -80,15 +80,15 @@ class Runner:
         for line in (*redo_lines(plans), cost_line(plans)):
             if line:
                 self.reporter.info(line)
-        outcomes: list[Outcome] = []
+        outcomes: list[StageOutcome] = []
         done: dict[str, Manifest] = {}
-        with self._alone(), self.store.in_use():
+        with self._lock_run(), self.store.in_use():
             check_same_input(self.run, self.dag, self.store)
             self._unlink_outdated()  # first: a kill in between leaves nothing of other settings in sight
             write_run_file(self.run)
             self.store.add_root(self.run.folder)
             for name in (plan.stage for plan in plans):
-                outcome = self._bring(name, done, forced=name in forced)
+                outcome = self._find_or_make(name, done, forced=name in forced)
                 done[name] = outcome.manifest
                 outcomes.append(outcome)
                 if outcome.how == "made":
@@ -99,7 +99,7 @@ class Runner:
                     break
         return outcomes
 
-    def _alone(self) -> AbstractContextManager[bool]:
+    def _lock_run(self) -> AbstractContextManager[bool]:
         """Keep the run folder for this process; wait while another one works there."""
         return only_one(self.run.folder / LOCK, self.reporter, self.run.folder.name)
 
@@ -118,26 +118,26 @@ class Runner:
         if line := cost_line(costs):
             self.reporter.info(f"now {line}")
 
-    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> Outcome:
+    def run_stage(self, name: str, *, force: bool = False, allow_partial: bool = False) -> StageOutcome:
         """Bring one stage to a finished folder, from finished stages before it.
 
         Raises StageError when a stage before it is not done (or only in part, without ``allow_partial``).
         """
         check_address_space()
         done: dict[str, Manifest] = {}
-        with self._alone(), self.store.in_use():
+        with self._lock_run(), self.store.in_use():
             self.store.add_root(self.run.folder)
             self._unlink_outdated()
             for upstream in self.dag.until(name)[:-1]:
                 done[upstream] = self._finished(upstream, done, name, allow_partial=allow_partial)
-            outcome = self._bring(name, done, forced=force)
+            outcome = self._find_or_make(name, done, forced=force)
             self._unlink_outdated()
         return outcome
 
     def _finished(
         self, upstream: str, done: Mapping[str, Manifest], name: str, *, allow_partial: bool
     ) -> Manifest:
-        entry = self._find(upstream, self.planner.recipe(upstream, done))
+        entry = self._find(upstream, self.planner.stage_key(upstream, done))
         if entry is None or entry.manifest is None:
             raise StageError(
                 f"{name} needs {upstream}, which is not done",
@@ -150,9 +150,9 @@ class Runner:
             )
         return entry.manifest
 
-    def _find(self, name: str, recipe: Recipe) -> Entry | None:
-        """What the store holds for ``recipe``; something damaged counts as nothing, with a warning."""
-        entry = self.store.find(name, recipe.key)
+    def _find(self, name: str, stage_key: StageKey) -> Entry | None:
+        """What the store holds for ``stage_key``; something damaged counts as nothing, with a warning."""
+        entry = self.store.find(name, stage_key.key)
         if entry is not None and entry.damage is not None:
             self.reporter.warn(
                 f"{name}: the stored results are damaged ({entry.damage}); they are made again"
@@ -160,27 +160,27 @@ class Runner:
             return None
         return entry
 
-    def _bring(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> Outcome:
+    def _find_or_make(self, name: str, done: Mapping[str, Manifest], *, forced: bool) -> StageOutcome:
         """Find or make the results of ``name``, and let the run folder show them."""
-        recipe = self.planner.recipe(name, done)
-        entry = self.store.find(name, recipe.key)
+        stage_key = self.planner.stage_key(name, done)
+        entry = self.store.find(name, stage_key.key)
         manifest = entry.whole if entry is not None and not forced else None
         how: Literal["found", "made"] = "found"
         if manifest is None:
-            recipe = self._read_again(name, done)
-            entry = self.store.find(name, recipe.key)
-            reasons = ("forced",) if forced else self.planner.reasons(recipe, entry)
-            with self.store.lock(recipe.key, self.reporter, name) as alone:
-                entry = self._find(name, recipe)
+            stage_key = self._rehashed_key(name, done)
+            entry = self.store.find(name, stage_key.key)
+            reasons = ("forced",) if forced else self.planner.reasons(stage_key, entry)
+            with self.store.lock(stage_key.key, self.reporter, name) as alone:
+                entry = self._find(name, stage_key)
                 manifest = entry.whole if entry is not None and not forced else None
                 if manifest is None:  # else another process made it while we waited
                     self.reporter.info(f"{name}: starts ({'; '.join(reasons)})")
-                    manifest, how = self._make(recipe, entry, forced=forced, alone=alone), "made"
-        manifest = self._with_inherited(manifest, recipe.inherited)
-        self.store.link(self.run.folder, name, recipe.key)
-        return Outcome(name, how, manifest, self.store.folder(name, recipe.key))
+                    manifest, how = self._make(stage_key, entry, forced=forced, alone=alone), "made"
+        manifest = self._with_inherited(manifest, stage_key.inherited)
+        self.store.link(self.run.folder, name, stage_key.key)
+        return StageOutcome(name, how, manifest, self.store.folder(name, stage_key.key))
 
-    def _read_again(self, name: str, done: Mapping[str, Manifest]) -> Recipe:
+    def _rehashed_key(self, name: str, done: Mapping[str, Manifest]) -> StageKey:
         """What ``name`` is made from, every byte of it read: a disk that rots tells no time stamp.
 
         Raises StoreError when an upstream result is damaged.
@@ -189,26 +189,26 @@ class Runner:
             manifest = done[upstream]
             folder = self.store.folder(upstream, manifest.key)
             names = [str(PurePosixPath(path, file)) for path in paths for file in manifest.under(path)]
-            damaged = next(damages(folder, manifest, names, self.store.memo, afresh=True), None)
+            damaged = next(damages(folder, manifest, names, self.store.memo, rehash=True), None)
             if damaged is not None:
                 raise StoreError(
                     f"{upstream}: the stored results are damaged ({damaged})",
                     hint="the same command makes them again",
                 )
-        return self.planner.recipe(name, done, afresh=True)
+        return self.planner.stage_key(name, done, rehash=True)
 
-    def _make(self, recipe: Recipe, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
+    def _make(self, stage_key: StageKey, entry: Entry | None, *, forced: bool, alone: bool) -> Manifest:
         """Let the stage do its work and publish it. The key's lock is held."""
-        name = recipe.parts.stage
+        name = stage_key.parts.stage
         stage = self.dag.load(name)
         work = self.store.open_work(
-            recipe.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
+            stage_key.key, fresh=forced, entry=entry, leftovers=stage.LEFTOVERS, alone=alone
         )
-        context = self.planner.context(name, recipe.inputs, work)
+        context = self.planner.context(name, stage_key.inputs, work)
         started, clock, usage = datetime.now(UTC), time.monotonic(), Usage()
         earlier = work.seconds
         try:
-            with noted(self.reporter, self.run.folder, name, work.folder) as reporter:
+            with recorded_progress(self.reporter, self.run.folder, name, work.folder) as reporter:
                 result = stage.run(replace(context, reporter=reporter))
         except BaseException:  # an interruption too: what it had done counts when it resumes
             work.note_seconds(earlier + time.monotonic() - clock)
@@ -220,7 +220,7 @@ class Runner:
             "peak_memory_gb": round(usage.peak_memory_gb, 3),
         }
         now = self.planner.external_digests(name)
-        if now != {role: recipe.origins[role] for role in now}:
+        if now != {role: stage_key.origins[role] for role in now}:
             self.store.discard(work.folder)
             raise StageError(
                 f"the input changed while {name} was reading it", hint="the same command starts it again"
@@ -238,12 +238,12 @@ class Runner:
         }
         manifest = Manifest(
             stage=name,
-            key=recipe.key,
-            status="partial" if result.missing or recipe.inherited else "complete",
+            key=stage_key.key,
+            status="partial" if result.missing or stage_key.inherited else "complete",
             missing=result.missing,
-            inherited=recipe.inherited,
-            parts=recipe.parts,
-            origins=recipe.origins,
+            inherited=stage_key.inherited,
+            parts=stage_key.parts,
+            origins=stage_key.origins,
             files=files,
             digest=tree_digest({name: record.digest for name, record in files.items()}),
             versions=versions(),
@@ -275,12 +275,12 @@ class Runner:
         return changed
 
 
-def check_same_input(run: Run, dag: Dag, store: Store) -> None:
+def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
     """Raise InputError when ``run.folder`` was made for another capture than ``run.source``.
 
     A capture that moved is the same when its content is.
     """
-    before = noted_source(run.folder)
+    before = read_source(run.folder)
     if before is None or before == run.source:
         return
     first = dag.names[0]

@@ -17,11 +17,11 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
     RUN_FILE,
     Device,
-    Noted,
-    Run,
+    RunMetadata,
+    RunSpec,
     damaged_run_file,
-    noted_run,
-    noted_source,
+    read_metadata,
+    read_source,
 )
 from cleargs.pipeline.store import STORE_FOLDER, Store
 
@@ -72,7 +72,7 @@ def opened_store(root: Path) -> Iterator[Store]:
         yield Store(root, memo)
 
 
-def asked_run(
+def resolve_run(
     dag: Dag,
     source: Path,
     folder: Path,
@@ -84,7 +84,7 @@ def asked_run(
     store: Path | None = None,
     device: DeviceChoice = "auto",
     say: Callable[[str], None],
-) -> Run:
+) -> RunSpec:
     """The run of the capture ``source`` in ``folder``, all that decides its results resolved.
 
     An existing run keeps its settings, its store and its device, each unless it is given here; ``reset``
@@ -94,30 +94,30 @@ def asked_run(
     if not source.exists():
         raise InputError(f"there is no {source}", hint="give a video, an image folder or a COLMAP project")
     if (source / RUN_FILE).is_file():
-        made_from = noted_source(source)
+        made_from = read_source(source)
         raise InputError(
             f"{source} is a run, not a capture",
             hint=f"give the capture that it was made from{f': {made_from}' if made_from else ''}",
         )
     folder, forgets = folder.absolute(), reset or workflow is not None
-    noted, kept = Noted(), None
+    metadata, kept = RunMetadata(), None
     try:
-        noted = noted_run(folder)
-        if noted.damaged:
+        metadata = read_metadata(folder)
+        if metadata.damaged:
             raise damaged_run_file(folder)
         # Checked, they hold no names that are gone: those would contradict what is set now.
-        kept = check_document(dag, noted.settings) if noted.settings and not forgets else None
+        kept = check_document(dag, metadata.settings) if metadata.settings and not forgets else None
     except ConfigError as error:
         if not forgets:
             raise ConfigError(
                 f"the settings of {folder} cannot be used: {error}", hint="--reset starts from the recipe"
             ) from error
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
-    root = (store or noted.store or folder / STORE_FOLDER).absolute()
-    chosen = resolve_device(noted.device or device if device == "auto" else device, say)
+    root = (store or metadata.store or folder / STORE_FOLDER).absolute()
+    chosen = resolve_device(metadata.device or device if device == "auto" else device, say)
     if kept is not None and (line := _own_settings(kept)):
         say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
-    return Run(folder, source.absolute(), config, root, chosen)
+    return RunSpec(folder, source.absolute(), config, root, chosen)
 
 
 def _own_settings(config: Config, most: int = 3) -> str:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-KIND_WORDS: Mapping[Any, str] = {
+TYPE_NAMES: Mapping[Any, str] = {
     int: "a whole number",
     float: "a number",
     bool: "true or false",
@@ -109,7 +109,7 @@ def allowed(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     elif origin in (Union, UnionType):
         words = " or ".join(allowed(kind) for kind in parts if kind is not NoneType)
     else:
-        words = KIND_WORDS[annotation]
+        words = TYPE_NAMES[annotation]
     limits = [
         f"{word} {getattr(item, attribute)}"
         for attribute, word in LIMITS

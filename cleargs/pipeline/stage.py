@@ -33,7 +33,7 @@ class StageContext(Generic[C]):
     """Outputs go here. What a killed try of the same key left is still here; files appear atomically."""
     checkpoints: Path
     """In-stage state. Never published, deleted when the stage is done."""
-    kept: Path
+    cache: Path
     """What was found out about single items (frames, say), for any later work of this stage in the store:
     files that appear whole, named by the digest of all that decides them. Any may be missing at any time."""
     seed: int

@@ -37,7 +37,7 @@ from cleargs.manifest import (
 )
 from cleargs.pipeline.lock import file_lock, is_locked, only_one
 from cleargs.progress import Reporter
-from cleargs.untrusted import FAULTS, read_text
+from cleargs.safe_io import FAULTS, read_text
 
 STORE_FOLDER = ".store"
 """Where a run keeps its store unless told otherwise."""
@@ -74,7 +74,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Work:
+class WorkFolder:
     """Where one key is being worked on."""
 
     folder: Path
@@ -158,20 +158,20 @@ class Store:
             try:
                 yield alone
             finally:
-                self._hand_back(key)
+                self._release(key)
 
     def _only_readable(self) -> bool:
         return self.root.is_dir() and not os.access(self.root, os.W_OK)
 
-    def _own(self) -> str:
+    def _owner_suffix(self) -> str:
         """The ending of this process's own work folders, where no lock keeps another one out."""
         return f"@{socket.gethostname()}-{os.getpid()}"
 
-    def _hand_back(self, key: str) -> None:
+    def _release(self, key: str) -> None:
         """Leave this process's own work folders of ``key`` to the next try."""
-        for folder in (self.root / "work").glob(f"{key}*{self._own()}"):
+        for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
             with suppress(OSError):  # another process left something there already
-                folder.rename(folder.with_name(folder.name.removesuffix(self._own())))
+                folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def open_work(
         self,
@@ -181,7 +181,7 @@ class Store:
         entry: Entry | None,
         leftovers: Sequence[str] = (),
         alone: bool = True,
-    ) -> Work:
+    ) -> WorkFolder:
         """The work folder of ``key``, ready to resume: of the outputs that dead writers left, only those stay
         that match one of the patterns ``leftovers``. Where this process is not ``alone``, the folder is its
         own.
@@ -189,10 +189,10 @@ class Store:
         A forced rebuild (``fresh``) has a folder of its own, which resumes only from an interrupted forced
         try. What a partial ``entry`` already holds is carried over once.
         """
-        work = Work(self.root / "work" / (f"{key}.forced" if fresh else key))
+        work = WorkFolder(self.root / "work" / (f"{key}.forced" if fresh else key))
         with disk_errors(work.folder):
             if not alone:
-                left, work = work, Work(work.folder.with_name(work.folder.name + self._own()))
+                left, work = work, WorkFolder(work.folder.with_name(work.folder.name + self._owner_suffix()))
                 with suppress(OSError):  # nothing is there, or another process took it
                     left.folder.rename(work.folder)
             _keep_only(work.out, leftovers)
@@ -206,7 +206,7 @@ class Store:
                     file.unlink()
         return work
 
-    def publish(self, work: Work, manifest: Manifest) -> Manifest:
+    def publish(self, work: WorkFolder, manifest: Manifest) -> Manifest:
         """Move the outputs of ``work`` to their final place: all or nothing, and durable.
 
         Where a whole result with the same content is already there, ours is dropped and that one's manifest
@@ -248,7 +248,7 @@ class Store:
             folder.rename(rubbish)
         shutil.rmtree(rubbish, ignore_errors=True)
 
-    def kept(self, stage: str) -> Path:
+    def cache_folder(self, stage: str) -> Path:
         """Where ``stage`` keeps what it found out about single items."""
         return self.root / "kept" / stage
 
@@ -347,7 +347,7 @@ class Garbage:
     bytes: int
 
 
-def writer_lives(work: Path) -> bool:
+def writer_is_alive(work: Path) -> bool:
     """Return True if a process works in the work folder ``work``."""
     key = work.name.partition("@")[0].removesuffix(".forced")
     return work.is_dir() and is_locked(work.parent.parent / "locks" / f"{key}.lock")

@@ -10,7 +10,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import disk_errors, sync_tree, whole_folder, write_json
@@ -21,9 +20,9 @@ from cleargs.progress import Task
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.scene import Scene
 from cleargs.splat.viewer import Viewer
+from cleargs.types import ImageU8
 
 Kind = Literal["film", "still", "folder"]
-Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
 
 _NUMBER = re.compile(r"%0?\d*d")
 _OPAQUE = 1 / 255
@@ -39,10 +38,10 @@ class Shot:
     """The frame of the capture to lay on its left."""
 
 
-class Photographer(Viewer):
+class ShotRenderer(Viewer):
     """Renders shots of one scene."""
 
-    def picture(self, shot: Shot) -> Picture:
+    def picture(self, shot: Shot) -> ImageU8:
         """What ``shot`` shows; of twice the width where it has a frame of the capture beside it."""
         rendered = self.view(shot.camera)
         if shot.filmed is None:
@@ -108,33 +107,33 @@ def write_shots(
         )
     if kind == "film":
         require_even(camera.width, camera.height)
-    photographer = Photographer(scene, device)
+    renderer = ShotRenderer(scene, device)
     with disk_errors(output):
         (output.parent.parent if kind == "folder" else output.parent).mkdir(parents=True, exist_ok=True)
 
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Iterator[ImageU8]:
         for shot in shots:
-            yield photographer.picture(shot)
+            yield renderer.picture(shot)
             task.advance()
 
     if kind == "film":
         write_video(output, pictures(), fps, codec=codec)
     elif kind == "still":
-        photographer.write(output, shots[0])
+        renderer.write(output, shots[0])
         task.advance()
     else:
         (before, after), (digits,) = _NUMBER.split(output.name), _NUMBER.findall(output.name)
         names = [f"{before}{digits % number}{after}" for number in range(len(shots))]
         with whole_folder(output.parent) as folder:
             for name, shot in zip(names, shots, strict=True):
-                photographer.write(folder / name, shot)
+                renderer.write(folder / name, shot)
                 task.advance()
             cameras = cameras_json(list(zip(names, (shot.camera for shot in shots), strict=True)))
             write_json(folder / "cameras.json", cameras)
             sync_tree(folder)
 
 
-def _fitted(image: Picture, height: int, width: int) -> Picture:
+def _fitted(image: ImageU8, height: int, width: int) -> ImageU8:
     """``image`` at the place that `cleargs.render.paths.framed` gives its content, black around it."""
     scale = min(width / image.shape[1], height / image.shape[0])
     wide, high = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))

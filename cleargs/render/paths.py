@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
 from cleargs.splat.camera import Camera, look_at
-
-Array = NDArray[np.float64]
+from cleargs.types import ArrayF64
 
 _SMOOTHING = (0.025, 0.1)
 """Sigma of the filter along the path, as a share of its length: at least, and at most. Between the two it is
@@ -37,7 +36,7 @@ _PULL = 0.003
 
 def smooth_path(
     cameras: Sequence[Camera], count: int
-) -> tuple[Array, NDArray[np.int64]]:  # [K, 4, 4] world to camera, [K]
+) -> tuple[ArrayF64, NDArray[np.int64]]:  # [K, 4, 4] world to camera, [K]
     """The way of ``cameras`` (in the order of their frames) from the first pose to the last, made smooth and
     cut into ``count`` poses of equal steps.
 
@@ -79,10 +78,10 @@ def smooth_path(
     return poses, np.rint(np.interp(even, motion, passed)).astype(np.int64)
 
 
-def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] world to camera
+def turntable(cameras: Sequence[Camera], count: int) -> ArrayF64:  # [count, 4, 4] world to camera
     """A turn in ``count`` steps around the point that ``cameras`` look at, from the first one's side.
 
-    At their median distance from the axis and median height; the axis is that of `upright`.
+    At their median distance from the axis and median height; the axis is that of `up_axis`.
 
     It is a full one in equal steps; where the cameras leave more than `WIDEST_GAP` of it out, it goes to and
     fro along what they saw, since beyond it the scene has nothing to show.
@@ -90,7 +89,7 @@ def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] 
     Raises InputError when they all look the same way.
     """
     centre = seen_point(cameras)
-    up = upright(cameras)
+    up = up_axis(cameras)
     offsets = np.stack([camera.centre for camera in cameras]) - centre
     heights = offsets @ up
     away = offsets - heights[:, None] * up
@@ -115,7 +114,7 @@ def turntable(cameras: Sequence[Camera], count: int) -> Array:  # [count, 4, 4] 
     return np.stack([look_at(place, centre, up) for place in places])
 
 
-def seen_point(cameras: Sequence[Camera]) -> Array:  # [3]
+def seen_point(cameras: Sequence[Camera]) -> ArrayF64:  # [3]
     """The point nearest to all optical axes, by least squares. Raises InputError when they are parallel."""
     axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [N, 3, 3] projections along each axis
@@ -126,11 +125,11 @@ def seen_point(cameras: Sequence[Camera]) -> Array:  # [3]
             hint="follow their path instead: leave out --turntable",
         )
     centres = np.stack([camera.centre for camera in cameras])
-    point: Array = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(cameras))
+    point: ArrayF64 = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(cameras))
     return point
 
 
-def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
+def up_axis(cameras: Sequence[Camera]) -> ArrayF64:  # [3] unit
     """Up: what the horizontal axes of ``cameras`` are perpendicular to, as nerfstudio finds it.
 
     The mean of their own ups would lean over, where they look down and stand on one side. Cameras whose
@@ -139,7 +138,7 @@ def upright(cameras: Sequence[Camera]) -> Array:  # [3] unit
     rights = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     mean = _unit(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
     level = rights.T @ rights / len(rights) - _PULL * np.outer(mean, mean)
-    up: Array = np.linalg.eigh(level)[1][:, 0]
+    up: ArrayF64 = np.linalg.eigh(level)[1][:, 0]
     return up if up @ mean > 0 else -up
 
 
@@ -159,7 +158,7 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _motion(path: Array) -> Array:  # [N, 7] -> [N], from 0
+def _motion(path: ArrayF64) -> ArrayF64:  # [N, 7] -> [N], from 0
     """Motion up to each centre and quaternion; see `smooth_path`."""
     centres, turns = path[:, :3], Rotation.from_quat(path[:, 3:])
     distance = np.linalg.norm(np.diff(centres, axis=0), axis=1)
@@ -168,11 +167,11 @@ def _motion(path: Array) -> Array:  # [N, 7] -> [N], from 0
     return np.concatenate([[0.0], np.cumsum(distance / max(extent, 1e-12) + angle / np.pi)])
 
 
-def _at(places: Array, motion: Array, path: Array) -> Array:
+def _at(places: ArrayF64, motion: ArrayF64, path: ArrayF64) -> ArrayF64:
     """The rows of ``path`` [N, C], given at ``motion`` [N], at ``places`` [K]."""
     return np.stack([np.interp(places, motion, column) for column in path.T], axis=1)
 
 
-def _unit(vector: Array) -> Array:
-    unit: Array = vector / max(float(np.linalg.norm(vector)), 1e-12)
+def _unit(vector: ArrayF64) -> ArrayF64:
+    unit: ArrayF64 = vector / max(float(np.linalg.norm(vector)), 1e-12)
     return unit

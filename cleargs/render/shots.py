@@ -21,8 +21,8 @@ from cleargs.manifest import linked_manifest
 from cleargs.media import MAX_PIXELS
 from cleargs.render.output import Shot
 from cleargs.render.paths import framed, smooth_path, turntable
+from cleargs.safe_io import FAULTS, cause, read_json
 from cleargs.splat.camera import Camera
-from cleargs.untrusted import FAULTS, cause, read_json
 
 World = Literal["normalised", "input"]
 

@@ -27,6 +27,7 @@ from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.camera import Camera
 from cleargs.splat.viewer import Viewer
+from cleargs.types import ImageU8
 
 HELD_OUT, UNPLACED = "held out", "not placed"
 """Roles of frames on which RVA has nothing to say."""
@@ -168,16 +169,14 @@ FOLDER = "frames"
 BYTES = 8_500_000
 """About how much all layers together may take."""
 
-_BYTES_A_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
+_BYTES_PER_PIXEL, _SIDE_MAX, _SIDE_MIN = 0.18, 960, 240  # of JPEGs at _QUALITY; px, long side
 _THUMBNAIL, _QUALITY = 240, 84
 
 RENDERED = 40
 """Most frames at which the final scene is rendered, evenly along the trajectory: more would take too long."""
 
-Image = NDArray[np.uint8]
 
-
-class Picture(NamedTuple):
+class ImageFile(NamedTuple):
     """A picture of the report, with the size it has."""
 
     path: str
@@ -186,7 +185,7 @@ class Picture(NamedTuple):
     height: int
 
 
-FramePictures = tuple[Picture, dict[str, Picture]]
+FramePictures = tuple[ImageFile, dict[str, ImageFile]]
 """Thumbnail of a frame, and its layers by their names in `LAYERS`."""
 
 
@@ -217,11 +216,11 @@ def side_of(pictures: int, aspect: float, budget: int, least: int = _SIDE_MIN) -
 
     It is ``least`` where that would be too small to see anything.
     """
-    pixels = budget / (_BYTES_A_PIXEL * max(pictures, 1))
+    pixels = budget / (_BYTES_PER_PIXEL * max(pictures, 1))
     return int(np.clip(math.sqrt(pixels / min(aspect, 1 / aspect)), least, _SIDE_MAX))
 
 
-def layers_of(row: FrameRow, run: Path) -> dict[str, Image]:
+def layers_of(row: FrameRow, run: Path) -> dict[str, ImageU8]:
     """The frame as filmed, and the other layers of its latest round. Raises InputError, StoreError."""
     images = {"observed": read_rgb(run / "ingest" / row.frame.image)}
     if row.selection is not None:
@@ -230,7 +229,7 @@ def layers_of(row: FrameRow, run: Path) -> dict[str, Image]:
     return images
 
 
-def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, side: int) -> FramePictures:
+def _write_frame(row: FrameRow, run: Path, report: Path, final: ImageU8 | None, side: int) -> FramePictures:
     images = layers_of(row, run)
     if final is not None:
         images["final"] = final
@@ -240,7 +239,7 @@ def _write_frame(row: FrameRow, run: Path, report: Path, final: Image | None, si
     return write_jpeg(report, f"{name}.jpg", images["observed"], _THUMBNAIL), layers
 
 
-def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
+def write_jpeg(report: Path, name: str, image: ImageU8, side: int) -> ImageFile:
     """Write ``image`` reduced to at most ``side`` pixels."""
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
@@ -250,4 +249,4 @@ def write_jpeg(report: Path, name: str, image: Image, side: int) -> Picture:
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
     (report / name).write_bytes(data.tobytes())
-    return Picture(name, width, height)
+    return ImageFile(name, width, height)

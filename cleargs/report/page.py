@@ -23,26 +23,26 @@ from cleargs.manifest import Manifest, plain_json
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
 from cleargs.report import charts
+from cleargs.report.formatting import duration
 from cleargs.report.frames import (
     CHOICES,
     LAYERS,
     MEANINGS,
     SCENES,
     FrameRow,
-    Picture,
+    ImageFile,
     camera_of,
     load_rows,
     scores_of,
     write_jpeg,
     write_pictures,
 )
-from cleargs.report.report_json import PAGE, LastRun, linked_manifests, noted, page_of, write_record
-from cleargs.report.verdict import Verdict
+from cleargs.report.report_json import PAGE, LastRun, last_run, linked_manifests, page_of, write_report_json
+from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import level_camera, opening, viewer_data, write_scene, write_viewer
-from cleargs.report.words import duration
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
@@ -94,7 +94,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     manifests = linked_manifests(run, planner.dag.names)
     if "ingest" not in manifests:
         raise InputError(f"nothing is done in {run} to report on", hint=f"see cleargs status {run}")
-    last = last or noted(run)
+    last = last or last_run(run)
     set_threads(planner.threads)
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
@@ -109,7 +109,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             name=run.name,
             source=planner.run.source.name,
             pictures=pictures,
-            verdict=Verdict(manifests, rows, planner.run.config),
+            verdict=ReportVerdict(manifests, rows, planner.run.config),
             scenes=scenes,
             viewer=write_viewer(folder) if scenes else "",
             plan=charts.plan_of(rows),
@@ -133,7 +133,7 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
                 "viewer": viewer,
             },
         )
-        write_record(folder, manifests, last)
+        write_report_json(folder, manifests, last)
     return page_of(run)
 
 
@@ -191,7 +191,7 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def command(run: Run, dag: Dag) -> str:
+def command(run: RunSpec, dag: Dag) -> str:
     """The ``cleargs run`` that makes this run, called next to its folder: a recipe, then settings."""
     wanted = dict(flattened(run.config.document()))
     candidates = []
@@ -224,7 +224,7 @@ def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return found
 
 
-def _frame_data(row: FrameRow, layers: Mapping[str, Picture], time: float | None) -> dict[str, Any]:
+def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
     """All that the page says of a frame."""
     lacking = {f"low {name}": row.judged.get(f"r_{name}") for name in R_CUES}
     cues = {name: 1.0 - value for name, value in lacking.items() if value is not None}

@@ -10,9 +10,9 @@ from typing import Any
 import cleargs
 from cleargs.files import write_json
 from cleargs.manifest import Manifest, linked_manifest
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
 
-FOLDER, PAGE, RECORD = "report", "index.html", "report.json"
+FOLDER, PAGE, REPORT_JSON = "report", "index.html", "report.json"
 
 
 @dataclass(frozen=True)
@@ -37,30 +37,30 @@ def linked_manifests(run: Path, names: Sequence[str]) -> dict[str, Manifest]:
 
 def is_current(run: Path, manifests: Mapping[str, Manifest]) -> bool:
     """Whether the report of ``run`` is of these results and of this version."""
-    return (run / FOLDER / PAGE).is_file() and _record(run).get("made_from") == _made_from(manifests)
+    return (run / FOLDER / PAGE).is_file() and _read_report(run).get("made_from") == _made_from(manifests)
 
 
 def _made_from(manifests: Mapping[str, Manifest]) -> dict[str, str]:
     return {"cleargs": cleargs.__version__, **{name: manifest.key for name, manifest in manifests.items()}}
 
 
-def _record(run: Path) -> dict[str, Any]:
+def _read_report(run: Path) -> dict[str, Any]:
     try:
-        record = read_json(run / FOLDER / RECORD)
+        record = read_json(run / FOLDER / REPORT_JSON)
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}
 
 
-def noted(run: Path) -> LastRun | None:
+def last_run(run: Path) -> LastRun | None:
     """What the present report knows of the last run; None without it."""
     try:
-        return LastRun(**_record(run)["last_run"])
+        return LastRun(**_read_report(run)["last_run"])
     except (KeyError, TypeError):
         return None
 
 
-def write_record(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
+def write_report_json(folder: Path, manifests: Mapping[str, Manifest], last: LastRun | None) -> None:
     """Note in the report's ``folder`` what it is made from."""
     note = {"made_from": _made_from(manifests), "last_run": asdict(last) if last else None}
-    write_json(folder / RECORD, note)
+    write_json(folder / REPORT_JSON, note)

@@ -23,8 +23,8 @@ from urllib.parse import urlsplit
 from cleargs.errors import InputError
 from cleargs.manifest import plain_json
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.live import at_work, preview_of
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.live import preview_of, running_stage
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.report.report_json import FOLDER, is_current, linked_manifests, page_of
 
 _PAGES: Mapping[str, str] = {"/": "live.html", "/live.css": "live.css", "/live.js": "live.js"}
@@ -39,7 +39,7 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, dag: Dag, run: Run, host: str, port: int) -> None:
+    def __init__(self, dag: Dag, run: RunSpec, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), partial(_Handler, dag, run, host))
@@ -69,7 +69,7 @@ class _Handler(SimpleHTTPRequestHandler):
     server_version, sys_version = "cleargs", ""
     timeout = 30
 
-    def __init__(self, dag: Dag, run: Run, host: str, *arguments: Any) -> None:
+    def __init__(self, dag: Dag, run: RunSpec, host: str, *arguments: Any) -> None:
         self._dag, self._run, self._host, self.path = dag, run, host, ""
         super().__init__(*arguments, directory=str(run.folder))
 
@@ -103,7 +103,7 @@ class _Handler(SimpleHTTPRequestHandler):
         if place in _PAGES:
             return str(Path(__file__).parent / "static" / _PAGES[place])
         if place == "/preview.png":
-            work = at_work(self._run.folder, self._run.store)
+            work = running_stage(self._run.folder, self._run.store)
             preview = None if work is None else preview_of(work, self._run.store)
             return "" if preview is None else str(preview.path)
         report = self._run.folder.resolve() / FOLDER
@@ -139,7 +139,7 @@ class _Handler(SimpleHTTPRequestHandler):
     def _state(self) -> dict[str, Any]:
         """All that the live page shows, as JSON values."""
         run = self._run
-        work = at_work(run.folder, run.store)
+        work = running_stage(run.folder, run.store)
         manifests = linked_manifests(run.folder, self._dag.names)
         preview = None if work is None else preview_of(work, run.store)
         stages = []

@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 from cleargs.manifest import Manifest
 from cleargs.pipeline.config import Config
+from cleargs.report.formatting import count
 from cleargs.report.frames import HELD_OUT, UNPLACED, FrameRow, last_scene
-from cleargs.report.words import count
 
 CLOSE_DB, LOOSE_DB = 28.0, 22.0
 """Training PSNR from which a scene is said to follow its frames closely, and below which only loosely. What
@@ -37,7 +37,7 @@ class Caution(NamedTuple):
     """As ``--set`` takes them; empty where no setting helps."""
 
 
-class Verdict:
+class ReportVerdict:
     """The first screen of a report of a run that shows these ``manifests``."""
 
     def __init__(self, manifests: Mapping[str, Manifest], rows: Sequence[FrameRow], config: Config) -> None:

@@ -28,7 +28,7 @@ BYTES = 10_000_000
 
 _VIEWER = Path(__file__).parent / "static" / "viewer"
 _TURN = np.array([-1.0, -1.0, 1.0])
-_SECONDS_A_FRAME = 0.4  # of the flight along the trajectory
+_SECONDS_PER_FRAME = 0.4  # of the flight along the trajectory
 _INVISIBLE = 0.5 / 255.0  # opacities below this are stored as 0
 _BASE64, _GZIP = 4 / 3, 0.9  # at worst, of what was measured on trained scenes
 
@@ -104,12 +104,12 @@ def viewer_data(
     that are also returned, by frame.
     """
     poses = {row.frame.frame_id: viewer_pose(camera_of(row.frame)) for row in placed}
-    times = {frame_id: index * _SECONDS_A_FRAME for index, frame_id in enumerate(poses)}
+    times = {frame_id: index * _SECONDS_PER_FRAME for index, frame_id in enumerate(poses)}
     start = opening(placed).frame.frame_id
     track = {
         "name": "trajectory",
-        "duration": _SECONDS_A_FRAME * len(poses),
-        "frameRate": 1 / _SECONDS_A_FRAME,
+        "duration": _SECONDS_PER_FRAME * len(poses),
+        "frameRate": 1 / _SECONDS_PER_FRAME,
         "loopMode": "none",
         "interpolation": "spline",
         "smoothness": 1,

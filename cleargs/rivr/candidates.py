@@ -14,7 +14,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Image: TypeAlias = NDArray[np.float32]
+from cleargs.types import ImageF32
+
 CandidateName: TypeAlias = Literal["render", "restored", "fused"]
 Chosen: TypeAlias = Literal["render", "restored", "fused", "observed"]
 """A candidate, or the raw frame O_t, which needs none."""
@@ -33,7 +34,7 @@ KEPT = "needs no repair"
 """The reason of a row whose raw frame is kept."""
 
 
-def fuse(render: Image, restored: Image, sigma: float) -> Image:
+def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
     """F = clip(R + D - blur_sigma(D)): the render's base with the restored image's fine detail.
 
     sigma: standard deviation of the Gaussian in pixels; finer detail comes from ``restored``.
@@ -42,7 +43,7 @@ def fuse(render: Image, restored: Image, sigma: float) -> Image:
     return np.clip(render + detail, 0.0, 1.0).astype(np.float32)
 
 
-def gaussian_blur(image: Image, sigma: float) -> NDArray[np.float64]:
+def gaussian_blur(image: ImageF32, sigma: float) -> NDArray[np.float64]:
     """``image`` [H, W, 3] under a separable Gaussian cut at 3 sigma, mirrored at the borders, in float64."""
     from scipy.ndimage import gaussian_filter
 
@@ -52,7 +53,7 @@ def gaussian_blur(image: Image, sigma: float) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class Choice:
+class CandidateChoice:
     """The chosen candidate and why."""
 
     chosen: CandidateName
@@ -61,7 +62,7 @@ class Choice:
 
 def choose(
     primary: Mapping[CandidateName, float], tiebreak: Mapping[CandidateName, float], margin: float
-) -> Choice:
+) -> CandidateChoice:
     """The candidate with the highest primary score, or the tie-break's favourite within ``margin`` of it.
 
     primary, tiebreak: score of each candidate, higher is better, on a scale of 0-100; both have the same
@@ -74,9 +75,9 @@ def choose(
     best = max(primary.values())
     close = [name for name in names if best - primary[name] <= margin]
     if len(close) == 1:
-        return Choice(close[0], "primary score")
+        return CandidateChoice(close[0], "primary score")
     chosen = max(close, key=lambda name: (tiebreak[name], primary[name]))
-    return Choice(chosen, "tie-break among " + ", ".join(close))
+    return CandidateChoice(chosen, "tie-break among " + ", ".join(close))
 
 
 def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: float) -> bool:
@@ -84,7 +85,7 @@ def unbeaten(raw: float, candidates: Mapping[CandidateName, float], margin: floa
     return max(candidates.values()) - raw <= margin
 
 
-def hardly_changes(observed: Image, restored: Image, render: Image) -> bool:
+def is_negligible_change(observed: ImageF32, restored: ImageF32, render: ImageF32) -> bool:
     """Whether the repair hardly changes the raw frame: |D - O|^2 < 0.15 |R - O|^2.
 
     A frame that is blurred or skewed differs from a good scene's render by just that, and its repair undoes
@@ -100,7 +101,7 @@ def hardly_changes(observed: Image, restored: Image, render: Image) -> bool:
     return changed < NEGLIGIBLE * unexplained
 
 
-def hide_masked(image: Image, observed: Image, mask: np.ndarray | None) -> Image:
+def hide_masked(image: ImageF32, observed: ImageF32, mask: np.ndarray | None) -> ImageF32:
     """``image`` with the observation in its masked pixels.
 
     All candidates then agree there, so that what is masked cannot decide between them.

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cleargs.base_model import Settings
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from cleargs.record import Settings
-from cleargs.rivr.candidates import Image
+from cleargs.types import ArrayF64, ImageF32, MaskBool
 
 BLOCK = 64
 """Side of the blocks that are compared, px."""
@@ -29,8 +29,6 @@ REFUSED = "repair refused: "
 
 _FLAT = 0.02  # a block of lower standard deviation has too little texture to be aligned
 _AT_REST = 0.8  # see `_lengths`
-
-Array = NDArray[np.float64]
 
 
 class GateConfig(Settings):
@@ -48,7 +46,9 @@ class GateConfig(Settings):
     )
 
 
-def rejection_reason(repair: Image, observed: Image, render: Image, limits: GateConfig) -> str | None:
+def rejection_reason(
+    repair: ImageF32, observed: ImageF32, render: ImageF32, limits: GateConfig
+) -> str | None:
     """Why ``repair`` [H, W, 3] of a frame must not become supervision; None when it may.
 
     Masked pixels must be the same in all three images (`candidates.hide_masked`).
@@ -64,7 +64,7 @@ def rejection_reason(repair: Image, observed: Image, render: Image, limits: Gate
     return None
 
 
-def all_masked(mask: NDArray[np.bool_] | None) -> str | None:
+def all_masked(mask: MaskBool | None) -> str | None:
     """Why no candidate of a frame may become supervision; None when one may.
 
     mask: bool [H, W], False where the frame is to be ignored; None: nothing is masked.
@@ -74,7 +74,7 @@ def all_masked(mask: NDArray[np.bool_] | None) -> str | None:
     return None
 
 
-def shifts(repair: Image, observed: Image, render: Image) -> Array:
+def shifts(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
     """How far each block is from its place in the nearer of O_t and R_t, px [rows, columns].
 
     0 where the block has too little texture to tell.
@@ -91,16 +91,16 @@ def shifts(repair: Image, observed: Image, render: Image) -> Array:
     return np.stack(found)
 
 
-def colour_differences(repair: Image, observed: Image, render: Image) -> Array:
+def colour_differences(repair: ImageF32, observed: ImageF32, render: ImageF32) -> ArrayF64:
     """How far the mean of each block is from that in the nearer of O_t and R_t, in the channel where it is
     farthest, in sRGB [rows, columns].
     """
     means, *references = (_block_means(image) for image in (repair, observed, render))
-    nearer: Array = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
+    nearer: ArrayF64 = np.minimum(*(np.abs(means - other).max(axis=2) for other in references))
     return nearer
 
 
-def _block_means(image: Image) -> Array:
+def _block_means(image: ImageF32) -> ArrayF64:
     """[rows, columns, 3]; taken in linear light, which blur keeps, and given in sRGB."""
     linear = linear_from_srgb(image).astype(np.float64)
     height, width, _ = linear.shape
@@ -110,7 +110,7 @@ def _block_means(image: Image) -> Array:
     return srgb_from_linear(np.stack(means, axis=1))
 
 
-def _rows(image: Image) -> Iterator[Array]:
+def _rows(image: ImageF32) -> Iterator[ArrayF64]:
     """The grey blocks of each row of blocks, [N, S, S]: S is `BLOCK`, or the shorter side of the image."""
     grey = image.mean(axis=2, dtype=np.float64)
     height, width = grey.shape
@@ -125,13 +125,13 @@ def _starts(length: int, side: int, step: int) -> list[int]:
     return sorted({*range(0, length - side + 1, step), length - side})
 
 
-def _spectra(blocks: Array) -> NDArray[np.complex128]:
+def _spectra(blocks: ArrayF64) -> NDArray[np.complex128]:
     window = np.hanning(blocks.shape[1])
     centred = blocks - blocks.mean(axis=(1, 2), keepdims=True)
     return np.fft.rfft2(centred * window[:, None] * window)
 
 
-def _lengths(cross: NDArray[np.complex128], side: int) -> Array:
+def _lengths(cross: NDArray[np.complex128], side: int) -> ArrayF64:
     """Length of each block's shift, px, from its cross-power spectrum [N, S, S // 2 + 1].
 
     Phase correlation, half whitened: fully, the noise that blur leaves at high frequencies would drown the
@@ -154,7 +154,7 @@ def _lengths(cross: NDArray[np.complex128], side: int) -> Array:
     return np.where(correlation[:, 0, 0] < _AT_REST * peak, lengths, 0.0)
 
 
-def _fraction(before: Array, peak: Array, after: Array) -> Array:
+def _fraction(before: ArrayF64, peak: ArrayF64, after: ArrayF64) -> ArrayF64:
     """Where the parabola through three samples is highest, from the middle one; at most half a sample off."""
     bend = before - 2.0 * peak + after
     offset = np.divide(0.5 * (before - after), bend, out=np.zeros_like(bend), where=bend < 0.0)

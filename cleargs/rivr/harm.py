@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cleargs.record import Settings
+from cleargs.base_model import Settings
 
 
 class HarmConfig(Settings):
@@ -40,7 +40,7 @@ class Fidelity(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Verdict:
+class HarmVerdict:
     """Whether a distilled scene may be published, with the figures that decided."""
 
     frames: list[int]
@@ -55,7 +55,7 @@ class Verdict:
 
 def judge_harm(
     frames: Sequence[int], before: Fidelity | None, after: Fidelity | None, limits: HarmConfig
-) -> Verdict:
+) -> HarmVerdict:
     """Compare a distilled scene with G0 on the held-back ``frames``.
 
     Harm is a mean PSNR lower by more than ``psnr_margin`` dB, or a mean primary score lower by more than
@@ -63,11 +63,11 @@ def judge_harm(
     Without frames there is no harm.
     """
     if before is None or after is None:
-        return Verdict([], None, None, None, None, harm=None)
+        return HarmVerdict([], None, None, None, None, harm=None)
     worse = []
     if after.psnr < before.psnr - limits.psnr_margin:
         worse.append(f"PSNR fell by {before.psnr - after.psnr:.2f} dB")
     if after.score < before.score - limits.score_margin:
         worse.append(f"primary score fell by {before.score - after.score:.2f}")
     harm = " and ".join(worse) or None
-    return Verdict(list(frames), before.psnr, after.psnr, before.score, after.score, harm)
+    return HarmVerdict(list(frames), before.psnr, after.psnr, before.score, after.score, harm)

@@ -24,19 +24,19 @@ from cleargs.progress import Reporter
 from cleargs.rivr.candidates import (
     CANDIDATES,
     KEPT,
-    Choice,
-    Image,
+    CandidateChoice,
     Source,
     choose,
     fuse,
-    hardly_changes,
     hide_masked,
+    is_negligible_change,
     unbeaten,
 )
-from cleargs.rivr.distillation import Deblurred, Snapshot, observation
+from cleargs.rivr.distillation import Deblurred, TrainedScene, observation
 from cleargs.rivr.gates import REFUSED, GateConfig, all_masked, rejection_reason
 from cleargs.rivr.tables import SELECTION, Selection, chosen_counts
-from cleargs.splat.views import Mask, View
+from cleargs.splat.views import TrainingView
+from cleargs.types import ImageF32, MaskBool
 
 PREFIX = "cleargs:"
 """How the names of the attributes in the EXR begin."""
@@ -70,7 +70,9 @@ class Rules:
     margin: float
     gate: GateConfig
 
-    def restored(self, view: View, render: Image, scene: Snapshot) -> tuple[Image, Source, Deblurred | None]:
+    def restored(
+        self, view: TrainingView, render: ImageF32, scene: TrainedScene
+    ) -> tuple[ImageF32, Source, Deblurred | None]:
         """D_t in the light of the render R_t, what it was made from, and the deblurred frame if that is it.
 
         What ``scene`` says of the frame's camera is undone.
@@ -82,10 +84,10 @@ class Rules:
             return self._restored_observation(view), "observation", None
         return self._restored(deblurred.image), "deblurred", deblurred
 
-    def _restored(self, image: Image) -> Image:
+    def _restored(self, image: ImageF32) -> ImageF32:
         return self.expert.restore(image, threads=self.threads)
 
-    def _restored_observation(self, view: View) -> Image:
+    def _restored_observation(self, view: TrainingView) -> ImageF32:
         """As the cache gives it back, so that every round and every resumed run has the same bits."""
         path = self.cache / f"{view.frame_id:06d}.exr"
         try:
@@ -99,8 +101,8 @@ class Rules:
 
 def run_round(
     number: int,
-    targets: Sequence[View],
-    scene: Snapshot,
+    targets: Sequence[TrainingView],
+    scene: TrainedScene,
     rules: Rules,
     out: Path,
     reporter: Reporter,
@@ -117,7 +119,7 @@ def run_round(
     with reporter.task(label, total=len(targets)) as task:
         for view in targets:
             exr = f"{folder}/{view.frame_id:06d}.exr"
-            row = recorded_row(out, exr)
+            row = read_row(out, exr)
             if row is None or (row.round, row.frame_id) != (number, view.frame_id):
                 if (out / exr).exists():
                     reporter.warn(f"{exr}: what an earlier try left cannot be used and is made again")
@@ -130,7 +132,7 @@ def run_round(
 
 
 def repair(
-    number: int, view: View, exr: str, scene: Snapshot, rules: Rules
+    number: int, view: TrainingView, exr: str, scene: TrainedScene, rules: Rules
 ) -> tuple[Selection, LayeredImage]:
     """Make, score and choose the candidates of one frame.
 
@@ -162,14 +164,14 @@ def repair(
             view.weight > 0.0  # without its repair a frame of no weight would be lost
             and unbeaten(raw[0], primary, rules.margin)
             and unbeaten(raw[1], tiebreak, rules.margin)
-            and hardly_changes(observed, shown["restored"], shown["render"])
+            and is_negligible_change(observed, shown["restored"], shown["render"])
         ):
             kept = KEPT
     refused = rejection_reason(shown["restored"], observed, shown["render"], rules.gate)
     choice = (
         choose(primary, tiebreak, rules.margin)
         if refused is None
-        else Choice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
+        else CandidateChoice("render", f"{REFUSED}{refused}")  # what is fused from it falls with it
     )
     masked = all_masked(mask)
     row = Selection(
@@ -201,7 +203,7 @@ def repair(
     return row, LayeredImage(layers, _attributes(row))
 
 
-def forget_others(out: Path, rounds: int, targets: Sequence[View]) -> None:
+def forget_others(out: Path, rounds: int, targets: Sequence[TrainingView]) -> None:
     """Remove what would be published beside the EXRs of ``targets`` in rounds 1 to ``rounds``."""
     ours = {
         f"round_{number:02d}/{view.frame_id:06d}.exr" for number in range(1, rounds + 1) for view in targets
@@ -211,7 +213,7 @@ def forget_others(out: Path, rounds: int, targets: Sequence[View]) -> None:
             remove(place)
 
 
-def recorded_row(out: Path, exr: str) -> Selection | None:
+def read_row(out: Path, exr: str) -> Selection | None:
     """The row that the EXR at ``out/exr`` carries; None where there is no whole EXR."""
     if not (out / exr).exists():
         return None
@@ -232,19 +234,19 @@ def _attributes(row: Selection) -> dict[str, int | float | str]:
     return {f"{PREFIX}{name}": value for name, value in values.items()}
 
 
-def pseudo_view(target: View, row: Selection, out: Path) -> View:
+def pseudo_view(target: TrainingView, row: Selection, out: Path) -> TrainingView:
     """The chosen candidate of ``row`` as supervision at the frame's pose, masked like the frame."""
 
     @cache  # a training loads a view often; the mask comes with the raw frame, which is then decoded once
-    def mask() -> Mask | None:
+    def mask() -> MaskBool | None:
         return target.load()[1]
 
-    def load() -> tuple[Image, Mask | None]:
+    def load() -> tuple[ImageF32, MaskBool | None]:
         return from_layer(read_exr(out / row.exr).layers[row.chosen]), mask()
 
     return replace(target, weight=1.0, kind="pseudo", load=load)
 
 
-def _score(scorer: Scorer, image: Image, threads: int) -> float:
+def _score(scorer: Scorer, image: ImageF32, threads: int) -> float:
     """In single precision, as the EXR holds it."""
     return float(np.float32(scorer.score(image, threads=threads)))

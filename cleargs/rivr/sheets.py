@@ -9,9 +9,9 @@ from cleargs.media.contact_sheet import Tile, contact_sheet
 from cleargs.media.exr import from_layer, read_exr
 from cleargs.media.image import write_rgb
 from cleargs.rivr.candidates import CANDIDATES
-from cleargs.rivr.distillation import Snapshot, observation
+from cleargs.rivr.distillation import TrainedScene, observation
 from cleargs.rivr.tables import Selection
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 SHEET_FRAMES = 6
 """Frames on a sheet."""
@@ -26,9 +26,9 @@ def write_candidates_sheet(path: Path, rows: Sequence[Selection], rivr: Path) ->
 
 def write_before_after_sheet(
     path: Path,
-    views: Sequence[View],
-    before: Snapshot,
-    after: Snapshot,
+    views: Sequence[TrainingView],
+    before: TrainedScene,
+    after: TrainedScene,
     repairs: Mapping[int, Selection],
     rivr: Path,
 ) -> None:

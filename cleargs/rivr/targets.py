@@ -17,13 +17,13 @@ from cleargs.errors import StageError
 from cleargs.formation.frames import view_of
 from cleargs.parquet import read_table
 from cleargs.rva.tables import FRAMES
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 Targets: TypeAlias = Literal["all", "degraded"]
 
 
 @dataclass(frozen=True)
-class Appraisal:
+class FrameAssessment:
     """What RVA says about a frame."""
 
     frame_id: int
@@ -38,7 +38,7 @@ class Appraisal:
     """Of the frame's raw supervision; 0: it is never loaded."""
 
 
-def held_back_frames(frames: Sequence[Appraisal], share: float = 0.125) -> list[int]:
+def select_holdout(frames: Sequence[FrameAssessment], share: float = 0.125) -> list[int]:
     """A share (at least one; none for 0) of the reliable frames: the best by R - B of each of as many equal
     parts of the trajectory (ties: the one nearest to the part's middle); in order.
 
@@ -60,22 +60,22 @@ def _parts(count: int, parts: int) -> Iterator[tuple[int, int]]:
     return pairwise(k * count // parts for k in range(parts + 1))
 
 
-def _best(frames: Sequence[Appraisal]) -> Appraisal:
+def _best(frames: Sequence[FrameAssessment]) -> FrameAssessment:
     middle = len(frames) // 2
     ranked = sorted(enumerate(frames), key=lambda item: (item[1].B - item[1].R, abs(item[0] - middle)))
     return ranked[0][1]
 
 
 @dataclass(frozen=True)
-class Group:
+class FrameGroup:
     """Target frames that are rendered from one scene."""
 
-    targets: Sequence[View]
+    targets: Sequence[TrainingView]
     steps: int
     """Steps of the distillation of what was accepted so far, after its frames."""
 
 
-def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> list[Group]:
+def trajectory_groups(targets: Sequence[TrainingView], size: int | None, steps: int) -> list[FrameGroup]:
     """``targets`` in their order, in as few groups of at most ``size`` frames as hold them, all in one for
     None; sizes differ by one at most. ``steps`` is shared in proportion to the frames and adds up exactly.
 
@@ -87,7 +87,7 @@ def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> 
     frames = len(targets)
     count = 1 if size is None else max(1, -(-frames // size))
     return [
-        Group(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
+        FrameGroup(targets[start:end], steps * end // frames - steps * start // frames if frames else steps)
         for start, end in _parts(frames, count)
     ]
 
@@ -96,56 +96,56 @@ def trajectory_groups(targets: Sequence[View], size: int | None, steps: int) -> 
 class Supervision:
     """Views of the registered training frames, by frame_id, each with its RVA weight (which may be 0)."""
 
-    views: dict[int, View]
-    appraisals: list[Appraisal]
-    held_back: list[int]
+    views: dict[int, TrainingView]
+    assessments: list[FrameAssessment]
+    holdout_ids: list[int]
     """Frames that get no repairs, to measure whether those of the others do harm; none where the settings
     hold none back."""
 
     @property
-    def real(self) -> list[View]:
+    def real(self) -> list[TrainingView]:
         """The active raw frames: D_real, the held-back ones among them, as for G0."""
         return [view for view in self.views.values() if view.weight > 0.0]
 
     @property
-    def judges(self) -> list[View]:
+    def holdout_views(self) -> list[TrainingView]:
         """The held-back frames."""
-        return [self.views[frame_id] for frame_id in self.held_back]
+        return [self.views[frame_id] for frame_id in self.holdout_ids]
 
-    def targets(self, which: Targets) -> list[View]:
+    def targets(self, which: Targets) -> list[TrainingView]:
         """The frames that every round repairs: ``all``, or those whose role is not ``strong``, but never the
         held-back ones.
         """
         return [
             self.views[frame.frame_id]
-            for frame in self.appraisals
-            if frame.frame_id not in self.held_back and (which == "all" or frame.role != "strong")
+            for frame in self.assessments
+            if frame.frame_id not in self.holdout_ids and (which == "all" or frame.role != "strong")
         ]
 
-    def worst(self, frame_ids: Sequence[int], count: int) -> list[View]:
+    def worst(self, frame_ids: Sequence[int], count: int) -> list[TrainingView]:
         """The ``count`` views of lowest R - B among ``frame_ids``, worst first."""
         wanted = set(frame_ids)
-        ranked = sorted(self.appraisals, key=lambda frame: (frame.R - frame.B, frame.frame_id))
+        ranked = sorted(self.assessments, key=lambda frame: (frame.R - frame.B, frame.frame_id))
         return [self.views[frame.frame_id] for frame in ranked if frame.frame_id in wanted][:count]
 
 
-def load_supervision(ingest: Path, rva: Path, held_back: float) -> Supervision:
+def load_supervision(ingest: Path, rva: Path, holdout_share: float) -> Supervision:
     """Read the finished folders of ingest and rva; frames that RVA could not score stay out. Decodes no
     image.
 
-    held_back: share of the reliable frames that judge the result.
+    holdout_share: share of the reliable frames that judge the result.
 
     Raises StoreError when a table is damaged, StageError when no frame can judge the result.
     """
     frames = {f.frame_id: f for f in load_frames(ingest) if f.registered and f.split == "train"}
-    columns = pa.schema([FRAMES.field(field.name) for field in fields(Appraisal)])
-    rows = [Appraisal(**row) for row in read_table(rva / "frames.parquet", columns).to_pylist()]
+    columns = pa.schema([FRAMES.field(field.name) for field in fields(FrameAssessment)])
+    rows = [FrameAssessment(**row) for row in read_table(rva / "frames.parquet", columns).to_pylist()]
     scored = [row for row in rows if row.frame_id in frames and row.R is not None]
-    appraisals = sorted(scored, key=lambda frame: frame.frame_id)
-    views = {a.frame_id: view_of(frames[a.frame_id], ingest, a.weight) for a in appraisals}
-    judges = held_back_frames(appraisals, held_back)
-    if held_back > 0.0 and not judges:
+    assessments = sorted(scored, key=lambda frame: frame.frame_id)
+    views = {a.frame_id: view_of(frames[a.frame_id], ingest, a.weight) for a in assessments}
+    holdout_ids = select_holdout(assessments, holdout_share)
+    if holdout_share > 0.0 and not holdout_ids:
         raise StageError(
             "no frame is reliable, and no frame takes the place of one", hint="run rva again with --force rva"
         )
-    return Supervision(views, appraisals, judges)
+    return Supervision(views, assessments, holdout_ids)

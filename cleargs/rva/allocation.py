@@ -10,9 +10,9 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from cleargs.rva.arrays import Bools, Floats
 from cleargs.rva.config import AssessmentConfig
 from cleargs.rva.tables import R_CUES
+from cleargs.types import ArrayBool, ArrayF64
 
 Roles = npt.NDArray[np.str_]
 
@@ -39,9 +39,9 @@ class Role(StrEnum):
 
 
 def appearance_scores(
-    cues: Floats,  # [N, 11] in [0, 1], columns as tables.CUE_COLUMNS
+    cues: ArrayF64,  # [N, 11] in [0, 1], columns as tables.CUE_COLUMNS
     config: AssessmentConfig,
-) -> tuple[Floats, Floats]:  # R [N], B [N], both in [0, 1]
+) -> tuple[ArrayF64, ArrayF64]:  # R [N], B [N], both in [0, 1]
     """R = w_R . r and B = w_B . b. The sums run cue by cue, so that a row's score needs that row alone."""
     r, b = cues[:, : len(R_CUES)], cues[:, len(R_CUES) :]
     R = sum((w * r[:, k] for k, w in enumerate(config.w_R)), start=np.zeros(len(cues)))
@@ -50,19 +50,19 @@ def appearance_scores(
     return np.clip(R, 0.0, 1.0), np.clip(B, 0.0, 1.0)
 
 
-def is_reliable(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
+def is_reliable(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> ArrayBool:
     """Membership in the appearance-reliable set A = {R >= tau_R, B <= tau_B}."""
     return np.asarray((config.tau_R <= R) & (config.tau_B >= B))
 
 
-def best_frames(R: Floats, B: Floats, count: int) -> Bools:  # [N] each, in trajectory order
+def best_frames(R: ArrayF64, B: ArrayF64, count: int) -> ArrayBool:  # [N] each, in trajectory order
     """The ``count`` frames of the largest R - B; ties go to the earlier."""
     chosen = np.zeros(len(R), dtype=bool)
     chosen[np.argsort(B - R, kind="stable")[:count]] = True
     return chosen
 
 
-def stand_in_set(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
+def stand_in_set(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> ArrayBool:
     """The best frames by R - B, a share `stand_in_share` of them and at least one (none of none).
 
     They take the place of an empty set A in the geometry.
@@ -70,7 +70,7 @@ def stand_in_set(R: Floats, B: Floats, config: AssessmentConfig) -> Bools:
     return best_frames(R, B, max(1, round(config.stand_in_share * len(R))))
 
 
-def standard_roles(R: Floats, B: Floats, G: Floats, config: AssessmentConfig) -> Roles:  # [N] each
+def standard_roles(R: ArrayF64, B: ArrayF64, G: ArrayF64, config: AssessmentConfig) -> Roles:  # [N] each
     """The standard supervision conditions, evaluated from top to bottom; suppressed where none holds."""
     geometric = (config.geometric_G <= G) & (config.geometric_B >= B)
     auxiliary = (config.auxiliary_R <= R) & (config.auxiliary_G <= G) & (config.auxiliary_B >= B)
@@ -81,7 +81,9 @@ def standard_roles(R: Floats, B: Floats, G: Floats, config: AssessmentConfig) ->
     )
 
 
-def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: AssessmentConfig) -> Floats:
+def reactivation_gain(
+    R: ArrayF64, B: ArrayF64, G: ArrayF64, Z: ArrayF64, config: AssessmentConfig
+) -> ArrayF64:
     """lambda_G G + lambda_R R + lambda_B (1 - B) + lambda_Z Z (paper, eq. tca_selection)."""
     quality = config.lambda_R * R + config.lambda_B * (1.0 - B)
     return np.asarray(config.lambda_G * G + quality + config.lambda_Z * Z)
@@ -90,7 +92,7 @@ def reactivation_gain(R: Floats, B: Floats, G: Floats, Z: Floats, config: Assess
 def reactivate(
     roles: Roles,  # [N] standard roles, in trajectory order
     bins: npt.NDArray[np.int32],  # [N]
-    gain: Floats,  # [N] from `reactivation_gain`
+    gain: ArrayF64,  # [N] from `reactivation_gain`
     config: AssessmentConfig,
 ) -> Roles:  # [N] a `Rule` where a suppressed frame is reactivated, "" elsewhere
     """Which suppressed frames supervise after all, and why.
@@ -113,10 +115,10 @@ def reactivate(
     return rules
 
 
-def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AssessmentConfig) -> Floats:
+def supervision_weights(roles: Roles, R: ArrayF64, G: ArrayF64, config: AssessmentConfig) -> ArrayF64:
     """The weight w in [0, 1] that the table gives to each role."""
 
-    def attenuated(mix: tuple[float, float]) -> Floats:
+    def attenuated(mix: tuple[float, float]) -> ArrayF64:
         return config.attenuated_base + config.attenuated_gain * (mix[0] * R + mix[1] * G)
 
     weight = np.select(
@@ -132,7 +134,7 @@ def supervision_weights(roles: Roles, R: Floats, G: Floats, config: AssessmentCo
     return np.asarray(np.clip(weight, 0.0, 1.0))  # base + gain may pass 1 by rounding
 
 
-def keep_sharp(R: Floats, B: Floats, config: AssessmentConfig) -> tuple[Roles, Floats]:  # [N] each
+def keep_sharp(R: ArrayF64, B: ArrayF64, config: AssessmentConfig) -> tuple[Roles, ArrayF64]:  # [N] each
     """Roles and weights of the baseline that drops blurry frames.
 
     A share `binary_share` of the frames (rounded up, at least one), best by R - B, and every reliable frame
@@ -147,7 +149,7 @@ def keep_sharp(R: Floats, B: Floats, config: AssessmentConfig) -> tuple[Roles, F
     return roles, kept.astype(np.float64)
 
 
-def effective_sample_size(weight: Floats) -> float:
+def effective_sample_size(weight: ArrayF64) -> float:
     """Kish's (sum w)^2 / sum w^2: how many equally weighted frames the weights are worth; 0 for none."""
     squares = float(np.dot(weight, weight))
     return float(weight.sum()) ** 2 / squares if squares > 0.0 else 0.0

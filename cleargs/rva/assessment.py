@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from cleargs.capture.tables import Frame
 from cleargs.rva import allocation, geometry
 from cleargs.rva.allocation import Role, Roles, Rule
-from cleargs.rva.arrays import Bools, Floats, Ints
 from cleargs.rva.config import AssessmentConfig
 from cleargs.rva.tables import BINS, CUE_COLUMNS, FRAMES
+from cleargs.types import ArrayBool, ArrayF64, ArrayInt
 
 S = TypeVar("S", bound=np.generic)
 
@@ -26,17 +26,17 @@ S = TypeVar("S", bound=np.generic)
 class Poses:
     """World-to-camera poses (OpenCV axes) of N frames; rows of unregistered frames are not read."""
 
-    rotations: Floats  # [N, 3, 3]
-    translations: Floats  # [N, 3]
-    registered: Bools  # [N]
+    rotations: ArrayF64  # [N, 3, 3]
+    translations: ArrayF64  # [N, 3]
+    registered: ArrayBool  # [N]
 
 
 @dataclass(frozen=True)
 class Observations:
     """Which frame observes which point: the paper's P_i as pairs."""
 
-    frame_id: Ints  # [M]
-    point_id: Ints  # [M]
+    frame_id: ArrayInt  # [M]
+    point_id: ArrayInt  # [M]
 
 
 @dataclass(frozen=True)
@@ -45,26 +45,26 @@ class Assessment:
     or not scored.
     """
 
-    R: Floats
-    B: Floats
-    reliable: Bools
-    stand_in: Bools
-    C: Floats
-    D: Floats
-    O: Floats
-    G: Floats
+    R: ArrayF64
+    B: ArrayF64
+    reliable: ArrayBool
+    stand_in: ArrayBool
+    C: ArrayF64
+    D: ArrayF64
+    O: ArrayF64
+    G: ArrayF64
     bin: npt.NDArray[np.int32]
-    Z: Floats
+    Z: ArrayF64
     role: Roles
     reactivated_for: Roles  # a `Rule`, "" where the frame is not reactivated
-    weight: Floats
-    covered: Bools  # [bins] active frames before reactivation
-    bin_edges: Floats  # [bins + 1] cumulative pose motion
+    weight: ArrayF64
+    covered: ArrayBool  # [bins] active frames before reactivation
+    bin_edges: ArrayF64  # [bins + 1] cumulative pose motion
 
 
 def assess(
-    frame_id: Ints,  # [N] distinct; orders the trajectory
-    cues: Floats,  # [N, 11] in [0, 1]; NaN in the row of a frame that could not be scored
+    frame_id: ArrayInt,  # [N] distinct; orders the trajectory
+    cues: ArrayF64,  # [N, 11] in [0, 1]; NaN in the row of a frame that could not be scored
     poses: Poses,
     observations: Observations,
     config: AssessmentConfig,
@@ -153,7 +153,7 @@ def frames_table(
     frame_id: npt.NDArray[np.int32],  # [N] ascending
     names: Sequence[str],
     evaluator: str,
-    cues: Floats,  # [N, 11], NaN where a frame could not be scored
+    cues: ArrayF64,  # [N, 11], NaN where a frame could not be scored
     result: Assessment,
 ) -> pa.Table:
     """The rows of rva/frames.parquet; NaN becomes null."""

@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator, model_validator
 
+from cleargs.base_model import FrozenModel, Settings, Unit
 from cleargs.plugins import require_known
-from cleargs.record import Record, Settings, Unit
 
 _SUM_TOLERANCE = 1e-9  # decimal weights such as 0.30 + 0.25 + ... do not add up to 1 exactly in binary
 
@@ -76,7 +76,7 @@ class QwenConfig(Settings):
     )
 
 
-class EvaluatorConfig(Record):
+class EvaluatorConfig(FrozenModel):
     """Choice of the evaluator that judges the appearance of frames."""
 
     evaluator: str = Field(

@@ -10,22 +10,21 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cleargs.errors import InputError, StoreError
 from cleargs.files import write_json
 from cleargs.media.image import read_mask, read_rgb
 from cleargs.progress import Reporter
-from cleargs.rva.arrays import Floats
-from cleargs.untrusted import read_json
+from cleargs.safe_io import read_json
+from cleargs.types import AnyImage, ArrayF64, ImageU8, MaskU8
 
 
 @dataclass(frozen=True)
-class View:
+class EvaluatedFrame:
     """A frame as an evaluator gets it: files, so that nobody has to hold a video in memory."""
 
     frame_id: int
@@ -34,7 +33,7 @@ class View:
     """8-bit image of the same size; pixels that are 0 in it are ignored."""
 
 
-def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
+def load_view(view: EvaluatedFrame) -> tuple[ImageU8, MaskU8 | None]:
     """The frame [H, W, 3] in sRGB and its mask [H, W]. Raises StoreError when one cannot be read."""
     hint = "run again with --force ingest"
     try:
@@ -46,7 +45,7 @@ def load_view(view: View) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] 
     return rgb, mask
 
 
-def reduced(image: npt.NDArray[Any], long_side: int) -> npt.NDArray[Any]:
+def reduced(image: AnyImage, long_side: int) -> AnyImage:
     """``image``, by area averaging where its long side exceeds ``long_side`` px."""
     height, width = image.shape[:2]
     scale = long_side / max(height, width)
@@ -67,7 +66,7 @@ class Evaluator(Protocol):
     def version(self) -> int:
         """Raised when equal images get other cues."""
 
-    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+    def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """Cues [n, 11] in [0, 1], columns as `tables.CUE_COLUMNS`, for frames given in trajectory order.
 
         A row of NaN is a frame that could not be scored; ``reporter`` was told why. Neighbours in ``views``
@@ -93,7 +92,7 @@ class ItemCache:
     bounds: tuple[float, float] = (-math.inf, math.inf)
     """Rows with a number outside are not taken from files."""
 
-    def row(self, view: View, make: Callable[[View], Floats]) -> Floats:
+    def row(self, view: EvaluatedFrame, make: Callable[[EvaluatedFrame], ArrayF64]) -> ArrayF64:
         """The kept row of ``view``, or else what ``make`` finds; a new file appears whole.
 
         Raises OSError when a file of the view cannot be read.
@@ -109,7 +108,7 @@ class ItemCache:
             write_json(self.folder / f"{digest}.json", dict(zip(self.columns, row.tolist(), strict=True)))
         return row
 
-    def find(self, file: Path) -> Floats | None:
+    def find(self, file: Path) -> ArrayF64 | None:
         """The row in ``file``; None where there is none, or where it is damaged."""
         try:
             kept = read_json(file)

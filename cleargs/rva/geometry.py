@@ -11,27 +11,27 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-from cleargs.rva.arrays import Bools, Floats, Ints
 from cleargs.rva.config import AssessmentConfig
+from cleargs.types import ArrayBool, ArrayF64, ArrayInt
 
 _PAIRS_AT_ONCE = 1 << 20
 """Pairs of frames held in memory at a time (8 MB an array of float64)."""
 
 
 def camera_centres(
-    rotations: Floats,  # [N, 3, 3] world to camera
-    translations: Floats,  # [N, 3]
-) -> Floats:  # [N, 3] in the world
+    rotations: ArrayF64,  # [N, 3, 3] world to camera
+    translations: ArrayF64,  # [N, 3]
+) -> ArrayF64:  # [N, 3] in the world
     """Camera centres -R^T t."""
     return np.asarray(-np.einsum("nij,ni->nj", rotations, translations))
 
 
-def view_directions(rotations: Floats) -> Floats:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
+def view_directions(rotations: ArrayF64) -> ArrayF64:  # [N, 3, 3] world to camera -> [N, 3] unit vectors
     """Optical axes in the world: the third row of R (OpenCV axes, z forward)."""
     return rotations[:, 2, :]
 
 
-def view_angle(chord: Floats) -> Floats:
+def view_angle(chord: ArrayF64) -> ArrayF64:
     """Angle between unit vectors, divided by pi, from the length of their difference.
 
     Unlike arccos of the dot product it is exact at 0 and accurate for small angles.
@@ -39,7 +39,7 @@ def view_angle(chord: Floats) -> Floats:
     return np.asarray(2.0 / np.pi * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)))
 
 
-def largest_distance(points: Floats) -> float:  # [N, 3]
+def largest_distance(points: ArrayF64) -> float:  # [N, 3]
     """Largest distance between any two points; 0 for fewer than two."""
     return max(
         (float(cdist(points[rows], points).max()) for rows in _row_blocks(len(points), len(points))),
@@ -48,11 +48,11 @@ def largest_distance(points: Floats) -> float:  # [N, 3]
 
 
 def pose_diversity(
-    centres: Floats,  # [N, 3]
-    directions: Floats,  # [N, 3] unit vectors
-    reference: Bools,  # [N] the reliable set (or its stand-in)
+    centres: ArrayF64,  # [N, 3]
+    directions: ArrayF64,  # [N, 3] unit vectors
+    reference: ArrayBool,  # [N] the reliable set (or its stand-in)
     config: AssessmentConfig,
-) -> Floats:  # D [N] in [0, 1]
+) -> ArrayF64:  # D [N] in [0, 1]
     """D_i = max over reference frames j != i of gamma_c d^c_ij + gamma_v d^v_ij; 0 where there is no such j.
 
     d^c is the distance of the camera centres over the largest one in the capture, d^v the view angle over pi.
@@ -72,9 +72,9 @@ def pose_diversity(
 
 
 def visibility(
-    frame_id: Ints,  # [N] ascending
-    observer: Ints,  # [M] id of the frame that observes
-    point_id: Ints,  # [M]
+    frame_id: ArrayInt,  # [N] ascending
+    observer: ArrayInt,  # [M] id of the frame that observes
+    point_id: ArrayInt,  # [M]
 ) -> sparse.csr_array:  # [N, P] of 0 and 1
     """The sets P_i as a sparse matrix; what other frames observe is left out.
 
@@ -92,7 +92,7 @@ def visibility(
     return seen
 
 
-def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> C [N] in [0, 1]
+def coverage_gain(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N, P], [N] -> C [N] in [0, 1]
     """C_i: the share of frame i's points, weighted by 1 / sqrt(n_p), that no reference frame sees; 0 without
     points.
 
@@ -107,7 +107,7 @@ def coverage_gain(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P]
     return np.asarray(np.divide(gained, total, out=np.zeros_like(total), where=total > 0.0))
 
 
-def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [N] -> O [N] in [0, 1]
+def redundancy(seen: sparse.csr_array, reference: ArrayBool) -> ArrayF64:  # [N, P], [N] -> O [N] in [0, 1]
     """O_i = max over reference frames j != i of |P_i and P_j| / |P_i or P_j|; 0 where there is no such j.
 
     Only pairs that share a point are visited: the work is the sum over points of (observers x reference
@@ -126,7 +126,7 @@ def redundancy(seen: sparse.csr_array, reference: Bools) -> Floats:  # [N, P], [
     return largest
 
 
-def geometric_utility(C: Floats, D: Floats, O: Floats, config: AssessmentConfig) -> Floats:
+def geometric_utility(C: ArrayF64, D: ArrayF64, O: ArrayF64, config: AssessmentConfig) -> ArrayF64:
     """G = clip to [0, 1] of alpha C + beta D - eta O (paper, eq. vista_geometry)."""
     return np.clip(config.alpha * C + config.beta * D - config.eta * O, 0.0, 1.0)
 
@@ -136,15 +136,15 @@ class Bins:
     """Where each frame lies on the trajectory."""
 
     index: npt.NDArray[np.int32]  # [N] bin of each frame
-    centrality: Floats  # [N] Z in [0, 1], 1 at the middle of the bin
-    edges: Floats  # [M + 1] cumulative motion at the bins' borders
+    centrality: ArrayF64  # [N] Z in [0, 1], 1 at the middle of the bin
+    edges: ArrayF64  # [M + 1] cumulative motion at the bins' borders
 
 
 def cumulative_motion(
-    centres: Floats,  # [N, 3] in trajectory order
-    directions: Floats,  # [N, 3] unit vectors
+    centres: ArrayF64,  # [N, 3] in trajectory order
+    directions: ArrayF64,  # [N, 3] unit vectors
     config: AssessmentConfig,
-) -> Floats:  # s [N], from 0
+) -> ArrayF64:  # s [N], from 0
     """Pose motion up to each frame: a step is gamma_c (normalised centre distance) + gamma_v (view angle /
     pi).
 
@@ -160,7 +160,7 @@ def cumulative_motion(
     return np.concatenate([[0.0], np.cumsum(config.gamma_c * distance + config.gamma_v * angle)])
 
 
-def cut_into_bins(motion: Floats, frames_per_bin: int) -> Bins:  # [N] cumulative, in trajectory order
+def cut_into_bins(motion: ArrayF64, frames_per_bin: int) -> Bins:  # [N] cumulative, in trajectory order
     """M = max(1, round(N / frames_per_bin)) bins of equal motion.
 
     With x = M s / S: bin = min(floor(x), M - 1) and Z = 1 - |2 (x - bin) - 1|. A camera that does not move

@@ -17,13 +17,9 @@ from itertools import product
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from cleargs.rva.arrays import Floats
 from cleargs.rva.evaluator import reduced
-
-Plane = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+from cleargs.types import ArrayF64, ImageU8, MaskBool, MaskU8, PlaneF32
 
 LONG_SIDE = 640
 """Images are reduced (never enlarged) to this long side: blur is measured in pixels of that size."""
@@ -60,14 +56,14 @@ _NEAREST_LAG = 5  # px: nearer, content hides the peak of a double image
 class Luminance:
     """Rec.601 luma of an sRGB image, 0 to 255."""
 
-    full: Plane  # [H, W] as given
-    reduced: Plane  # [h, w] long side at most LONG_SIDE
-    valid: Mask  # [h, w] not masked
+    full: PlaneF32  # [H, W] as given
+    reduced: PlaneF32  # [h, w] long side at most LONG_SIDE
+    valid: MaskBool  # [h, w] not masked
 
 
 def reduce_luminance(
-    rgb: npt.NDArray[np.uint8],  # [H, W, 3] sRGB
-    mask: npt.NDArray[np.uint8] | None,  # [H, W], 0 = ignore
+    rgb: ImageU8,  # [H, W, 3] sRGB
+    mask: MaskU8 | None,  # [H, W], 0 = ignore
 ) -> Luminance:
     """Luma as given, and reduced by area averaging; a reduced pixel counts if all that it averages does."""
     full = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -77,14 +73,16 @@ def reduce_luminance(
     return Luminance(full, small, reduced((mask > 0).astype(np.float32), LONG_SIDE) > 0.999)
 
 
-def away_from_masked(valid: Mask, radius: int) -> Mask:
+def away_from_masked(valid: MaskBool, radius: int) -> MaskBool:
     """Valid pixels at least ``radius`` (pixels, square neighbourhood) from masked ones and the border."""
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), dtype=np.uint8)
     eroded = cv2.erode(valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(eroded > 0)
 
 
-def detail_ratios(luminance: Plane, valid: Mask, noise: float) -> Floats:  # [h, w], [h, w] -> [DIRECTIONS]
+def detail_ratios(
+    luminance: PlaneF32, valid: MaskBool, noise: float
+) -> ArrayF64:  # [h, w], [h, w] -> [DIRECTIONS]
     """Mean over the tiles of u' T(FINE) u / u' T(COARSE) u along each direction k pi / DIRECTIONS.
 
     The noise's own share is taken off; ``noise`` in levels of 255. About 3 for a sharp scene of step edges,
@@ -105,8 +103,8 @@ def detail_ratios(luminance: Plane, valid: Mask, noise: float) -> Floats:  # [h,
 
 
 def _directional_energy(
-    luminance: Plane, inner: Mask, share: Floats, noise: float, sigma: float
-) -> Floats:  # [tiles, DIRECTIONS]
+    luminance: PlaneF32, inner: MaskBool, share: ArrayF64, noise: float, sigma: float
+) -> ArrayF64:  # [tiles, DIRECTIONS]
     """u' T(sigma) u of each tile, in squared levels a pixel."""
     smooth = cv2.GaussianBlur(luminance, (0, 0), sigma)
     x, y = (0.5 * cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=1) * inner for dx in (1, 0))
@@ -121,16 +119,16 @@ def _directional_energy(
     )
 
 
-def _tile_means(plane: Plane) -> Floats:  # [h, w] -> [tiles]
+def _tile_means(plane: PlaneF32) -> ArrayF64:  # [h, w] -> [tiles]
     height, width = plane.shape
     size = max(1, round(width / TILE)), max(1, round(height / TILE))
     return cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
 
 
 def extents_from_ratios(
-    ratio: Floats,  # [...] as `detail_ratios`
-    content: Floats,  # [...] > 1: what sharp views of the same content have
-) -> Floats:  # [...] px, in [0, MAX_EXTENT]
+    ratio: ArrayF64,  # [...] as `detail_ratios`
+    content: ArrayF64,  # [...] > 1: what sharp views of the same content have
+) -> ArrayF64:  # [...] px, in [0, MAX_EXTENT]
     """Standard deviation s of the blur: solves ratio = ((COARSE^2 + s^2) / (FINE^2 + s^2))^p with the p that
     ``content`` has at s = 0.
     """
@@ -140,7 +138,7 @@ def extents_from_ratios(
     return np.asarray(np.sqrt(np.clip(square, 0.0, MAX_EXTENT**2)))
 
 
-def noise_level(luminance: Plane, valid: Mask) -> float:
+def noise_level(luminance: PlaneF32, valid: MaskBool) -> float:
     """Standard deviation of the noise, in levels of 255.
 
     Immerkaer's operator ("Fast noise variance estimation", CVIU 1996), which cancels ramps, with a median in
@@ -160,7 +158,7 @@ def noise_level(luminance: Plane, valid: Mask) -> float:
     return _MAD_TO_SIGMA * float(np.median(flat))
 
 
-def blocking(luminance: Plane) -> float:
+def blocking(luminance: PlaneF32) -> float:
     """Excess of the steps on an 8 px grid over those between its lines; 0 for none, 1 for twice as strong.
 
     After Wang, Bovik and Evans ("Blind measurement of blocking artifacts", ICIP 2000), in the pixel domain:
@@ -180,7 +178,7 @@ def blocking(luminance: Plane) -> float:
     return max(strengths, default=0.0)
 
 
-def ringing(luminance: Plane, valid: Mask, noise: float) -> float:
+def ringing(luminance: PlaneF32, valid: MaskBool, noise: float) -> float:
     """Ripple beside strong edges over what is there farther away, in levels of 255 beyond the noise.
 
     The response of Immerkaer's operator at 3 to 5 px from strong edges, as its lower quartile there (texture
@@ -198,7 +196,7 @@ def ringing(luminance: Plane, valid: Mask, noise: float) -> float:
     return max(float(np.quantile(response[band], 0.25)) / 0.319 - noise, 0.0)
 
 
-def exposure(luminance: Plane, valid: Mask) -> tuple[float, float, float]:
+def exposure(luminance: PlaneF32, valid: MaskBool) -> tuple[float, float, float]:
     """How the pixels that count use the range of levels, black and clipped where none counts.
 
     The mean luma over 255, the share of clipped pixels, and the 95th percentile less the 5th, over 255.
@@ -211,7 +209,7 @@ def exposure(luminance: Plane, valid: Mask) -> tuple[float, float, float]:
     return float(np.mean(levels, dtype=np.float64)) / 255.0, clipped, float(high - low) / 255.0
 
 
-def ghosting(luminance: Plane, noise: float) -> float:
+def ghosting(luminance: PlaneF32, noise: float) -> float:
     """Height of the largest positive side peak of the power cepstrum: below 0.06 for none,
     0.1 to 0.3 for a double image of about equal parts.
 

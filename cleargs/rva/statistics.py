@@ -22,9 +22,9 @@ import numpy as np
 
 from cleargs.progress import Reporter
 from cleargs.rva import measures
-from cleargs.rva.arrays import Floats
-from cleargs.rva.evaluator import ItemCache, View, load_view
+from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view
 from cleargs.rva.measures import DIRECTIONS, Luminance, detail_ratios, extents_from_ratios, reduce_luminance
+from cleargs.types import ArrayF64
 
 # Extents are standard deviations of the blur in px at the reduced size.
 _NEIGHBOURS = 4  # frames before and after whose best is taken for what the content itself looks like
@@ -59,12 +59,12 @@ _BRIGHT = (0.70, 0.95)  # mean luma at which brightness begins to hurt and expos
 _STOPS = (0.4, 2.0)  # jump of the mean luma from the neighbours' median, in stops: harmless, and failure
 
 
-def ramp(value: Floats, ends: tuple[float, float]) -> Floats:
+def ramp(value: ArrayF64, ends: tuple[float, float]) -> ArrayF64:
     """0 at the first end and beyond, 1 at the second, linear between; the ends may fall."""
     return np.clip((value - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
 
 
-def decay(value: Floats, half: float, steepness: float) -> Floats:
+def decay(value: ArrayF64, half: float, steepness: float) -> ArrayF64:
     """1 at 0, 1/2 at ``half``, towards 0: 1 / (1 + (value / half)^steepness)."""
     return np.asarray(1.0 / (1.0 + (value / half) ** steepness))
 
@@ -73,14 +73,14 @@ def decay(value: Floats, half: float, steepness: float) -> Floats:
 class Measures:
     """Raw measures of n frames, in trajectory order."""
 
-    detail: Floats  # [n, DIRECTIONS] see measures.detail_ratios
-    noise: Floats  # [n] levels of 255
-    blocking: Floats  # [n]
-    ringing: Floats  # [n] levels of 255
-    ghosting: Floats  # [n] height of a cepstral peak
-    mean: Floats  # [n] luma, of 1
-    clipped: Floats  # [n] share of the pixels
-    spread: Floats  # [n] luma, of 1
+    detail: ArrayF64  # [n, DIRECTIONS] see measures.detail_ratios
+    noise: ArrayF64  # [n] levels of 255
+    blocking: ArrayF64  # [n]
+    ringing: ArrayF64  # [n] levels of 255
+    ghosting: ArrayF64  # [n] height of a cepstral peak
+    mean: ArrayF64  # [n] luma, of 1
+    clipped: ArrayF64  # [n] share of the pixels
+    spread: ArrayF64  # [n] luma, of 1
 
 
 MEASURE_COLUMNS = (
@@ -90,7 +90,7 @@ MEASURE_COLUMNS = (
 """Names of the numbers in a row of `measure`."""
 
 
-def measure(luminance: Luminance) -> Floats:
+def measure(luminance: Luminance) -> ArrayF64:
     """All raw measures of one frame as a row, in the order of `MEASURE_COLUMNS`."""
     image, valid = luminance.reduced, luminance.valid
     noise = measures.noise_level(image, valid)
@@ -116,7 +116,7 @@ class StatisticsEvaluator:
         """``cache`` is a folder in which the measures of single frames are kept."""
         self._cache = ItemCache(cache, MEASURE_COLUMNS, [self.name, self.version, cv2.__version__])
 
-    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+    def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """See `Evaluator.evaluate`. Raises StoreError when an image cannot be read."""
         if not views:
             return np.zeros((0, 11))
@@ -127,11 +127,11 @@ class StatisticsEvaluator:
                 task.advance()
         return cues_from_measures(np.stack(rows))
 
-    def _measure(self, view: View) -> Floats:
+    def _measure(self, view: EvaluatedFrame) -> ArrayF64:
         return self._cache.row(view, lambda view: measure(reduce_luminance(*load_view(view))))
 
 
-def cues_from_measures(rows: Floats) -> Floats:  # [n, 11] in [0, 1]
+def cues_from_measures(rows: ArrayF64) -> ArrayF64:  # [n, 11] in [0, 1]
     """The cues in the order of `tables.CUE_COLUMNS`, from rows of `measure`; each column's function says what
     it is.
     """
@@ -159,13 +159,13 @@ def cues_from_measures(rows: Floats) -> Floats:  # [n, 11] in [0, 1]
     )
 
 
-def around(values: Floats, pick: Callable[..., Floats]) -> Floats:  # [n, ...] -> [n, ...]
+def around(values: ArrayF64, pick: Callable[..., ArrayF64]) -> ArrayF64:  # [n, ...] -> [n, ...]
     """``pick`` (np.min, np.max, np.median) over each frame and up to _NEIGHBOURS on either side."""
     spans = [slice(max(0, i - _NEIGHBOURS), i + _NEIGHBOURS + 1) for i in range(len(values))]
     return np.stack([pick(values[span], axis=0) for span in spans])
 
 
-def content_detail(m: Measures) -> Floats:  # [n, DIRECTIONS]
+def content_detail(m: Measures) -> ArrayF64:  # [n, DIRECTIONS]
     """What the frame's content shows where it is sharp: the best ratio among the neighbours, direction by
     direction, within _CONTENT_DETAIL.
 
@@ -175,12 +175,12 @@ def content_detail(m: Measures) -> Floats:  # [n, DIRECTIONS]
     return np.clip(around(m.detail, np.max), *_CONTENT_DETAIL)
 
 
-def sharpness(extents: Floats) -> Floats:
+def sharpness(extents: ArrayF64) -> ArrayF64:
     """r_sharpness: 1 where no direction is blurred, 1/2 at _SHARPNESS_HALF in the worst one."""
     return decay(extents.max(axis=1), _SHARPNESS_HALF, _STEEPNESS)
 
 
-def structure(extents: Floats) -> Floats:
+def structure(extents: ArrayF64) -> ArrayF64:
     """r_structure: clarity of edges and corners of any orientation, by the blur's mean over the directions.
 
     A motion leaves the edges along it intact, so structure suffers less from it than from an equal defocus.
@@ -188,7 +188,7 @@ def structure(extents: Floats) -> Floats:
     return decay(extents.mean(axis=1), _STRUCTURE_HALF, _STEEPNESS)
 
 
-def texture_reliability(m: Measures, content: Floats) -> Floats:
+def texture_reliability(m: Measures, content: ArrayF64) -> ArrayF64:
     """r_texture: share of the content's fine detail that the frame keeps, where it has contrast at all.
 
     Detail is counted from 1, what a fully blurred image shows (`measures.detail_ratios`).
@@ -198,17 +198,17 @@ def texture_reliability(m: Measures, content: Floats) -> Floats:
     return ramp(kept, _DETAIL) * ramp(m.spread, _CONTRAST)
 
 
-def artifact_freedom(m: Measures) -> Floats:
+def artifact_freedom(m: Measures) -> ArrayF64:
     """1 - b_artifacts: no blocks on an 8 px grid and no ripples beside strong edges."""
     return decay(m.blocking, _BLOCKING_HALF, 2.0) * decay(m.ringing, _RINGING_HALF, 2.0)
 
 
-def cleanness(m: Measures, artifacts: Floats) -> Floats:
+def cleanness(m: Measures, artifacts: ArrayF64) -> ArrayF64:
     """r_cleanness: free of noise, blocks and ringing."""
     return artifacts * decay(m.noise, _NOISE_HALF, 2.0)
 
 
-def exposure_quality(m: Measures) -> Floats:
+def exposure_quality(m: Measures) -> ArrayF64:
     """r_exposure: neither clipped nor dark nor glaring, and as bright as its neighbours.
 
     Clipping is counted beyond the least clipped neighbour's: a window or a lamp in view is content. Failure
@@ -221,24 +221,24 @@ def exposure_quality(m: Measures) -> Floats:
     return (1.0 - clipped) * (1.0 - tonal) * (1.0 - ramp(stops, _STOPS))
 
 
-def exposure_failure(quality: Floats) -> Floats:
+def exposure_failure(quality: ArrayF64) -> ArrayF64:
     """b_exposure_failure: the loss of exposure quality, mild ones forgiven: (1 - q)^2 (3 - 2 (1 - q))."""
     loss = 1.0 - quality
     return loss * loss * (3.0 - 2.0 * loss)
 
 
-def isotropy(extents: Floats) -> Floats:
+def isotropy(extents: ArrayF64) -> ArrayF64:
     """Whether a blur is a disc's (1) or a motion's (0), by the least extent over the largest."""
     return ramp(extents.min(axis=1) / np.maximum(extents.max(axis=1), 1e-9), _ISOTROPY)
 
 
-def visible_blur(extents: Floats, half: float) -> Floats:
+def visible_blur(extents: ArrayF64, half: float) -> ArrayF64:
     """0 for what content alone may explain, 1/2 at ``half`` px beyond it, as variances subtract."""
     visible = np.sqrt(np.maximum(extents**2 - _NOTICEABLE**2, 0.0))
     return 1.0 - decay(visible, half, _STEEPNESS)
 
 
-def motion_blur(extents: Floats) -> Floats:
+def motion_blur(extents: ArrayF64) -> ArrayF64:
     """b_motion_blur: the visible blur of the worst direction, where it is not the same in all.
 
     Failure modes: a rotation about the optical axis or a curved path blurs all directions and reads as
@@ -247,14 +247,14 @@ def motion_blur(extents: Floats) -> Floats:
     return (1.0 - isotropy(extents)) * visible_blur(extents.max(axis=1), _MOTION_HALF)
 
 
-def defocus(extents: Floats) -> Floats:
+def defocus(extents: ArrayF64) -> ArrayF64:
     """b_defocus: the visible blur that even the best direction has, where it is the same in all. Failure
     modes: as for `motion_blur`.
     """
     return isotropy(extents) * visible_blur(extents.min(axis=1), _DEFOCUS_HALF)
 
 
-def ghosting(m: Measures) -> Floats:
+def ghosting(m: Measures) -> ArrayF64:
     """b_ghosting: a second image of everything, by the side peak of the cepstrum beyond the neighbours'.
 
     Failure modes: see `measures.ghosting`; ghosts of single moving objects are not seen.
@@ -263,6 +263,6 @@ def ghosting(m: Measures) -> Floats:
     return ramp(m.ghosting - content, _GHOST)
 
 
-def unreliable_texture(m: Measures, texture: Floats) -> Floats:
+def unreliable_texture(m: Measures, texture: ArrayF64) -> ArrayF64:
     """b_unreliable_texture: fine detail lost, or drowned in noise."""
     return 1.0 - texture * decay(m.noise, _NOISE_HALF, 2.0)

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cleargs.errors import InputError
-
-Array = npt.NDArray[np.float64]
+from cleargs.types import ArrayF64
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,7 @@ class Camera:
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
 
-def look_at(place: Array, target: Array, up: Array) -> Array:  # [4, 4] world to camera
+def look_at(place: ArrayF64, target: ArrayF64, up: ArrayF64) -> ArrayF64:  # [4, 4] world to camera
     """A camera at ``place`` whose axis goes through ``target``, without roll. OpenCV axes."""
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, up)

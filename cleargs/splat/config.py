@@ -7,18 +7,18 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cleargs.record import Inherited, Settings
+from cleargs.base_model import Inherited, Settings
 
 # Steps and Gaussians where the settings leave them open. Neither is one number for all captures. Steps follow
 # the frames, since each is to be seen often enough; Gaussians follow the pixels, since they have that much to
 # say. `quality` scales both. docs/speed.md has what each step up costs and brings.
 Quality = Literal["draft", "standard", "high"]
 
-STEPS_A_FRAME = 50
+STEPS_PER_FRAME = 50
 MIN_STEPS, MAX_STEPS = 3200, 7200
 STEPS_FACTOR: dict[Quality, float] = {"draft": 0.25, "standard": 1.0, "high": 4.0}
 
-PIXELS_A_GAUSSIAN = 160
+PIXELS_PER_GAUSSIAN = 160
 MIN_BUDGET = 40_000
 BUDGET_FACTOR: dict[Quality, float] = {"draft": 0.5, "standard": 1.0, "high": 2.0}
 
@@ -30,7 +30,7 @@ INIT_OPACITY = 0.5
 
 def steps_from_frames(frames: int, quality: Quality = "standard") -> int:
     """Steps of the first scene of a capture with so many active frames."""
-    return round(STEPS_FACTOR[quality] * min(max(STEPS_A_FRAME * frames, MIN_STEPS), MAX_STEPS))
+    return round(STEPS_FACTOR[quality] * min(max(STEPS_PER_FRAME * frames, MIN_STEPS), MAX_STEPS))
 
 
 def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standard") -> int:
@@ -40,7 +40,7 @@ def budget_from_pixels(pixels: int, max_budget: int, quality: Quality = "standar
     40,000 at least, since fewer cost a small capture a dB, and ``max_budget`` at most: all times the
     quality's factor.
     """
-    standard = min(max(pixels // PIXELS_A_GAUSSIAN, MIN_BUDGET), max_budget)
+    standard = min(max(pixels // PIXELS_PER_GAUSSIAN, MIN_BUDGET), max_budget)
     return max(1, int(BUDGET_FACTOR[quality] * standard))
 
 
@@ -206,7 +206,7 @@ class TrainConfig(Settings):
 
     @property
     def length(self) -> int:
-        """The steps; raises ValueError while they are not decided (`cleargs.splat.effort.decided`)."""
+        """The steps; raises ValueError while they are not decided (`cleargs.splat.budget.resolve_config`)."""
         if self.steps is None:
             raise ValueError("the steps of this training are not decided yet")
         return self.steps

@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Arrays = dict[str, F32]
+from cleargs.types import AnyArray, ArrayF32, ArrayF64
+
+Arrays = dict[str, ArrayF32]
 
 NOISE_CUT = 0.15
 """Opacity above which the noise factor is under 1e-6, and is left out."""
@@ -32,7 +31,7 @@ ROUNDS = 4
 """Rounds of a refinement, each with its share of the growth: a Gaussian with much of the error, such as a
 smear over half of a frame, is cut into up to sixteen."""
 
-PART = 0.7
+SPLIT_FRACTION = 0.7
 """How far the halves of a Gaussian lie from its middle, and their scale, as shares of its scale along its
 longest axis: together they spread about as far (0.7² + 0.7² = 0.98)."""
 
@@ -41,7 +40,7 @@ def refine(
     arrays: Arrays,
     moments: Sequence[Arrays],
     *,
-    errors: F64,  # [N] >= 0
+    errors: ArrayF64,  # [N] >= 0
     rate: float,
     budget: int,
     min_opacity: float,
@@ -78,7 +77,7 @@ def refine(
     return arrays, running
 
 
-def _placed(array: F32, places: NDArray[np.int64], rows: F32) -> F32:
+def _placed(array: ArrayF32, places: NDArray[np.int64], rows: ArrayF32) -> ArrayF32:
     """``array`` with ``rows`` at ``places``, made longer where these lie behind its end."""
     longer = max(len(array), 1 + int(places.max(initial=-1)))
     if longer > len(array):
@@ -87,7 +86,7 @@ def _placed(array: F32, places: NDArray[np.int64], rows: F32) -> F32:
     return array
 
 
-def sample_once(weights: F64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def sample_once(weights: ArrayF64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """``count`` different indices, in proportion to ``weights`` [N] >= 0, of which as many are above 0.
 
     Efraimidis and Spirakis, "Weighted random sampling with a reservoir" (2006).
@@ -98,16 +97,16 @@ def sample_once(weights: F64, count: int, rng: np.random.Generator) -> NDArray[n
     return first
 
 
-def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: F64, min_opacity: float) -> Arrays:
+def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: ArrayF64, min_opacity: float) -> Arrays:
     """Make the Gaussians ``cut`` one of their halves, in place, and return the other ones.
 
     The opacity is such that the optical depth, summed along the axis, stays.
     """
     longest = arrays["log_scales"][cut].argmax(axis=1)
     axes = rotation_matrices(arrays["rotations"][cut])[np.arange(len(cut)), :, longest]
-    away = axes * (PART * np.exp(arrays["log_scales"][cut, longest]))[:, None]
-    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / PART), min_opacity, 1.0 - 1e-6)
-    arrays["log_scales"][cut, longest] += np.float32(math.log(PART))
+    away = axes * (SPLIT_FRACTION * np.exp(arrays["log_scales"][cut, longest]))[:, None]
+    faint = np.clip(1.0 - (1.0 - opacity) ** (0.5 / SPLIT_FRACTION), min_opacity, 1.0 - 1e-6)
+    arrays["log_scales"][cut, longest] += np.float32(math.log(SPLIT_FRACTION))
     arrays["logit_opacities"][cut] = np.log(faint) - np.log1p(-faint)
     others = {name: array[cut] for name, array in arrays.items()}
     arrays["means"][cut] -= away
@@ -115,7 +114,7 @@ def _halves(arrays: Arrays, cut: NDArray[np.int64], opacity: F64, min_opacity: f
     return others
 
 
-def rotation_matrices(quaternions: F32) -> F32:
+def rotation_matrices(quaternions: ArrayF32) -> ArrayF32:
     """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w x y z) of any length; zero: no rotation."""
     norm = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
     w, x, y, z = (quaternions / np.maximum(norm, np.float32(1e-12))).T
@@ -127,7 +126,7 @@ def rotation_matrices(quaternions: F32) -> F32:
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
-def sigmoid(x: NDArray[Any]) -> NDArray[Any]:
+def sigmoid(x: AnyArray) -> AnyArray:
     """1 / (1 + exp(-x)), in the type of ``x``; the input is kept within +-80, where exp stays finite."""
-    result: NDArray[Any] = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
+    result: AnyArray = 1 / (1 + np.exp(-np.clip(x, -80, 80)))
     return result

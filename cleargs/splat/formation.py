@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cleargs.splat.camera import Camera
 from cleargs.splat.types import Render
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 Renderer = Callable[[Camera], Render]
 """The scene as trained so far at a camera, with depth."""
@@ -42,7 +42,7 @@ class Formation(Protocol):
 
     def form(
         self,
-        view: View,
+        view: TrainingView,
         factor: float,
         progress: float,
         target: Tensor,  # [H, W, 3] sRGB

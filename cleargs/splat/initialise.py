@@ -14,7 +14,7 @@ from cleargs.random_streams import Stream
 from cleargs.splat.config import INIT_OPACITY, INIT_SCALE
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 NEIGHBOURS = 3
 """Neighbours whose mean distance is a starting scale (Inria), and whose depth an added point takes."""
@@ -53,7 +53,7 @@ class SparsePoints:
 
 def starting_gaussians(
     sparse: SparsePoints,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     *,
     at_least: int,
     at_most: int | None,
@@ -124,7 +124,7 @@ def fewer_points(sparse: SparsePoints, count: int, *, seed: int) -> SparsePoints
     return SparsePoints(sparse.xyz[kept], sparse.rgb[kept], observed)
 
 
-def add_points(sparse: SparsePoints, views: Sequence[View], count: int, *, seed: int) -> SparsePoints:
+def add_points(sparse: SparsePoints, views: Sequence[TrainingView], count: int, *, seed: int) -> SparsePoints:
     """``sparse`` with ``count`` more points (none observed), spread evenly over the views and their pixels.
 
     A point lies behind a random unmasked pixel, at the depth of the sparse points that the view observes
@@ -144,7 +144,7 @@ def add_points(sparse: SparsePoints, views: Sequence[View], count: int, *, seed:
 
 
 def _points_of_view(
-    view: View, seen: NDArray[np.float64], count: int, rng: np.random.Generator
+    view: TrainingView, seen: NDArray[np.float64], count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """``count`` points behind random pixels of one view, given the sparse points [S, 3] it sees."""
     camera = view.camera

@@ -18,11 +18,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cleargs.children import module_command
 from cleargs.errors import StoreError
 from cleargs.files import write_json
 from cleargs.kernel_cache import cache_folder
-from cleargs.untrusted import FAULTS, read_json
+from cleargs.safe_io import FAULTS, read_json
+from cleargs.subprocesses import module_command
 
 if TYPE_CHECKING:
     from cleargs.splat.camera import Camera
@@ -37,7 +37,7 @@ REPEATS = 12
 REFERENCE_MS = 80.0
 """Of an iteration on the reference machine: a core of an Intel Xeon (Emerald Rapids, AVX-512)."""
 
-PATIENCE_S = 300
+TIMEOUT_S = 300
 """Two seconds of work; where no kernel is compiled yet, half a minute and more."""
 
 
@@ -46,7 +46,7 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
 
     Remembered from an earlier measurement. Without one it is measured where somebody is told so (``say``).
     """
-    pace = remembered_pace()
+    pace = cached_pace()
     if pace is not None or say is None:
         return 1.0 if pace is None else pace
     say("measuring the pace of this machine (once; kernels may have to be compiled for it)")
@@ -58,7 +58,7 @@ def machine_pace(say: Callable[[str], None] | None = None) -> float:
     return milliseconds / REFERENCE_MS
 
 
-def remembered_pace() -> float | None:
+def cached_pace() -> float | None:
     """What was measured on this machine before; None where nothing was, or the note of it is damaged."""
     with suppress(*FAULTS):
         return _sound(read_json(_note())["milliseconds"]) / REFERENCE_MS
@@ -116,7 +116,7 @@ def _measured() -> float | None:
     """In a process of its own: neither its memory nor its one thread are to stay with a run."""
     try:
         command = module_command("cleargs.splat.pace")
-        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=PATIENCE_S)
+        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT_S)
         return _sound(json.loads(done.stdout))
     except (OSError, ValueError, TypeError, subprocess.SubprocessError):
         return None
@@ -136,7 +136,7 @@ def _measure() -> float:
     """
     import torch
 
-    from cleargs.splat.backend import Meter, rasteriser_for, set_threads, step_gaussians
+    from cleargs.splat.backend import LossAccumulator, rasteriser_for, set_threads, step_gaussians
     from cleargs.splat.types import Moments
 
     set_threads(1)
@@ -144,13 +144,13 @@ def _measure() -> float:
     gaussians, camera = random_scene(SPLATS, WIDTH, HEIGHT)
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     slope = torch.empty_like(target)
-    engine, meter, moments = rasteriser_for(), Meter("cpu", 0.2), Moments.zeros(gaussians)
+    engine, losses, moments = rasteriser_for(), LossAccumulator("cpu", 0.2), Moments.zeros(gaussians)
     rates: dict[str, float | torch.Tensor] = dict.fromkeys(gaussians.tensors(), 0.0)
     times = []
     for step in range(1, REPEATS + 1):
         start = time.process_time()
         image = engine.forward(gaussians, camera).image
-        meter.add(step, image, target, gradient=slope)
+        losses.add(step, image, target, gradient=slope)
         step_gaussians(gaussians, engine.backward(slope), moments, rates, step=step)
         times.append(time.process_time() - start)
     return round(1e3 * min(times), 2)

@@ -14,9 +14,9 @@ import torch
 
 from cleargs.errors import StoreError
 from cleargs.files import atomic_path
+from cleargs.safe_io import FAULTS, cause, open_regular
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.untrusted import FAULTS, cause, open_regular
 
 _ANTIALIAS = "cleargs antialias"
 _BACKGROUND = "cleargs background"

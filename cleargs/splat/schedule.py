@@ -16,7 +16,7 @@ INRIA_STEPS = 30_000
 """Steps of the training that the rates of 3DGS are made for."""
 MAX_RATE_FACTOR = 6.0
 
-LOOKS = 5
+ERROR_STEPS = 5
 """Steps before a refinement whose errors say what is to grow, one frame each. Where refinements follow each
 other within eight times as many steps there are fewer, since each costs a backward pass."""
 
@@ -82,7 +82,7 @@ class Schedule:
         """Return whether the step after these adds to the errors by which the next refinement goes."""
         interval = self._config.refine_interval
         refined = -(-(step + 1) // interval) * interval
-        return refined - (step + 1) < min(LOOKS, max(1, interval // 8)) and self._refined(refined)
+        return refined - (step + 1) < min(ERROR_STEPS, max(1, interval // 8)) and self._refined(refined)
 
     def _refined(self, step: int) -> bool:
         config = self._config

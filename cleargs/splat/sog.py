@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cleargs.splat.compressed_ply import LOG_SCALE_MAX, morton_order, smaller_parts
 from cleargs.splat.scene import Scene
+from cleargs.types import ImageU8
 
 _CODES = 256
 _PALETTE_MAX = 65536  # labels have 16 bits
@@ -34,7 +35,7 @@ def sog(scene: Scene) -> bytes:
     gaussians = scene.gaussians.to("cpu").detach()
     gaussians = gaussians.select(torch.from_numpy(morton_order(gaussians.means.numpy())))
     count, sh = gaussians.num, gaussians.sh.numpy()
-    pictures: dict[str, NDArray[np.uint8]] = {}
+    pictures: dict[str, ImageU8] = {}
 
     means = gaussians.means.numpy().astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -99,7 +100,7 @@ def _harmonics(
 def _picture(
     rgb: NDArray[np.uint8],  # [N, 3]
     alpha: NDArray[np.uint8] | None = None,  # [N]; None: opaque
-) -> NDArray[np.uint8]:
+) -> ImageU8:
     """One pixel a Gaussian, row by row, in a picture [H, W, 4] whose sides are multiples of 4."""
     width = max(4, int(np.ceil(np.sqrt(len(rgb)) / 4)) * 4)
     height = max(4, -(-len(rgb) // (4 * width)) * 4)
@@ -110,7 +111,7 @@ def _picture(
     return picture.reshape(height, width, 4)
 
 
-def _webp(picture: NDArray[np.uint8]) -> bytes:
+def _webp(picture: ImageU8) -> bytes:
     """Lossless, except for the colour where alpha is 0: of Gaussians that nobody sees."""
     done, content = cv2.imencode(
         ".webp", cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS]
@@ -129,7 +130,7 @@ def codebook(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:  # 
     return np.pad(np.sort(found[:, 0]), (0, size - len(found)), mode="edge")
 
 
-def nearest(centres: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.uint8]:
+def nearest(centres: NDArray[np.float32], values: NDArray[np.float32]) -> ImageU8:
     """Index of the nearest of up to 256 ascending ``centres`` for each value, in the shape of ``values``."""
     return np.searchsorted((centres[1:] + centres[:-1]) / 2, values).astype(np.uint8)
 

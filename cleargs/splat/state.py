@@ -14,9 +14,9 @@ from torch import Tensor
 from cleargs.errors import StoreError
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
+from cleargs.safe_io import cause
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.types import Moments
-from cleargs.untrusted import cause
 
 
 def save_state(path: Path, tensors: dict[str, Tensor]) -> None:

@@ -15,7 +15,7 @@ from cleargs.files import write_bytes
 from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.types import Reading
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 _ROW = np.dtype(
     [
@@ -40,7 +40,7 @@ class TrainLog:
         self._rows = np.zeros(steps, _ROW)
 
     def seen(
-        self, step: int, view: View, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
+        self, step: int, view: TrainingView, weight: float, target: Tensor, n_gaussians: int, sh_degree: int
     ) -> None:
         """Write what a step trains on; `measured` fills in the rest."""
         self._rows[step] = (

@@ -22,10 +22,10 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.progress import PREVIEW, Rate, Reporter, Task
 from cleargs.random_streams import Stream
-from cleargs.splat.backend import Meter, backend_for, step_gaussians
+from cleargs.splat.backend import LossAccumulator, backend_for, step_gaussians
+from cleargs.splat.budget import resolve_config, seconds_by_step
 from cleargs.splat.camera import Camera
 from cleargs.splat.config import TrainConfig
-from cleargs.splat.effort import decided, seconds_by_step
 from cleargs.splat.formation import Formation, Formed
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda import support
@@ -34,7 +34,7 @@ from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
 from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
 from cleargs.splat.types import Moments, Render, group
-from cleargs.splat.views import ImageCache, View, require_views
+from cleargs.splat.views import ImageCache, TrainingView, require_views
 from cleargs.termination import deferred_sigterm
 
 _NOTE_INTERVAL = 10
@@ -69,7 +69,7 @@ class Trainer:
     def __init__(
         self,
         scene: Scene,
-        views: Sequence[View],
+        views: Sequence[TrainingView],
         config: TrainConfig,
         *,
         seed: Sequence[int],
@@ -85,7 +85,7 @@ class Trainer:
         require_views(weighted)
         self._share = pseudo_share if self._real and self._pseudo else float(bool(self._pseudo))
         self._pseudo_weight = pseudo_weight
-        self._config = config = decided(config, self._real or self._pseudo)
+        self._config = config = resolve_config(config, self._real or self._pseudo)
         self.length = config.length
         self._seed = tuple(seed)
         self._scene = scene
@@ -104,7 +104,7 @@ class Trainer:
         self._errors: Tensor | None = None  # [N] since the last refinement
         self._formation = formation
         self._cache = ImageCache(config.cache_mb * 2**20, self._device, training=True)
-        self._meter = Meter(self._device, config.ssim_lambda)
+        self._losses = LossAccumulator(self._device, config.ssim_lambda)
         self._log = TrainLog(self.length)
         self._slopes: dict[tuple[int, int], Tensor] = {}
         starts: list[float | str] = [
@@ -172,7 +172,7 @@ class Trainer:
     @property
     def last_psnr(self) -> float:
         """Mean PSNR over the last 50 steps, dB."""
-        self._read_meter()
+        self._read_losses()
         return self._log.recent_psnr(self.done)
 
     def step(self) -> None:
@@ -228,7 +228,7 @@ class Trainer:
         The rate counts from the first call on: the steps before may have waited for kernels to be compiled.
         """
         words = [f"training PSNR {self.last_psnr:.2f} dB", f"{self._gaussians.num} Gaussians"]
-        if (steps := rate.a_second(self.done)) is not None:
+        if (steps := rate.per_second(self.done)) is not None:
             words.insert(0, f"{steps:.1f} it/s")
         task.update(done=self.done, note=", ".join(words), share=shares[self.done])
 
@@ -241,7 +241,7 @@ class Trainer:
 
     def state(self) -> dict[str, Tensor]:
         """All that a training needs to resume: parameters, moments, affines, step and the log so far."""
-        self._read_meter()
+        self._read_losses()
         state = {
             "fingerprint": self._fingerprint,
             "step": torch.tensor(self.done),
@@ -272,10 +272,10 @@ class Trainer:
 
     def rows(self, round: int) -> pa.Table:
         """The log so far, one row a step."""
-        self._read_meter()
+        self._read_losses()
         return self._log.table(self.done, round)
 
-    def _view(self, step: int) -> View:
+    def _view(self, step: int) -> TrainingView:
         """The view of a step: pseudo ones spread evenly at their share, both in shuffled epochs."""
         before = math.floor(step * self._share)
         if math.floor((step + 1) * self._share) > before:
@@ -286,7 +286,9 @@ class Trainer:
         order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
-    def _formed(self, view: View, factor: float, target: Tensor, mask: Tensor | None) -> Formed | None:
+    def _formed(
+        self, view: TrainingView, factor: float, target: Tensor, mask: Tensor | None
+    ) -> Formed | None:
         if self._formation is None:
             return None
         progress = self._at / self._config.planned
@@ -304,9 +306,9 @@ class Trainer:
         if size not in self._slopes:
             self._slopes[size] = torch.empty_like(target)
         slope = self._slopes[size]
-        self._meter.add(self.done, image, target, mask, weight=weight, gradient=slope)
-        if not support.on_gpu(self._device) or len(self._meter) >= _NOTE_INTERVAL:
-            self._read_meter()
+        self._losses.add(self.done, image, target, mask, weight=weight, gradient=slope)
+        if not support.on_gpu(self._device) or len(self._losses) >= _NOTE_INTERVAL:
+            self._read_losses()
         return slope
 
     def _shares_of_error(
@@ -322,9 +324,9 @@ class Trainer:
         shares = self._rasteriser.backward(error if formed is None else formed.backward(error))
         return shares.sh[:, 0].sum(dim=1).clamp_(min=0.0)
 
-    def _read_meter(self) -> None:
+    def _read_losses(self) -> None:
         """Bring the log up to date. Waits for the GPU."""
-        for step, read in self._meter.take():
+        for step, read in self._losses.take():
             self._log.measured(step, read)
             if not math.isfinite(read.loss):
                 self.check_finite()
@@ -387,7 +389,7 @@ def _numbers(camera: Camera) -> list[float]:
 
 
 def _fingerprint(
-    scene: Scene, views: Sequence[View], config: TrainConfig, starts: Sequence[float | str]
+    scene: Scene, views: Sequence[TrainingView], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})

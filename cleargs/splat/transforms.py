@@ -111,7 +111,7 @@ def _multiply(first: Tensor, second: Tensor) -> Tensor:
     return second @ matrix.T
 
 
-def upright(first: Camera, up: str) -> dict[str, Any]:
+def orient_up(first: Camera, up: str) -> dict[str, Any]:
     """Scale, rotation [3, 3] and translation [3] from the normalised world to one with ``up`` of `UP`, in
     which ``first`` stands at the origin and looks ahead. Up stays up, whatever its pitch and roll.
     """

@@ -10,6 +10,7 @@ from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
+from cleargs.types import ImageU8
 
 
 class Viewer:
@@ -19,9 +20,7 @@ class Viewer:
         self._scene = scene.to(device)
         self._engine = rasteriser_for(device)
 
-    def view(
-        self, camera: Camera, affine: NDArray[np.float64] | None = None
-    ) -> NDArray[np.uint8]:  # [H, W, 3] sRGB
+    def view(self, camera: Camera, affine: NDArray[np.float64] | None = None) -> ImageU8:  # [H, W, 3] sRGB
         """What ``camera`` sees, its colours through ``affine`` [3, 4] if there is one."""
         image = self.render(camera, self._scene.background).image.cpu().numpy()
         if affine is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,17 +15,14 @@ from torch import Tensor
 from cleargs.errors import InputError, StageError
 from cleargs.random_streams import Stream
 from cleargs.splat.camera import Camera
-
-Pixels = NDArray[Any]
-"""An image [H, W, 3]: uint8, or float32 sRGB in [0, 1]."""
-Mask = NDArray[np.bool_]
+from cleargs.types import AnyImage, MaskBool
 
 UNSEEN_BLOCK, UNSEEN_CELL = 8, 80
 """Side in pixels of the blocks of a frame that no training sees, and of the cells that have one each: 1 %."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TrainingView:
     """One image that a scene should explain."""
 
     frame_id: int
@@ -34,12 +31,12 @@ class View:
     """Factor on the loss: the RVA weight w_i of a real frame."""
     kind: Literal["real", "pseudo"]
     """A captured frame, or a repaired one."""
-    load: Callable[[], tuple[Pixels, Mask | None]]
+    load: Callable[[], tuple[AnyImage, MaskBool | None]]
     """Gives image [H, W, 3] (uint8, or float32 sRGB in [0, 1]) and mask [H, W] (True counts; None: all do).
     Called when first needed, and again when the cache could not keep the image."""
 
 
-def require_views(views: Sequence[View]) -> None:
+def require_views(views: Sequence[TrainingView]) -> None:
     """Raise InputError when there is nothing to train on."""
     if not views:
         raise InputError(
@@ -48,7 +45,7 @@ def require_views(views: Sequence[View]) -> None:
         )
 
 
-def unseen_pixels(frame_id: int, height: int, width: int) -> Mask:
+def unseen_pixels(frame_id: int, height: int, width: int) -> MaskBool:
     """The pixels [H, W] of a frame, and of its repairs, that no training sees; they follow from ``frame_id``.
 
     How well a scene shows them says how good it is without a frame held out. They lie in blocks, since a
@@ -90,10 +87,10 @@ class ImageCache:
         self._white = torch.tensor(255.0, device=self._device)
         self._used = 0
         self._factor = 1.0
-        self._held: dict[View, tuple[Tensor, Tensor | None]] = {}
+        self._held: dict[TrainingView, tuple[Tensor, Tensor | None]] = {}
         self._scratch: dict[tuple[int, int], Tensor] = {}
 
-    def get(self, view: View, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
+    def get(self, view: TrainingView, factor: float = 1.0) -> tuple[Tensor, Tensor | None]:
         """Image [H, W, 3] float32 and mask [H, W] (or None) of a view, resampled by ``factor``.
 
         The image lies in a buffer of the cache, and is valid until the next call.
@@ -122,7 +119,9 @@ class ImageCache:
         return image, mask
 
 
-def _prepare(view: View, factor: float, training: bool) -> tuple[NDArray[np.generic], Mask | None]:
+def _prepare(
+    view: TrainingView, factor: float, training: bool
+) -> tuple[NDArray[np.generic], MaskBool | None]:
     """Load a view and resample it by pixel area; a reduced pixel counts when every pixel under it does."""
     image, mask = view.load()
     camera = view.camera.scaled(factor)

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from cleargs.errors import InputError
-from cleargs.synth.optics import MIN_SAMPLES, Array, Lens, Shutter
+from cleargs.synth.optics import MIN_SAMPLES, Lens, Shutter
 from cleargs.synth.path import HandheldPath
+from cleargs.types import ArrayF64
 
 GRID = (24, 14)
 """Columns and rows of the points whose motion is followed."""
@@ -26,13 +27,13 @@ of that size."""
 
 
 @dataclass(frozen=True)
-class FrameMotion:
+class SimulatedMotion:
     """One frame's surroundings in time: what an exposure about its middle would smear."""
 
     path: HandheldPath
     time: float
     """Middle of the exposure, seconds."""
-    points: Array  # [P, 3] that the middle pose sees, in the world
+    points: ArrayF64  # [P, 3] that the middle pose sees, in the world
     lens: Lens
 
     def blur(self, exposure: float) -> float:
@@ -64,15 +65,15 @@ class FrameMotion:
         times = self.time + (ticks - stride * (samples - 1) / 2) * tick
         return Shutter(self.path.poses(times), place.reshape(index.shape), times)
 
-    def _lengths(self, exposure: float) -> Array:
+    def _lengths(self, exposure: float) -> ArrayF64:
         times = self.time + exposure * np.linspace(-0.5, 0.5, INSTANTS)
         return np.asarray(np.linalg.norm(np.diff(self._tracks(times), axis=0), axis=2).sum(0))
 
-    def _skews(self, readout: float) -> Array:
+    def _skews(self, readout: float) -> ArrayF64:
         first, last = self._tracks(self.time + readout * np.array([-0.5, 0.5]))
         return np.asarray(np.linalg.norm(last - first, axis=1))
 
-    def _tracks(self, times: Array) -> Array:
+    def _tracks(self, times: ArrayF64) -> ArrayF64:
         """Image positions [T, P, 2] in pixels."""
         poses = self.path.poses(times)
         local = np.einsum("tpk,tkj->tpj", self.points - poses[:, None, :, 3], poses[:, :, :3])
@@ -80,7 +81,7 @@ class FrameMotion:
         return np.asarray(focal * local[..., :2] / np.maximum(local[..., 2:], 1e-6), np.float64)
 
 
-def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> FrameMotion:
+def follow(path: HandheldPath, time: float, depth: ArrayF64, lens: Lens) -> SimulatedMotion:
     """The motion about a frame whose view at ``time`` has ``depth`` [H, W] (0 where there is nothing)."""
     columns = (np.arange(GRID[0]) + 0.5) / GRID[0] * lens.width
     rows = (np.arange(GRID[1]) + 0.5) / GRID[1] * lens.height
@@ -89,7 +90,7 @@ def follow(path: HandheldPath, time: float, depth: Array, lens: Lens) -> FrameMo
     rays = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy, np.ones_like(x)], -1)
     seen = z > 0
     pose = path.poses(np.array([time]))[0]
-    return FrameMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
+    return SimulatedMotion(path, time, (rays * z[..., None])[seen] @ pose[:, :3].T + pose[:, 3], lens)
 
 
 def duration_for(pixels: float, motion: Callable[[float], float]) -> float:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array: TypeAlias = NDArray[np.float64]
+from cleargs.types import ArrayF64
 
 MIN_SAMPLES = 8
 """Samples of a picture without motion: they also smooth the edges of a world that is sampled by rays."""
@@ -45,16 +45,16 @@ class Shutter:
     Global shutter: all rows of a sample share a pose. Rolling shutter: a window that slides over the poses.
     """
 
-    poses: Array  # [T, 3, 4] in the order of time
+    poses: ArrayF64  # [T, 3, 4] in the order of time
     index: NDArray[np.intp]  # [S, H] into poses
-    times: Array = field(default_factory=lambda: np.zeros(1))  # [T or 1] seconds: for what moves by itself
+    times: ArrayF64 = field(default_factory=lambda: np.zeros(1))  # [T or 1] seconds: for what moves by itself
 
     @property
     def samples(self) -> int:
         return len(self.index)
 
 
-def still(pose: Array, height: int) -> Shutter:  # [3, 4]
+def still(pose: ArrayF64, height: int) -> Shutter:  # [3, 4]
     """An instant: one pose for all rows."""
     return Shutter(pose[None], np.zeros((MIN_SAMPLES, height), np.intp))
 
@@ -63,7 +63,7 @@ def still(pose: Array, height: int) -> Shutter:  # [3, 4]
 class Aperture:
     """A thin lens: the points of the aperture that the samples look through, one a sample."""
 
-    points: Array = field(default_factory=lambda: np.zeros((1, 2)))  # [S or 1, 2] world units
+    points: ArrayF64 = field(default_factory=lambda: np.zeros((1, 2)))  # [S or 1, 2] world units
     focus: float = 1.0
     """Distance in focus, world units."""
 
@@ -74,22 +74,22 @@ PINHOLE = Aperture()
 class World(Protocol):
     """Something to photograph."""
 
-    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
         """The mean over the samples in linear light, [H, W, 3]; 1 is sensor white."""
         ...
 
-    def depth(self, pose: Array, lens: Lens) -> Array:
+    def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
         """Distance along the optical axis through the pixel centres, [H, W]; 0 where there is nothing."""
         ...
 
 
-def low_discrepancy(count: int) -> Array:
+def low_discrepancy(count: int) -> ArrayF64:
     """[count, 2] points that cover the unit square evenly (Roberts' R2 sequence)."""
     steps = np.array([0.7548776662466927, 0.5698402909980532])
     return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0, np.float64)
 
 
-def disc(count: int, radius: float) -> Array:
+def disc(count: int, radius: float) -> ArrayF64:
     """[count, 2] points that cover a disc evenly (sunflower spiral)."""
     number = np.arange(count) + 0.5
     angle = number * math.pi * (3 - math.sqrt(5))

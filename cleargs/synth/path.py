@@ -15,38 +15,39 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cleargs.random_streams import Stream
-from cleargs.synth.optics import Aperture, Array, Lens, Shutter, World
+from cleargs.synth.optics import Aperture, Lens, Shutter, World
+from cleargs.types import ArrayF64
 
 UP = np.array([0.0, 1.0, 0.0])
-DEGREES_A_FRAME, MAX_DEGREES = 4.0, 150.0
+DEGREES_PER_FRAME, MAX_DEGREES = 4.0, 150.0
 
 
 class Course(Protocol):
     """The drift of a walk, without pauses or tremor."""
 
-    def poses(self, shares: Array) -> Array:
+    def poses(self, shares: ArrayF64) -> ArrayF64:
         """Poses [T, 3, 4] at ``shares`` [T] of the way; a little beyond 0 and 1 is allowed."""
         ...
 
-    def novel(self, share: float, rng: np.random.Generator) -> Array:
+    def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
         """A pose [3, 4] off the course, near ``share``, that looks at what the course looks at."""
         ...
 
 
 @dataclass(frozen=True)
-class Setting:
+class SceneSetup:
     """Where a capture is made."""
 
     name: str
     world: World
     course: Course
     lens: Lens
-    film: Callable[[Shutter, Lens, Aperture], tuple[Array, Array]] | None = None
+    film: Callable[[Shutter, Lens, Aperture], tuple[ArrayF64, ArrayF64]] | None = None
     """The world with something that moves in it: light, and the share of the exposure in which a pixel sees
     it."""
 
 
-def look_at(centres: Array, target: Array) -> Array:  # [..., 3], [3]
+def look_at(centres: ArrayF64, target: ArrayF64) -> ArrayF64:  # [..., 3], [3]
     """Poses [..., 3, 4] at ``centres`` that look at ``target``, level in a world with y up."""
     forward = target - centres
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
@@ -61,21 +62,21 @@ class Orbit:
     ``frames`` neighbours on it are about 4 degrees apart, over at most 150 degrees.
     """
 
-    def __init__(self, focus: Array, frames: int, seed: int) -> None:
+    def __init__(self, focus: ArrayF64, frames: int, seed: int) -> None:
         self._focus = focus
-        self._arc = float(np.radians(min(DEGREES_A_FRAME * frames, MAX_DEGREES)))
+        self._arc = float(np.radians(min(DEGREES_PER_FRAME * frames, MAX_DEGREES)))
         rng = np.random.default_rng([seed, Stream.ORBIT])
         self._phases = rng.uniform(0, 2 * np.pi, 2)  # of distance and height
 
-    def poses(self, shares: Array) -> Array:
+    def poses(self, shares: ArrayF64) -> ArrayF64:
         return look_at(self._centres(shares), self._focus)
 
-    def novel(self, share: float, rng: np.random.Generator) -> Array:
+    def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
         """Nearer or farther, higher or lower: off by up to one and a half frames' way in each axis."""
         centre = self._centres(np.array([share]))[0] + rng.uniform(-0.22, 0.22, 3)
         return look_at(centre, self._focus + rng.uniform(-0.08, 0.08, 3))
 
-    def _centres(self, shares: Array) -> Array:
+    def _centres(self, shares: ArrayF64) -> ArrayF64:
         angle = (shares - 0.5) * self._arc
         distance = 2.15 + 0.2 * np.sin(2 * np.pi * shares + self._phases[0])
         height = 1.4 + 0.18 * np.sin(4 * np.pi * shares + self._phases[1])
@@ -85,18 +86,18 @@ class Orbit:
 
 FPS = 6.0
 """Frames a second: what a walk of a few degrees a frame needs."""
-FRAMES_A_PAUSE = 6.0
+FRAMES_PER_PAUSE = 6.0
 PAUSE = 0.8
 """The pace lies between 1 - PAUSE and 1 + PAUSE of its mean."""
 TREMOR_HZ = (1.0, 12.0)
 TREMOR_RADIANS = 0.005
 """Deviation of the aim, about a third of a degree, as of a hand that walks and tries to hold still."""
-FRAMES_A_SWING = 4.0
+FRAMES_PER_SWING = 4.0
 SWING_SECONDS = 0.12
 SWING_RADIANS = (0.035, 0.085)
-FRAMES_A_STRETCH = 32
+FRAMES_PER_STRETCH = 32
 STRETCH_SHARE = 0.375
-"""Of every `FRAMES_A_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
+"""Of every `FRAMES_PER_STRETCH` frames of a stretched walk this share, in one piece, is shaky."""
 SHAKING = 12.0
 """How many times larger the tremor is there: as of a hand in a hurry. It swings only there."""
 STRETCH_EDGE = 1 / FPS
@@ -108,7 +109,7 @@ class Hand:
     distance the turn moves the image far more.
 
     The tremor has the same speed in each band from 1 to 12 Hz, and the hand swings every few frames.
-    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_A_STRETCH` frames.
+    ``stretched``: and it shakes for stretches in one piece, one in every `FRAMES_PER_STRETCH` frames.
     """
 
     def __init__(self, duration: float, seed: int, *, stretched: bool = False) -> None:
@@ -117,7 +118,7 @@ class Hand:
         amplitudes = 1 / self._frequencies
         amplitudes *= TREMOR_RADIANS * np.sqrt(2 / np.square(amplitudes).sum(0))
         self._amplitudes = amplitudes  # [harmonics, 3] radians
-        count = max(1, round(duration * FPS / FRAMES_A_SWING))
+        count = max(1, round(duration * FPS / FRAMES_PER_SWING))
         self._swing_times = (np.arange(count) + rng.uniform(0, 1, count)) / count * duration  # seconds
         direction = rng.uniform(0, 2 * np.pi, count)
         axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
@@ -126,7 +127,7 @@ class Hand:
         self.stretches = _stretches(duration, seed) if stretched else np.empty((0, 2))
         """Seconds [stretches, 2] from and to which the hand shakes."""
 
-    def turns(self, times: Array) -> Array:  # [T]
+    def turns(self, times: ArrayF64) -> ArrayF64:  # [T]
         """Rotation vectors [T, 3]."""
         waves = np.sin(2 * np.pi * self._frequencies * times[:, None, None] + self._phases)
         tremor = (self._amplitudes * waves).sum(1)
@@ -138,7 +139,7 @@ class Hand:
             tremor, swings = tremor * (1 + (SHAKING - 1) * strength), swings * strength
         return np.asarray(tremor + swings @ self._swing_turns, np.float64)
 
-    def shake_strength(self, times: Array) -> Array:  # [T] seconds
+    def shake_strength(self, times: ArrayF64) -> ArrayF64:  # [T] seconds
         """1 [T] within a stretch, 0 outside."""
         start, end = self.stretches.T
         inside = np.minimum(times[:, None] - start, end - times[:, None])
@@ -146,8 +147,8 @@ class Hand:
         return np.asarray((share**2 * (3 - 2 * share)).sum(1))
 
 
-def _stretches(duration: float, seed: int) -> Array:
-    count = max(1, round(duration * FPS / FRAMES_A_STRETCH))
+def _stretches(duration: float, seed: int) -> ArrayF64:
+    count = max(1, round(duration * FPS / FRAMES_PER_STRETCH))
     free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
     starts = np.arange(count) + free
     return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
@@ -163,23 +164,23 @@ class HandheldPath:
         """Seconds."""
         self.hand = Hand(self.duration, seed, stretched=stretched)
         self._course = course
-        self._pauses = max(1, round(frames / FRAMES_A_PAUSE))
+        self._pauses = max(1, round(frames / FRAMES_PER_PAUSE))
         rng = np.random.default_rng([seed, Stream.WALK])
         self._phase = rng.uniform(0, 2 * np.pi)  # of the pace, radians
 
-    def poses(self, times: Array) -> Array:  # [T] seconds
+    def poses(self, times: ArrayF64) -> ArrayF64:  # [T] seconds
         """Camera to world [T, 3, 4] with OpenCV axes."""
         poses = self._course.poses(self.progress(times))
         turns = Rotation.from_rotvec(self.hand.turns(times)).as_matrix()
         return np.concatenate([poses[:, :, :3] @ turns, poses[:, :, 3:]], 2)
 
-    def progress(self, times: Array) -> Array:
+    def progress(self, times: ArrayF64) -> ArrayF64:
         """Share of the course walked: its speed is 1 + PAUSE cos, so that frames bunch at the pauses."""
         share, turn = times / self.duration, 2 * np.pi * self._pauses
         wave = np.sin(turn * share + self._phase) - np.sin(self._phase)
         return np.asarray(share + PAUSE / turn * wave, np.float64)
 
 
-def frame_times(frames: int) -> Array:
+def frame_times(frames: int) -> ArrayF64:
     """Middles of the exposures, seconds [frames]."""
     return np.asarray((np.arange(frames) + 0.5) / FPS, np.float64)

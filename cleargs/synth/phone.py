@@ -13,13 +13,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cleargs.media.colour import LUMA
 from cleargs.media.encode import write_video
 from cleargs.media.video import decode_frames, read_timeline
 from cleargs.random_streams import Stream
-from cleargs.synth.optics import Array
+from cleargs.types import ArrayF64, ImageU8
 
 NOISE = 1.5 / 255
 """Deviation of the sensor noise at mid grey, sRGB units: a phone's small pixels, indoors."""
@@ -47,14 +46,14 @@ class Look:
     sharpening: float = 0.0
     """Share of the luma's fine detail that is added to all channels."""
 
-    def tone(self, value: Array) -> Array:
+    def tone(self, value: ArrayF64) -> ArrayF64:
         """The curve: [0, 1] onto [0, 1], rising."""
         if not self.contrast:
             return value
         low, high = (1 / (1 + math.exp(-self.contrast * (end - self.pivot))) for end in (0.0, 1.0))
         return np.asarray((1 / (1 + np.exp(-self.contrast * (value - self.pivot))) - low) / (high - low))
 
-    def apply(self, image: Array) -> Array:  # [H, W, 3] sRGB in [0, 1]
+    def apply(self, image: ArrayF64) -> ArrayF64:  # [H, W, 3] sRGB in [0, 1]
         """sRGB in [0, 1]."""
         image = self.tone(image)
         if not self.sharpening:
@@ -74,7 +73,7 @@ def phone_look(seed: int) -> Look:
     return Look(rng.uniform(3.0, 4.5), rng.uniform(0.4, 0.5), rng.uniform(0.4, 0.7))
 
 
-def metered(light: Array) -> float:  # [H, W, 3] linear
+def metered(light: ArrayF64) -> float:  # [H, W, 3] linear
     """What the meter sees: the mean luminance, above 0, over a spot in the middle."""
     red, blue = LUMA["bt709"]
     rows, columns = (np.sin(math.pi * (np.arange(size) + 0.5) / size) ** SPOT for size in light.shape[:2])
@@ -83,16 +82,18 @@ def metered(light: Array) -> float:  # [H, W, 3] linear
     return max(float(mean), 1e-6)
 
 
-def auto_exposure(luminances: Array, step: float) -> Array:  # [F] of `metered`, seconds from frame to frame
+def auto_exposure(
+    luminances: ArrayF64, step: float
+) -> ArrayF64:  # [F] of `metered`, seconds from frame to frame
     """The gain of each frame in stops [F], of mean 0: it goes towards what the frame asks for, with `LAG`."""
-    asked = -METERED * np.log2(luminances)
-    gains = asked.copy()
-    for number in range(1, len(asked)):
-        gains[number] = asked[number] + (gains[number - 1] - asked[number]) * math.exp(-step / LAG)
+    wanted = -METERED * np.log2(luminances)
+    gains = wanted.copy()
+    for number in range(1, len(wanted)):
+        gains[number] = wanted[number] + (gains[number - 1] - wanted[number]) * math.exp(-step / LAG)
     return np.asarray(gains - gains.mean(), np.float64)
 
 
-def coded(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> list[NDArray[np.uint8]]:
+def coded(path: Path, frames: Sequence[ImageU8], fps: float) -> list[ImageU8]:
     """Write ``frames`` [H, W, 3] as the phone's video to ``path``, and give back what a player shows."""
     write_video(path, frames, fps, BITS_PER_PIXEL)
     return [frame for _, frame in decode_frames(path, read_timeline(path).pts)]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from cleargs.errors import InputError
 from cleargs.random_streams import Stream
 from cleargs.synth import phone
-from cleargs.synth.image_motion import FrameMotion, duration_for
+from cleargs.synth.image_motion import SimulatedMotion, duration_for
 from cleargs.synth.path import FPS
 from cleargs.synth.phone import auto_exposure
 
@@ -92,7 +92,7 @@ class Fault:
 
 
 def plan(
-    protocol: Protocol, motions: Sequence[FrameMotion], luminances: Sequence[float], seed: int
+    protocol: Protocol, motions: Sequence[SimulatedMotion], luminances: Sequence[float], seed: int
 ) -> list[Fault]:
     """The fault of each frame of a walk; ``luminances`` is what each frame's meter sees, in linear light."""
     scale = motions[0].lens.width / REFERENCE_WIDTH
@@ -110,7 +110,7 @@ def plan(
     return [Fault(exposure, readout, stops=float(stops), noise=phone.NOISE) for stops in gains]
 
 
-def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
+def _mixed(motions: Sequence[SimulatedMotion], scale: float, rng: np.random.Generator) -> list[Fault]:
     """What phones give: of any two neighbours one is sharp (blur under `SHARP_BLUR`) and one is not.
 
     Of the others the 60 % that move fastest are blurred by 7-22 px; of the rest every other one is defocused
@@ -119,8 +119,8 @@ def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generato
     """
     count = len(motions)
     pairs = np.arange(0, count - 1, 2)
-    spoilt = [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
-    by_speed = sorted(spoilt, key=lambda number: -motions[number].blur(0.02))
+    degraded = [int(number) for number in pairs + rng.integers(0, 2, len(pairs))]
+    by_speed = sorted(degraded, key=lambda number: -motions[number].blur(0.02))
     blurred = by_speed[: round(0.6 * len(by_speed))]
     defocused = sorted(by_speed[len(blurred) :])[::2]
     drift = 0.1 * np.sin(2 * np.pi * (np.arange(count) / 24 + rng.uniform()))
@@ -132,7 +132,7 @@ def _mixed(motions: Sequence[FrameMotion], scale: float, rng: np.random.Generato
             blur, noise = rng.uniform(7, 22), 2 * NOISE
         elif number in defocused:
             radius = rng.uniform(3, 6)
-        elif number in spoilt:
+        elif number in degraded:
             stops += float(rng.choice([-1, 1]) * rng.uniform(1.3, 2.2))
             noise = 3 * NOISE
         exposure = duration_for(blur * scale, motion.blur)

@@ -16,8 +16,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from cleargs.kernel_cache import configure_numba
-from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, Shutter, low_discrepancy, phone_lens
-from cleargs.synth.path import Orbit, Setting
+from cleargs.synth.optics import PINHOLE, Aperture, Lens, Shutter, low_discrepancy, phone_lens
+from cleargs.synth.path import Orbit, SceneSetup
 from cleargs.synth.room import (
     BOX,
     LEVEL_STARTS,
@@ -29,6 +29,7 @@ from cleargs.synth.room import (
     Room,
     make_room,
 )
+from cleargs.types import ArrayF64
 
 configure_numba("raycast")
 
@@ -41,13 +42,13 @@ OCCLUSION = 0.8
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _dot(a: Array, b: Array) -> float:
+def _dot(a: ArrayF64, b: ArrayF64) -> float:
     total: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return total
 
 
 @njit(cache=True, error_model="numpy")
-def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
+def _hit_box(origin: ArrayF64, ray: ArrayF64, half: ArrayF64, normal: ArrayF64) -> float:
     """Distance to a box of half sides ``half`` at the origin, from outside or from inside."""
     near, far, near_axis, far_axis = -MISS, MISS, 0, 0
     for axis in range(3):
@@ -70,7 +71,7 @@ def _hit_box(origin: Array, ray: Array, half: Array, normal: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> float:
+def _hit_sphere(origin: ArrayF64, ray: ArrayF64, radius: float, normal: ArrayF64) -> float:
     half = _dot(origin, ray)
     root = half * half - _dot(origin, origin) + radius * radius
     if root < 0:
@@ -84,7 +85,7 @@ def _hit_sphere(origin: Array, ray: Array, radius: float, normal: Array) -> floa
 
 
 @njit(cache=True, error_model="numpy")
-def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, normal: Array) -> float:
+def _hit_rod(origin: ArrayF64, ray: ArrayF64, radius: float, half_length: float, normal: ArrayF64) -> float:
     """An open cylinder about the y axis."""
     a = ray[0] * ray[0] + ray[2] * ray[2]
     b = origin[0] * ray[0] + origin[2] * ray[2]
@@ -101,7 +102,7 @@ def _hit_rod(origin: Array, ray: Array, radius: float, half_length: float, norma
 
 
 @njit(cache=True, error_model="numpy")
-def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv: Array) -> None:
+def _texture_coordinates(kind: int, point: ArrayF64, normal: ArrayF64, size: ArrayF64, uv: ArrayF64) -> None:
     """Metres along the surface; each face of a box sees another part of its texture."""
     if kind == BOX:
         axis = 0
@@ -122,7 +123,7 @@ def _texture_coordinates(kind: int, point: Array, normal: Array, size: Array, uv
 
 
 @njit(cache=True, error_model="numpy")
-def _sample(texture: NDArray[np.float32], uv: Array, footprint: float, colour: Array) -> None:
+def _sample(texture: NDArray[np.float32], uv: ArrayF64, footprint: float, colour: ArrayF64) -> None:
     """Trilinear lookup; ``footprint`` is the size of a pixel on the surface, in metres."""
     level = min(max(math.log2(max(footprint * TEXELS_PER_METRE, 1e-6)), 0.0), LEVELS - 1.001)
     colour[0], colour[1], colour[2] = 0.0, 0.0, 0.0
@@ -143,7 +144,7 @@ def _sample(texture: NDArray[np.float32], uv: Array, footprint: float, colour: A
 
 
 @njit(cache=True, error_model="numpy")
-def _to_local(item: np.void, vector: Array, shift: bool, local: Array) -> None:
+def _to_local(item: np.void, vector: ArrayF64, shift: bool, local: ArrayF64) -> None:
     """A direction, or with ``shift`` a point, in the primitive's own axes."""
     centre, rotation = item["centre"], item["rotation"]
     x = vector[0] - centre[0] if shift else vector[0]
@@ -154,7 +155,7 @@ def _to_local(item: np.void, vector: Array, shift: bool, local: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _cover_of_sphere(to_centre: Array, radius: float, to_light: Array, reach: float) -> float:
+def _cover_of_sphere(to_centre: ArrayF64, radius: float, to_light: ArrayF64, reach: float) -> float:
     """How much of the lamp a ball hides from a point, 0 to 1, soft at its rim."""
     along = _dot(to_centre, to_light)
     if along <= 0.0 or along >= reach:
@@ -165,7 +166,7 @@ def _cover_of_sphere(to_centre: Array, radius: float, to_light: Array, reach: fl
 
 
 @njit(cache=True, error_model="numpy")
-def _cover_of_box(point: Array, ray: Array, half: Array, reach: float) -> float:
+def _cover_of_box(point: ArrayF64, ray: ArrayF64, half: ArrayF64, reach: float) -> float:
     """How much of the lamp a box hides from ``point``, 0 to 1; both vectors in the box's axes.
 
     By the room that the box leaves on the side where the ray passes its middle: soft over the penumbra, or
@@ -189,13 +190,13 @@ def _cover_of_box(point: Array, ray: Array, half: Array, reach: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _light_at(
-    point: Array,
-    normal: Array,
-    to_light: Array,
+    point: ArrayF64,
+    normal: ArrayF64,
+    to_light: ArrayF64,
     reach: float,
     primitives: NDArray[np.void],
     own: int,
-    scratch: Array,  # [3, 3]
+    scratch: ArrayF64,  # [3, 3]
 ) -> tuple[float, float]:
     """Share of the lamp and share of the ambient light that the primitives leave (0 dark, 1 lit)."""
     lit, ambient = 1.0, 1.0
@@ -226,7 +227,7 @@ def _light_at(
 
 
 @njit(cache=True, error_model="numpy")
-def _passes_by(item: np.void, origin: Array, ray: Array) -> bool:
+def _passes_by(item: np.void, origin: ArrayF64, ray: ArrayF64) -> bool:
     """Whether the ray misses the sphere around the primitive."""
     centre = item["centre"]
     x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
@@ -237,14 +238,14 @@ def _passes_by(item: np.void, origin: Array, ray: Array) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _trace(
-    origin: Array,
-    ray: Array,
+    origin: ArrayF64,
+    ray: ArrayF64,
     pixel_angle: float,
     primitives: NDArray[np.void],
     textures: NDArray[np.float32],
-    light: Array,
-    colour: Array,
-    scratch: Array,  # [10, 3], so that a ray allocates nothing
+    light: ArrayF64,
+    colour: ArrayF64,
+    scratch: ArrayF64,  # [10, 3], so that a ray allocates nothing
 ) -> tuple[float, int]:
     """Radiance along one ray into ``colour``; returns the distance and the number of what it hits."""
     best, hit = MISS, 0
@@ -303,9 +304,9 @@ def _trace(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _render(
-    poses: Array,  # [S, H, 3, 4] camera to world, of each row in each sample
-    jitter: Array,  # [S, 2] offset inside the pixel, in [0, 1)
-    lens: Array,  # [S, 2] point on the lens, metres; zero for a pinhole
+    poses: ArrayF64,  # [S, H, 3, 4] camera to world, of each row in each sample
+    jitter: ArrayF64,  # [S, 2] offset inside the pixel, in [0, 1)
+    lens: ArrayF64,  # [S, 2] point on the lens, metres; zero for a pinhole
     focus: float,
     fx: float,
     fy: float,
@@ -313,11 +314,11 @@ def _render(
     cy: float,
     primitives: NDArray[np.void],
     textures: NDArray[np.float32],
-    light: Array,
-    track: Array,  # [S, H, 3] where the last primitive is; [0, 0, 3]: where it says itself
-    image: Array,
-    depth: Array,
-    share: Array,  # of the samples that see the last primitive
+    light: ArrayF64,
+    track: ArrayF64,  # [S, H, 3] where the last primitive is; [0, 0, 3]: where it says itself
+    image: ArrayF64,
+    depth: ArrayF64,
+    share: ArrayF64,  # of the samples that see the last primitive
 ) -> None:
     passes, height, width = poses.shape[0], image.shape[0], image.shape[1]
     last = primitives.shape[0] - 1
@@ -353,27 +354,27 @@ class RoomWorld:
 
     room: Room
 
-    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> Array:
+    def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
         """The mean over the samples, each with one ray a pixel at its own place inside the pixel."""
         return self._expose(shutter, lens, aperture)[0]
 
     def film(
         self, balloon: Balloon, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE
-    ) -> tuple[Array, Array]:
+    ) -> tuple[ArrayF64, ArrayF64]:
         """The same with ``balloon`` in the room, where it is at each row's time in each sample; and the share
         [H, W] of the exposure in which a pixel sees it.
         """
         image, _, share = self._expose(shutter, lens, aperture, balloon)
         return image, share
 
-    def depth(self, pose: Array, lens: Lens) -> Array:
+    def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
         """Exact depth through the pixel centres."""
         middle = Shutter(pose[None], np.zeros((1, lens.height), np.intp))
         return self._expose(middle, lens, PINHOLE)[1]
 
     def _expose(
         self, shutter: Shutter, lens: Lens, aperture: Aperture, balloon: Balloon | None = None
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[ArrayF64, ArrayF64, ArrayF64]:
         """Image, depth, and share of the samples that see the last primitive; see `_render`."""
         primitives, track = self.room.primitives, np.empty((0, 0, 3))
         if balloon is not None:
@@ -390,8 +391,8 @@ class RoomWorld:
         return image, depth, share
 
 
-def room_setting(frames: int, width: int, height: int, seed: int) -> Setting:
+def room_setting(frames: int, width: int, height: int, seed: int) -> SceneSetup:
     """The procedural room of ``seed``, in metres, and a walk around its table."""
     room = make_room(seed)
     world, course, lens = RoomWorld(room), Orbit(room.focus, frames, seed), phone_lens(width, height)
-    return Setting("room", world, course, lens, partial(world.film, Balloon(room, seed)))
+    return SceneSetup("room", world, course, lens, partial(world.film, Balloon(room, seed)))

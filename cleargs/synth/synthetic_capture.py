@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from cleargs.errors import InputError
 from cleargs.files import write_json
@@ -21,12 +20,13 @@ from cleargs.media.image import write_rgb
 from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
-from cleargs.synth.image_motion import FrameMotion, follow
-from cleargs.synth.optics import PINHOLE, Aperture, Array, Lens, disc, still
-from cleargs.synth.path import FPS, HandheldPath, Setting, frame_times
+from cleargs.synth.image_motion import SimulatedMotion, follow
+from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, still
+from cleargs.synth.path import FPS, HandheldPath, SceneSetup, frame_times
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
 from cleargs.synth.raycast import room_setting
+from cleargs.types import ArrayF64, ImageU8
 
 NEAR_FOCUS = 0.2
 """Where a frame out of focus is focused, as a share of the mean distance: in front of everything."""
@@ -65,7 +65,7 @@ def make_capture(
     height: int,
     seed: int,
     reporter: Reporter,
-    setting: Setting | None = None,
+    setting: SceneSetup | None = None,
     video: bool = False,
 ) -> dict[str, Any]:
     """Write the capture ``protocol`` into the new folder ``out``; returns what ``truth/capture.json`` says.
@@ -170,12 +170,12 @@ def make_capture(
 
 
 def _expose(
-    setting: Setting,
-    motion: FrameMotion,
+    setting: SceneSetup,
+    motion: SimulatedMotion,
     fault: Fault,
     nearness: float,
     rng: np.random.Generator,
-) -> tuple[Array, Array]:
+) -> tuple[ArrayF64, ArrayF64]:
     """One frame as it falls on the sensor, in linear light, and the share [H, W] that sees what moves.
 
     nearness: mean of 1 / depth over the pixels that see something.
@@ -195,7 +195,7 @@ def _expose(
     return light, np.zeros(light.shape[:2])
 
 
-def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: Look) -> Array:
+def _write_sharp(folder: Path, stem: str, setting: SceneSetup, pose: ArrayF64, look: Look) -> ArrayF64:
     """Writes the sharp view and returns its light [H, W, 3]."""
     light = setting.world.render(still(pose, setting.lens.height), setting.lens)
     write_rgb(folder / "images" / f"{stem}.png", develop(light, look=look))
@@ -203,13 +203,13 @@ def _write_sharp(folder: Path, stem: str, setting: Setting, pose: Array, look: L
 
 
 def develop(
-    image: Array,
+    image: ArrayF64,
     *,
     stops: float = 0.0,
     noise: float = 0.0,
     rng: np.random.Generator | None = None,
     look: Look = PLAIN,
-) -> NDArray[np.uint8]:
+) -> ImageU8:
     """Exposure error, sensor noise, clipping, sRGB encoding, the camera's look, 8 bits: RGB [H, W, 3] from
     linear light.
 
@@ -224,7 +224,7 @@ def develop(
     return np.asarray(np.rint(look.apply(srgb_from_linear(np.clip(image, 0, 1))) * 255), np.uint8)
 
 
-def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str, Any]:
+def _row(number: int, image: str, motion: SimulatedMotion, fault: Fault) -> dict[str, Any]:
     return {
         "frame_id": number,
         "image": image,
@@ -240,7 +240,7 @@ def _row(number: int, image: str, motion: FrameMotion, fault: Fault) -> dict[str
     }
 
 
-def _write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: Array) -> None:  # [F, 3, 4]
+def _write_transforms(folder: Path, lens: Lens, images: Sequence[str], poses: ArrayF64) -> None:  # [F, 3, 4]
     """``transforms.json`` as nerfstudio reads it: OpenGL camera to world."""
     frames = []
     for image, pose in zip(images, poses, strict=True):

@@ -12,12 +12,12 @@ import pytest
 from toy_batch import ToyBatch
 
 from cleargs.batch.loop import program
-from cleargs.batch.sheet import Scene, SheetError, read_scenes
+from cleargs.batch.sheet import SceneJob, SheetError, read_scenes
 from cleargs.cli.main import invoke
 from cleargs.errors import InputError
 
 
-def read(folder: Path, name: str, text: str) -> list[Scene]:
+def read(folder: Path, name: str, text: str) -> list[SceneJob]:
     (folder / name).write_text(text)
     return read_scenes(folder / name)
 

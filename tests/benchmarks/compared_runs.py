@@ -7,7 +7,7 @@ from pathlib import Path
 from report_run import FinishedRun
 
 from benchmarks.comparison.findings import Compared, compare_scenes
-from benchmarks.comparison.scenes import Recipe, existing
+from benchmarks.comparison.scenes import SceneRecipe, existing
 from cleargs.digest import DigestMemo
 from cleargs.evaluate.config import EvalOptions
 from cleargs.pipeline.store import Store
@@ -24,7 +24,7 @@ def compare_runs(root: Path) -> tuple[Path, Compared]:
     (runs[1].folder / "rivr/manifest.json").unlink()
     out = root / "out"
     out.mkdir()
-    recipe = Recipe(runs[0].dag, "default", (), "cpu", 1, EvalOptions(lpips=(), scorers=()))
+    recipe = SceneRecipe(runs[0].dag, "default", (), "cpu", 1, EvalOptions(lpips=(), scorers=()))
     with DigestMemo(root / "digests.sqlite") as memo:
         made = [existing(run.folder, run.dag, None) for run in runs]
         return out, compare_scenes(out, made, recipe, Store(root, memo), SilentReporter())

@@ -10,14 +10,14 @@ import pytest
 from benchmarks.commands import invoke
 from benchmarks.speed import benchmark_plan as plans
 from benchmarks.speed.benchmark import run
-from benchmarks.speed.benchmark_plan import Case, Plan, full_plan, quick_plan
+from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan, full_plan, quick_plan
 from benchmarks.speed.benchmark_results import Benchmark
 from benchmarks.speed.markdown import NOT_RUN, markdown, milliseconds
 from benchmarks.speed.peak_memory import peak_memory
 from benchmarks.speed.timing import Quartiles
 from cleargs.progress import SilentReporter
 
-SMALL, LARGE = Case(60, 40, 24), Case(90, 48, 32)
+SMALL, LARGE = BenchmarkCase(60, 40, 24), BenchmarkCase(90, 48, 32)
 
 
 def toy_plan() -> Plan:
@@ -30,7 +30,7 @@ def toy_plan() -> Plan:
         torch_largest=SMALL,
         roofline=SMALL,
         more_splats=(SMALL, LARGE),
-        larger_splats=(SMALL, Case(60, 40, 24, 5.0)),
+        larger_splats=(SMALL, BenchmarkCase(60, 40, 24, 5.0)),
         memory=False,
         peak_repeats=1,
         seed=4,
@@ -116,8 +116,8 @@ def test_plans_name_cases_that_are_measured():
     for plan in (full_plan((1, 2)), quick_plan((1,))):
         compared = [plan.compares_torch(case) for case in plan.cases]
         assert any(compared) and not all(compared)
-    assert not full_plan((1,)).compares_torch(Case(200_000, 320, 180))
-    assert not full_plan((1,)).compares_torch(Case(10_000, 1280, 720))
+    assert not full_plan((1,)).compares_torch(BenchmarkCase(200_000, 320, 180))
+    assert not full_plan((1,)).compares_torch(BenchmarkCase(10_000, 1280, 720))
     assert milliseconds(Quartiles(1.0, 2.0, 30.0)) == "2.00 [1.00 30.00]"
 
 

@@ -13,7 +13,7 @@ from benchmarks.speed.probe import KERNELS, PACKAGE, timed_kernels
 from benchmarks.speed.roofline import roof, roofline
 from benchmarks.speed.scaling import straight_line
 from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
-from benchmarks.speed.work import Work, size_of, work_of
+from benchmarks.speed.work import KernelWork, size_of, work_of
 from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import reference
@@ -73,9 +73,9 @@ def _kernel(name):
 
 def test_the_roof_is_the_slower_of_operations_and_bytes():
     peaks = Peaks(gflops=100.0, gbytes=10.0)
-    bound = roof("k", Work(operations=4e8, bytes=1e7), 8.0, peaks)  # at least 4 ms, and 1 ms
+    bound = roof("k", KernelWork(operations=4e8, bytes=1e7), 8.0, peaks)  # at least 4 ms, and 1 ms
     assert (bound.bound, bound.fraction) == ("operations", pytest.approx(0.5))
-    bound = roof("k", Work(operations=1e8, bytes=6e7), 8.0, peaks)  # at least 1 ms, and 6 ms
+    bound = roof("k", KernelWork(operations=1e8, bytes=6e7), 8.0, peaks)  # at least 1 ms, and 6 ms
     assert (bound.bound, bound.fraction) == ("bytes", pytest.approx(0.75))
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.comparison.choices import Choice, agreement, exposed
+from benchmarks.comparison.choices import ChoiceRow, agreement, exposed
 from cleargs.synth.synthetic_capture import develop
 
 
-def row(chosen: str, render: float, restored: float, observed: float) -> Choice:
+def row(chosen: str, render: float, restored: float, observed: float) -> ChoiceRow:
     psnr = {"render": render, "restored": restored, "observed": observed}
     # The better by PSNR is the worse by LPIPS here, so that the two cannot be mistaken for one another.
     lpips = {name: value / 100 for name, value in psnr.items()}
-    return Choice(round=1, frame_id=0, chosen=chosen, psnr=psnr, lpips=lpips)
+    return ChoiceRow(round=1, frame_id=0, chosen=chosen, psnr=psnr, lpips=lpips)
 
 
 def test_agreement_by_hand() -> None:

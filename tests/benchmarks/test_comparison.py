@@ -15,8 +15,8 @@ from benchmarks.commands import invoke
 from benchmarks.comparison import findings
 from benchmarks.comparison.cells import Cell
 from benchmarks.comparison.choices import judge_choices
-from benchmarks.comparison.equal_work import Work, decide_work
-from benchmarks.comparison.scenes import Made, Recipe, evaluated, existing, view_sets
+from benchmarks.comparison.equal_work import EqualWork, decide_work
+from benchmarks.comparison.scenes import Made, SceneRecipe, evaluated, existing, view_sets
 from cleargs.capture.tables import load_frames
 from cleargs.cli.common import DONE_IN_PART
 from cleargs.errors import InputError
@@ -148,8 +148,8 @@ def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
     config = load_config(installed(), "default", ("g0.budget=7",), 0)
     frames = 6 * 160 * 90
     open_ = decide_work(load_config(installed(), "default", (), 0), out / "room-0" / "rva" / "ingest", None)
-    assert open_ == Work(3800, 6, budget_from_pixels(frames, 10**6), sh_degree_from_views(6))
-    assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == Work(50, 6, 7, 0)
+    assert open_ == EqualWork(3800, 6, budget_from_pixels(frames, 10**6), sh_degree_from_views(6))
+    assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == EqualWork(50, 6, 7, 0)
 
 
 def test_steps_sets_the_total_of_all(capture: Path, out: Path) -> None:
@@ -265,7 +265,7 @@ def test_metrics_whose_weights_came_later_are_measured(
     dag, options = installed(), EvalOptions(lpips=(), scorers=("clarity-net",))
 
     def kept_weights() -> dict[str, str]:
-        recipe = Recipe(dag, "smoke", (), "cpu", 1, options)
+        recipe = SceneRecipe(dag, "smoke", (), "cpu", 1, options)
         with opened_store(out / STORE_FOLDER) as store:
             made = existing(run, dag, None)
             return evaluated(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[0].weights

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison import pictures
-from benchmarks.comparison.equal_work import Steps, Work, split, steps_of, variant_config
+from benchmarks.comparison.equal_work import EqualWork, Steps, split, steps_of, variant_config
 from benchmarks.comparison.scenes import capture_name
 from benchmarks.comparison.variants import VARIANTS, WHOLE, Variant
 from cleargs.errors import ConfigError
@@ -34,7 +34,7 @@ def test_every_variant_sees_the_same_images() -> None:
 def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) -> None:
     plain = load_config(installed(), recipe)
     for total in (steps_of(plain, 20).total, 1000, 7777):
-        work = Work(steps=total, frames=20, budget=12_345, sh_degree=2)
+        work = EqualWork(steps=total, frames=20, budget=12_345, sh_degree=2)
         config = variant_config(installed(), variant, recipe, (), 0, work)
         assert steps_of(config, 20, variant.stage).total == total
         g0, rivr = config.sections["g0"], config.sections["rivr"]
@@ -53,7 +53,7 @@ def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) 
 def test_the_recipe_s_own_total_changes_nothing_but_budget_and_degree() -> None:
     full = next(variant for variant in VARIANTS if variant.name == WHOLE)
     plain = load_config(installed(), "default", seed=0)
-    work = Work(steps_of(plain, 20).total, 20, budget=40_000, sh_degree=1)
+    work = EqualWork(steps_of(plain, 20).total, 20, budget=40_000, sh_degree=1)
     same = (
         "g0.sh_degree=1",
         "g0.budget=40000",

@@ -12,11 +12,11 @@ import pytest
 from benchmarks.commands import invoke
 from benchmarks.comparison import results_page as results
 from benchmarks.comparison.cells import Cell
-from benchmarks.comparison.evidence import Workshop, minutes, read_evidence
-from benchmarks.comparison.kept_sections import KeptSection
+from benchmarks.comparison.evidence import EvidenceContext, minutes, read_evidence
 from benchmarks.comparison.origin import version_of_source
 from benchmarks.comparison.results_page import Origin, losses, results_page
-from benchmarks.comparison.scenes import Recipe, Sample
+from benchmarks.comparison.saved_sections import SavedSection
+from benchmarks.comparison.scenes import Sample, SceneRecipe
 from benchmarks.comparison.variants import QUESTIONS, VARIANTS, find_variants
 from cleargs.errors import ConfigError
 from cleargs.evaluate.config import EvalOptions
@@ -117,13 +117,15 @@ def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: 
 def test_what_a_section_before_it_has_made_takes_no_time(tmp_path: Path) -> None:
     blur = read_evidence().quick[0]
     with opened_store(tmp_path / "store") as store:
-        recipe = Recipe(installed(), "default", (), "cpu", 2, EvalOptions())
-        shop = Workshop(tmp_path, None, recipe, store, SilentReporter())
+        recipe = SceneRecipe(installed(), "default", (), "cpu", 2, EvalOptions())
+        context = EvidenceContext(tmp_path, None, recipe, store, SilentReporter())
         alone, again, more = minutes(
-            [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], shop
+            [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], context
         )
         assert again == 0.0 and 0.0 < more < alone / len(blur.variants)
-        (twice,) = minutes([blur.model_copy(update={"seeds": (*blur.seeds, 105, 106, 107, 108, 109)})], shop)
+        (twice,) = minutes(
+            [blur.model_copy(update={"seeds": (*blur.seeds, 105, 106, 107, 108, 109)})], context
+        )
         assert twice == pytest.approx(2 * alone)
 
 
@@ -157,14 +159,14 @@ def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
     )
 
 
-def found(*gains: float, version: str = "0.1.0, abc") -> KeptSection:
+def found(*gains: float, version: str = "0.1.0, abc") -> SavedSection:
     """The whole method gains so much PSNR in each sample, and always 0.1 of LPIPS."""
     cells = []
     for number, gain in enumerate(gains):
         cells.append(cell("all-view", f"s{number}", 20.0 + number, 0.4))
         cells.append(cell("full", f"s{number}", 20.0 + number + gain, 0.3 + 0.001 * number))
     (section, *_) = read_evidence().quick
-    return KeptSection(
+    return SavedSection(
         section=section,
         version=version,
         machine="cpu, 2 threads",
@@ -269,7 +271,7 @@ def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
     assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
     assert text.count("each image judged after the affine on sRGB that fits it to the truth best.") == 1
     plain, aligned = (
-        KeptSection.model_validate_json((out / f"results/{name}.json").read_bytes())
+        SavedSection.model_validate_json((out / f"results/{name}.json").read_bytes())
         for name in ("rooms", "aligned")
     )
     scenes = {(one.sample, one.variant, one.views): one for one in plain.cells if one.column == "mixed 1x"}

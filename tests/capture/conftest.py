@@ -65,7 +65,7 @@ def ingest(tmp_path: Path) -> Ingest:
             externals={},
             out=out,
             checkpoints=work,
-            kept=work / "kept",
+            cache=work / "kept",
             seed=0,
             device="cpu",
             threads=threads,

@@ -14,7 +14,7 @@ from cleargs.media.image import image_size
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import Run
+from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.stage import Estimate
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
@@ -30,7 +30,9 @@ def photos(tmp_path: Path) -> Path:
 
 
 def costs(source: Path, *overrides: str, threads: int = 2) -> dict[str, Estimate]:
-    run = Run(source.parent / "run", source, load_config(installed(), "default", overrides), source, "cpu")
+    run = RunSpec(
+        source.parent / "run", source, load_config(installed(), "default", overrides), source, "cpu"
+    )
     with DigestMemo(source.parent / "memo") as memo:
         planner = Planner(installed(), run, Store(source, memo), threads, SilentReporter())
         return {plan.stage: plan.estimate for plan in planner.plan() if plan.estimate is not None}

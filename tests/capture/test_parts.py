@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from OpenImageIO import ImageOutput, ImageSpec
 from pydantic import ValidationError
 
-from cleargs.capture.cameras import Camera, Pose, normalise, pinhole
+from cleargs.capture.cameras import Intrinsics, Pose, normalise, pinhole
 from cleargs.capture.capture import SourceFrame
 from cleargs.capture.choice import held_out, holdout_hash, sharpness
 from cleargs.capture.folders import frame_key, masks_of, natural_key, spread
@@ -41,14 +41,14 @@ from cleargs.stages.ingest import IngestConfig
 from .conftest import HEIGHT, WIDTH, texture
 
 LENSES = [
-    Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.15)),
-    Camera("OPENCV", 320, 240, (300.0, 310.0, 155.0, 125.0, 0.12, -0.05, 0.002, -0.001)),
-    Camera("OPENCV_FISHEYE", 320, 240, (150.0, 150.0, 160.0, 120.0, 0.02, -0.01, 0.0, 0.0)),
+    Intrinsics("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.15)),
+    Intrinsics("OPENCV", 320, 240, (300.0, 310.0, 155.0, 125.0, 0.12, -0.05, 0.002, -0.001)),
+    Intrinsics("OPENCV_FISHEYE", 320, 240, (150.0, 150.0, 160.0, 120.0, 0.02, -0.01, 0.0, 0.0)),
 ]
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
-def test_undistorted_pixels_are_where_the_pinhole_says(lens: Camera) -> None:
+def test_undistorted_pixels_are_where_the_pinhole_says(lens: Intrinsics) -> None:
     # An image that says where it comes from: red is x, green is y of the lens's own pixels.
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     coded = np.stack([x * 0.75, y, np.full_like(x, 200)], axis=-1).astype(np.uint8)
@@ -129,7 +129,7 @@ def small_model() -> SparseModel:
         for key in (0, 1)
     }
     images = {key + 1: image for key, image in images.items()}
-    camera = {1: Camera("OPENCV", 100, 80, (90.0, 91.0, 50.0, 40.0, 0.1, 0.0, 0.0, 0.0))}
+    camera = {1: Intrinsics("OPENCV", 100, 80, (90.0, 91.0, 50.0, 40.0, 0.1, 0.0, 0.0, 0.0))}
     return SparseModel(camera, images, ids, random.normal(size=(4, 3)), random.random(4))
 
 
@@ -185,7 +185,7 @@ def test_damaged_rigs_are_not_read(tmp_path: Path, name: str, damage: bytes) -> 
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)
-def test_resized_camera_scales_its_pixels(lens: Camera) -> None:
+def test_resized_camera_scales_its_pixels(lens: Intrinsics) -> None:
     rays = np.array([[0.2, 0.1, 1.0], [-0.3, 0.2, 1.0]])
     before = lens.colmap().img_from_cam(rays)
     after = lens.resized(160, 120).colmap().img_from_cam(rays)
@@ -398,7 +398,7 @@ def test_a_camera_that_fits_the_stored_image_keeps_it_so(tmp_path: Path, orienta
     pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 4), np.uint8)
     path = tmp_path / "turned.png"
     write_oriented(path, pixels, orientation)
-    camera = Camera("PINHOLE", 6, 4, (5.0, 5.0, 3.0, 2.0))
+    camera = Intrinsics("PINHOLE", 6, 4, (5.0, 5.0, 3.0, 2.0))
     stored = read_image(SourceFrame("turned.png", path, camera=camera))
     assert np.array_equal(stored, pixels[..., :3])
     alone = SourceFrame("turned.png", path)

@@ -17,12 +17,12 @@ from toy import Bench
 
 from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
-from cleargs.cli.progress_bars import LineReporter
+from cleargs.cli.progress_bars import PlainTextReporter
 from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
-from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.runner import StageOutcome
 
 
 @pytest.fixture
@@ -406,7 +406,9 @@ def test_a_signal_that_was_blocked_at_the_start_stays_blocked() -> None:
 
 
 def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def outcome(stage: str, how: Literal["found", "made"], files: list[str], **summary: object) -> Outcome:
+    def outcome(
+        stage: str, how: Literal["found", "made"], files: list[str], **summary: object
+    ) -> StageOutcome:
         parts = KeyParts(
             stage=stage, version=1, config={}, inputs={}, externals={}, seed=0, device="cpu", libraries={}
         )
@@ -426,7 +428,7 @@ def test_the_end_of_a_run_is_five_lines(tmp_path: Path, capsys: pytest.CaptureFi
             device="cpu",
             summary=summary,
         )
-        return Outcome(stage, how, manifest, tmp_path)
+        return StageOutcome(stage, how, manifest, tmp_path)
 
     held_back = {"frames": [3, 9], "psnr_before": 22.58, "psnr_after": 23.61, "harm": None}
     outcomes = [
@@ -467,7 +469,7 @@ def test_the_time_left_counts_from_the_first_step_on(
     """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    with LineReporter().task("G0", 1000) as task:
+    with PlainTextReporter().task("G0", 1000) as task:
         for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
             clock[0] = now
             task.update(done=done)
@@ -481,7 +483,7 @@ def test_the_time_left_follows_the_work_where_steps_differ(
     """Half of the steps may be a quarter of the work: a training's last steps have the most Gaussians."""
     clock = [0.0]
     monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    with LineReporter().task("G0", 1000) as task:
+    with PlainTextReporter().task("G0", 1000) as task:
         for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
             clock[0] = now
             task.update(done=done, share=share)

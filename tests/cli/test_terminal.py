@@ -14,10 +14,10 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import explanation, invoke
-from cleargs.cli.progress_bars import LineReporter
+from cleargs.cli.progress_bars import PlainTextReporter
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
-from cleargs.untrusted import printable
+from cleargs.safe_io import printable
 
 CLIPBOARD = "\x1b]52;c;ZXZpbA==\x07"
 CLEAR = "\x1b[2J\x1b[H"
@@ -56,7 +56,7 @@ def test_the_streams_escape_all_but_lines_and_colours() -> None:
 def test_errors_and_reports_are_one_line_each(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     _, cause, remedy = explanation(InputError(f"no {CLIPBOARD}{FORGED}", hint=FORGED))
     assert cause.isprintable() and remedy.isprintable()
-    reporter = LineReporter()
+    reporter = PlainTextReporter()
     reporter.warn(FORGED)
     reporter.info(CLEAR)
     with reporter.task(CLIPBOARD, 1) as task:

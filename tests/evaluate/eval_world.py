@@ -26,7 +26,7 @@ from cleargs.pipeline.config import check_document
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
+from cleargs.pipeline.run_file import RunSpec, read_run_file, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera
@@ -166,7 +166,9 @@ def write_run(
         )
     write_table(ingest / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
     config = check_document(installed(), {})
-    write_run_file(Run(folder.absolute(), folder.absolute() / "capture", config, folder / ".store", "cpu"))
+    write_run_file(
+        RunSpec(folder.absolute(), folder.absolute() / "capture", config, folder / ".store", "cpu")
+    )
     note_finished(folder, "ingest", {"poses": poses, "similarity": WORLD.to_json()})
     (folder / "rva").mkdir()
     note_finished(folder, "rva")

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from OpenImageIO import ImageOutput, ImageSpec
 from scipy.spatial.transform import Rotation
 
-from cleargs.capture.cameras import Camera as Lens
+from cleargs.capture.cameras import Intrinsics as Lens
 from cleargs.capture.cameras import Pose, Similarity
 from cleargs.errors import InputError
 from cleargs.evaluate.config import EvalOptions

@@ -19,7 +19,7 @@ from cleargs.formation.capture import (
 from cleargs.formation.exposure import Exposure
 from cleargs.formation.frame import FrameFormation
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.photograph import photograph
+from cleargs.formation.observed import render_observed
 from cleargs.formation.table import read_formation, write_formation
 from cleargs.progress import SilentReporter
 from cleargs.splat.camera import Camera
@@ -27,7 +27,7 @@ from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trained, Trainer
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 5
 CONFIG = TrainConfig(
@@ -75,19 +75,19 @@ def scene() -> Scene:
     )
 
 
-def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[View]:
+def views(blurred: int | None = BLURRED, weights: list[float] | None = None) -> list[TrainingView]:
     made = []
     for index, angle in enumerate(np.linspace(-0.1, 0.1, FRAMES)):
-        view = View(index, camera(angle), 1.0, "real", lambda: (None, None))
+        view = TrainingView(index, camera(angle), 1.0, "real", lambda: (None, None))
         moved = FrameFormation(index, BLUR, "blur", reach_px=4.0) if index == blurred else None
-        seen = photograph(scene(), view, formation=moved).numpy()
+        seen = render_observed(scene(), view, formation=moved).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
         weight = 1.0 if weights is None else weights[index]
-        made.append(View(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(TrainingView(index, view.camera, weight, "real", lambda pixels=pixels: (pixels, None)))
     return made
 
 
-def run(folder: Path, seen: list[View], formation: CaptureFormation | None) -> Trained:
+def run(folder: Path, seen: list[TrainingView], formation: CaptureFormation | None) -> Trained:
     folder.mkdir(exist_ok=True)
     trainer = Trainer(scene(), seen, CONFIG, seed=(3,), formation=formation)
     return trainer.run(checkpoint=folder / "state.safetensors", reporter=SilentReporter())
@@ -110,7 +110,7 @@ def test_with_it_a_blurred_frame_teaches_a_sharp_scene(tmp_path: Path) -> None:
     truth = torch.from_numpy(sharp.load()[0].astype(np.float32) / 255)
     for name, formation in (("plain", None), ("formed", CaptureFormation([views()[BLURRED]], LOOK))):
         trained = run(tmp_path / name, [views()[BLURRED]], formation)
-        errors[name] = float((photograph(trained.scene, sharp) - truth).square().mean())
+        errors[name] = float((render_observed(trained.scene, sharp) - truth).square().mean())
     assert errors["formed"] < 0.1 * errors["plain"]
 
 
@@ -124,14 +124,16 @@ def test_sharp_frames_train_as_without_it_bit_for_bit(tmp_path: Path) -> None:
     assert with_it.rows.equals(without.rows)
 
 
-def crossed() -> list[View]:
+def crossed() -> list[TrainingView]:
     """The sharp views, with a red square that stands elsewhere in each."""
     made = []
     for view in views(blurred=None):
         pixels = view.load()[0].copy()
         left = 8 + 17 * view.frame_id
         pixels[24:40, left : left + 16] = (230, 20, 20)
-        made.append(View(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(
+            TrainingView(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None))
+        )
     return made
 
 
@@ -141,7 +143,7 @@ def test_what_moves_teaches_little(tmp_path: Path) -> None:
     for name, tolerance, motions in (("plain", 0.0, True), ("doubted", 0.05, True), ("alone", 0.05, False)):
         look = FormationConfig(start=0.0, unexplained=tolerance, enabled=motions)
         trained = run(tmp_path / name, crossed(), CaptureFormation(crossed(), look))
-        shown = [photograph(trained.scene, view) - photograph(scene(), view) for view in crossed()]
+        shown = [render_observed(trained.scene, view) - render_observed(scene(), view) for view in crossed()]
         errors[name] = float(torch.stack(shown).square().mean())
     assert errors["doubted"] < 0.1 * errors["plain"], errors
     assert errors["alone"] < 0.1 * errors["plain"], errors
@@ -178,14 +180,16 @@ def test_a_checkpoint_of_another_formation_is_not_taken(tmp_path: Path) -> None:
 SKEW = FrameMotion(skew=np.array([0, 0, 0, 0, 9.0, 0]), median_depth=3.0)
 
 
-def skewed(frames: list[int]) -> list[View]:
+def skewed(frames: list[int]) -> list[TrainingView]:
     """The views, with a rolling shutter in these."""
     made = []
     for view in views(blurred=None):
         moved = FrameFormation(view.frame_id, SKEW, "skew", reach_px=5.0)
-        seen = photograph(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
+        seen = render_observed(scene(), view, formation=moved if view.frame_id in frames else None).numpy()
         pixels = np.rint(255 * seen).astype(np.uint8)
-        made.append(View(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(
+            TrainingView(view.frame_id, view.camera, 1.0, "real", lambda pixels=pixels: (pixels, None))
+        )
     return made
 
 
@@ -193,11 +197,11 @@ def test_a_twist_is_the_motion_of_the_scene_past_the_camera() -> None:
     """The last rows of a skewed frame are those of a camera turned by half the skew."""
     view = views(blurred=None)[2]
     moved = FrameFormation(2, SKEW, "skew", reach_px=5.0)
-    seen = photograph(scene(), view, formation=moved)[-4:, 8:-8]
+    seen = render_observed(scene(), view, formation=moved)[-4:, 8:-8]
     difference = {}
     for side in (-1, 1):
-        turned = View(2, camera(side * 0.5 * 9.0 / 90.0), 1.0, "real", view.load)
-        difference[side] = float((photograph(scene(), turned)[-4:, 8:-8] - seen).abs().mean())
+        turned = TrainingView(2, camera(side * 0.5 * 9.0 / 90.0), 1.0, "real", view.load)
+        difference[side] = float((render_observed(scene(), turned)[-4:, 8:-8] - seen).abs().mean())
     # The four rows lie up to a 0.3 px short of it, where the squares have edges.
     assert difference[1] < 0.4 * difference[-1], difference
 
@@ -288,7 +292,7 @@ def test_a_frame_is_rendered_with_a_margin() -> None:
     """What moved in from beyond the border is explained too."""
     seen = views()
     moved = FrameFormation(BLURRED, BLUR, "blur", reach_px=4.0)
-    wide = photograph(scene(), seen[BLURRED], formation=moved)
-    without = photograph(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
+    wide = render_observed(scene(), seen[BLURRED], formation=moved)
+    without = render_observed(scene(), seen[BLURRED], formation=FrameFormation(BLURRED, BLUR, "blur"))
     assert (wide - without)[4:-4, 8:-8].abs().max() < 1e-5
     assert (wide - without)[:, :2].abs().max() > 0.01

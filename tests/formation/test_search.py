@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.photographs import (
+from helpers.observations import (
     CAMERA,
     HEIGHT,
     MEDIAN,
     WIDTH,
     Image,
-    photograph,
+    observe,
     picture,
     sight,
     soft,
@@ -75,7 +75,7 @@ def test_the_flow_of_a_reduced_view_is_reduced() -> None:
 )
 def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model) -> None:
     """By what it does to the image: turns and steps to the side are alike where the depth hardly varies."""
-    found = preferred(search(sight(soft(truth), photograph(truth, motion))))
+    found = preferred(search(sight(soft(truth), observe(truth, motion))))
     assert found.model == model
     assert found.explained > 0.3
     ours, theirs = (wall_fields(m) for m in (found.motion, motion))
@@ -87,14 +87,14 @@ def test_what_happened_is_found(truth: Image, motion: FrameMotion, model: Model)
 
 
 def test_a_sharp_frame_is_left_alone(truth: Image) -> None:
-    found = preferred(search(sight(soft(truth), photograph(truth, FrameMotion()))))
+    found = preferred(search(sight(soft(truth), observe(truth, FrameMotion()))))
     # A soft render beside a sharp frame: nothing that a camera does makes the render sharper.
     assert found.explained < 0.01
 
 
 def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
     nearly = replace(BLUR, blur=0.8 * BLUR.blur)
-    still, found = refine(sight(soft(truth), photograph(truth, BLUR)), "blur", nearly)
+    still, found = refine(sight(soft(truth), observe(truth, BLUR)), "blur", nearly)
     assert still.model == "none"
     before = np.linalg.norm(nearly.blur - BLUR.blur)
     assert np.linalg.norm(found.motion.blur - BLUR.blur) < 0.5 * before
@@ -102,7 +102,7 @@ def test_a_fit_goes_on_from_the_last_one(truth: Image) -> None:
 
 def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
     shifted = replace(BLUR, pose=twist(0, 0, 0, 1.0, -2.0, 0))
-    observed = photograph(truth, shifted)
+    observed = observe(truth, shifted)
     found = preferred(search(sight(soft(truth), observed), pose=True))
     ours, theirs = (wall_fields(m) for m in (found.motion, shifted))
     assert torch.hypot(*theirs.offset).mean() > 2.0
@@ -112,7 +112,7 @@ def test_a_pose_is_corrected_with_the_motion(truth: Image) -> None:
 def test_masked_pixels_say_nothing(truth: Image) -> None:
     weight = np.ones((HEIGHT, WIDTH), np.float32)
     weight[40:90, 60:120] = 0.0
-    observed = photograph(truth, BLUR)
+    observed = observe(truth, BLUR)
     ruined = np.where(weight[..., None] > 0, observed, np.float32(1.0))
     clean, spoilt = (preferred(search(sight(soft(truth), o, weight))) for o in (observed, ruined))
     np.testing.assert_array_equal(clean.motion.vector, spoilt.motion.vector)
@@ -147,7 +147,7 @@ def test_threads_do_not_change_a_bit(truth: Image) -> None:
     found = []
     for threads in (1, 2):
         set_threads(threads)
-        found.append(preferred(search(sight(soft(truth), photograph(truth, BOTH)))))
+        found.append(preferred(search(sight(soft(truth), observe(truth, BOTH)))))
     np.testing.assert_array_equal(found[0].motion.vector, found[1].motion.vector)
     assert found[0].misfit == found[1].misfit
 
@@ -193,7 +193,7 @@ def test_search_runs_the_kernels_that_it_is_given(truth: Image) -> None:
             Counting.calls += 1
             return getattr(cpu, name)
 
-    seen = sight(photograph(truth, BLUR), truth)
+    seen = sight(observe(truth, BLUR), truth)
     given: Any = Counting()
     first = refine(seen, "blur", BLUR, kernels=given)
     assert Counting.calls > 2

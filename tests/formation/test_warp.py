@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from helpers.photographs import CAMERA, MEDIAN, Image, twist, wall, wall_fields
+from helpers.observations import CAMERA, MEDIAN, Image, twist, wall, wall_fields
 from helpers.warp_oracle import (
     ALL,
     LONG,

@@ -25,7 +25,7 @@ import torch
 from cleargs.capture.tables import load_frames
 from cleargs.formation.exposure import read_exposure
 from cleargs.formation.frames import view_of
-from cleargs.formation.photograph import evaluate_views
+from cleargs.formation.observed import evaluate_views
 from cleargs.pipeline.stage import StageContext
 from cleargs.progress import SilentReporter
 from cleargs.splat.ply import read_ply
@@ -59,7 +59,7 @@ def train(run: Path, out: Path, config: G0Config, device: Any) -> dict[str, Any]
             externals={},
             out=folders["g0"],
             checkpoints=folders["checkpoints"],
-            kept=folders["kept"],
+            cache=folders["kept"],
             seed=0,
             device=device,
             threads=torch.get_num_threads(),

@@ -7,10 +7,10 @@ import json
 
 import pytest
 
-from benchmarks.speed.benchmark_plan import Case, DevicePlan
+from benchmarks.speed.benchmark_plan import BenchmarkCase, DevicePlan
 from cleargs.progress import SilentReporter
 
-SMALL, LARGE = Case(6, 15, 12), Case(9, 16, 14)
+SMALL, LARGE = BenchmarkCase(6, 15, 12), BenchmarkCase(9, 16, 14)
 
 
 @pytest.fixture

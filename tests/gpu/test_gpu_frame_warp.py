@@ -105,7 +105,7 @@ def test_a_training_through_the_warp_follows_the_cpu(
     monkeypatch.setattr(splat_toy, "WIDTH", 20)
     monkeypatch.setattr(splat_toy, "HEIGHT", 16)
     # How the frames were taken is given: a search would tell near ties apart by the last bit.
-    monkeypatch.setattr("cleargs.formation.capture.explain", lambda frame, *given, **options: frame)
+    monkeypatch.setattr("cleargs.formation.capture.fit_motion", lambda frame, *given, **options: frame)
     rng = np.random.default_rng(0)
     views = splat_toy.views([rng.integers(0, 256, (16, 20, 3), dtype=np.uint8) for _ in range(3)])
     depth = {"median_depth": 1.0}

@@ -28,7 +28,7 @@ def test_too_many_pairs_is_an_error(device, monkeypatch):
 
 
 def test_pairs_that_do_not_fit_are_refused_before_they_are_made(device, monkeypatch):
-    monkeypatch.setattr(rasteriser, "UNASKED", 0)
+    monkeypatch.setattr(rasteriser, "UNCHECKED_BYTES", 0)
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12).to(device)
     engine = rasteriser_for(device)

@@ -13,7 +13,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="the extra `browser
 CHROMIUM = shutil.which("chromium")
 NO_CHROMIUM = "there is no chromium (apt-get install chromium)"
 
-PATIENCE_MS = 240_000  # software WebGL on a busy machine
+TIMEOUT_MS = 240_000  # software WebGL on a busy machine
 ALLOWED = ("file:", "data:", "blob:")
 SIZES: dict[str, Any] = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
@@ -35,7 +35,7 @@ class Opened:
         self.page = page
         self.complaints: list[str] = []
         self.requests: list[str] = []
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         page.on("console", self._heard)
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
         page.on("request", lambda request: self.requests.append(request.url))

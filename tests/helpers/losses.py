@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cleargs.splat.backend import Meter, backend_for
+from cleargs.splat.backend import LossAccumulator, backend_for
 from cleargs.splat.types import Rate
 
 
@@ -23,11 +23,11 @@ class PhotometricLoss(NamedTuple):
 def photometric_loss(
     image: Tensor, target: Tensor, *, ssim_lambda: float, weight: float = 1.0, mask: Tensor | None = None
 ) -> PhotometricLoss:
-    """Return what `Meter` says of one image."""
+    """Return what `LossAccumulator` says of one image."""
     gradient = torch.full(image.shape, 7.0, device=image.device)
-    meter = Meter(image.device, ssim_lambda)
-    meter.add(0, image, target, mask, weight=weight, gradient=gradient)
-    ((_, read),) = meter.take()
+    losses = LossAccumulator(image.device, ssim_lambda)
+    losses.add(0, image, target, mask, weight=weight, gradient=gradient)
+    ((_, read),) = losses.take()
     return PhotometricLoss(read.loss, gradient, read.l1, read.ssim)
 
 

@@ -12,7 +12,7 @@ from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 WIDTH, HEIGHT = 40, 30
 Image = NDArray[np.uint8]
@@ -52,11 +52,11 @@ def angles(count: int) -> list[float]:
     return [np.pi * index / count for index in range(count)]
 
 
-def views(pictures: list[Image], *, weights: list[float] | None = None) -> list[View]:
+def views(pictures: list[Image], *, weights: list[float] | None = None) -> list[TrainingView]:
     """Real views of the pictures, in the order of `images`."""
     weights = weights or [1.0] * len(pictures)
     return [
-        View(index, camera(angle), weight, "real", keep(picture))
+        TrainingView(index, camera(angle), weight, "real", keep(picture))
         for index, (angle, weight, picture) in enumerate(
             zip(angles(len(pictures)), weights, pictures, strict=True)
         )

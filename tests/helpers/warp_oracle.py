@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from helpers.photographs import MEDIAN, twist
+from helpers.observations import MEDIAN, twist
 from torch import Tensor
 
 from cleargs.formation.motion import FrameMotion

@@ -19,7 +19,7 @@ from cleargs.models.expert import load_expert
 from cleargs.models.lpips import NETS, convert_sdist, weights_file
 from cleargs.models.registry import (
     InstalledFile,
-    Model,
+    RegistryEntry,
     Role,
     file_digest,
     find_model,
@@ -39,7 +39,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def model_for(archive: Path, **digests: str) -> Model:
+def model_for(archive: Path, **digests: str) -> RegistryEntry:
     """The registry's LPIPS entry with the digests of an archive of our own."""
     entry = find_model("lpips")
     assert entry.source is not None

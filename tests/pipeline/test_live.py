@@ -13,17 +13,17 @@ from toy import Bench
 from cleargs.cli.main import invoke
 from cleargs.errors import StoreError
 from cleargs.pipeline import live
-from cleargs.pipeline.live import NOTE, AtWork, at_work, noted, preview_of
+from cleargs.pipeline.live import PROGRESS_FILE, RunningStage, preview_of, recorded_progress, running_stage
 from cleargs.progress import SilentReporter
 
 
 def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     hold = bench.root / "hold"
     hold.touch()
-    assert at_work(bench.folder, bench.store) is None
+    assert running_stage(bench.folder, bench.store) is None
     process = start(bench, f"square.hold={hold}")
     wait_for(bench, "held")
-    found = at_work(bench.folder, bench.store)
+    found = running_stage(bench.folder, bench.store)
     assert found is not None and (found.stage, found.label) == ("square", "square")
     work = bench.store / "work" / found.work
     assert preview_of(found, bench.store) is None
@@ -39,7 +39,7 @@ def test_a_run_at_work_says_so_until_it_ends(bench: Bench, capsys: pytest.Captur
     assert "square is at work: square" in said and f"preview: {preview.path}" in said
     hold.unlink()
     assert process.wait(60) == 0
-    assert at_work(bench.folder, bench.store) is None and not (bench.folder / NOTE).exists()
+    assert running_stage(bench.folder, bench.store) is None and not (bench.folder / PROGRESS_FILE).exists()
 
 
 def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
@@ -49,10 +49,10 @@ def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
     wait_for(bench, "held")
     process.kill()
     process.wait()
-    assert (bench.folder / NOTE).exists() and at_work(bench.folder, bench.store) is None
+    assert (bench.folder / PROGRESS_FILE).exists() and running_stage(bench.folder, bench.store) is None
     hold.unlink()
     assert [outcome.how for outcome in bench.run()] == ["found", "made", "made"]
-    assert not (bench.folder / NOTE).exists()
+    assert not (bench.folder / PROGRESS_FILE).exists()
 
 
 @pytest.mark.parametrize(
@@ -69,24 +69,24 @@ def test_a_killed_run_is_not_at_work(bench: Bench) -> None:
 def test_a_damaged_note_says_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr(live, "writer_lives", lambda work: True)
-    whole = AtWork(stage="g0", work="key@host-1", label="G0", done=1, total=2).model_dump()
-    (tmp_path / NOTE).write_text(json.dumps(whole))
-    assert at_work(tmp_path, tmp_path) is not None
-    (tmp_path / NOTE).write_text(json.dumps(whole | change))
-    assert at_work(tmp_path, tmp_path) is None
-    (tmp_path / NOTE).write_text("{")
-    assert at_work(tmp_path, tmp_path) is None
+    monkeypatch.setattr(live, "writer_is_alive", lambda work: True)
+    whole = RunningStage(stage="g0", work="key@host-1", label="G0", done=1, total=2).model_dump()
+    (tmp_path / PROGRESS_FILE).write_text(json.dumps(whole))
+    assert running_stage(tmp_path, tmp_path) is not None
+    (tmp_path / PROGRESS_FILE).write_text(json.dumps(whole | change))
+    assert running_stage(tmp_path, tmp_path) is None
+    (tmp_path / PROGRESS_FILE).write_text("{")
+    assert running_stage(tmp_path, tmp_path) is None
 
 
 def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "EVERY", 0.0)
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    with noted(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
+    with recorded_progress(SilentReporter(), tmp_path, "g0", tmp_path / "key@me") as reporter:
 
         def note() -> dict[str, Any]:
-            found: dict[str, Any] = json.loads((tmp_path / NOTE).read_text())
+            found: dict[str, Any] = json.loads((tmp_path / PROGRESS_FILE).read_text())
             return found
 
         assert note()["stage"] == note()["label"] == "g0" and note()["work"] == "key@me"
@@ -102,7 +102,7 @@ def test_the_task_that_was_told_of_last_is_noted(tmp_path: Path, monkeypatch: py
                 assert (note()["label"], note()["done"], note()["total"]) == ("inner", 3, None)
             outer.advance()
             assert (note()["label"], note()["done"]) == ("G0", 21)
-    assert not (tmp_path / NOTE).exists()
+    assert not (tmp_path / PROGRESS_FILE).exists()
 
 
 def test_a_note_that_cannot_be_written_stops_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,6 +120,6 @@ def test_a_note_is_no_sign_of_a_checkpoint(bench: Bench) -> None:
     process = start(bench, f"square.hold={hold}")
     wait_for(bench, "held")
     files = {file.name for file in (bench.store / "work").rglob("*") if file.is_file()}
-    assert NOTE not in files and "state.txt" in files
+    assert PROGRESS_FILE not in files and "state.txt" in files
     hold.unlink()
     assert process.wait(60) == 0

@@ -12,7 +12,7 @@ from cleargs.errors import ConfigError
 from cleargs.pipeline.config import check_document, load_config, merge, parse_override
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.run_file import RUN_FILE
-from cleargs.pipeline.session import asked_run
+from cleargs.pipeline.session import resolve_run
 from cleargs.pipeline.settings import settings_of
 
 OLD = (Path(__file__).with_name("old_run.toml")).read_text()
@@ -35,7 +35,7 @@ def test_old_run_takes_new_settings(tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
     (tmp_path / RUN_FILE).write_text(OLD)
     overrides = ["g0.quality=high", "g0.lr_means=1e-4"]
-    run = asked_run(installed(), tmp_path / "capture", tmp_path, overrides=overrides, say=lambda line: None)
+    run = resolve_run(installed(), tmp_path / "capture", tmp_path, overrides=overrides, say=lambda line: None)
     assert run.config == load_config(installed(), "smoke", overrides)
 
 

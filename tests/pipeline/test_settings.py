@@ -21,9 +21,9 @@ from cleargs.pipeline.config import (
 )
 from cleargs.pipeline.dag import Dag, installed, load_stage
 from cleargs.pipeline.keys import key_config
-from cleargs.pipeline.run_file import Run, read_run_file, write_run_file
+from cleargs.pipeline.run_file import RunSpec, read_run_file, write_run_file
 from cleargs.pipeline.runner import check_same_input
-from cleargs.pipeline.session import asked_run, opened_store
+from cleargs.pipeline.session import opened_store, resolve_run
 from cleargs.pipeline.settings import settings_of
 
 
@@ -120,7 +120,7 @@ def test_every_setting_has_a_meaning_and_a_range() -> None:
 
 def test_run_file_tells_what_each_setting_means(bench: Bench) -> None:
     document = check_document(installed(), {"ingest": {"holdout": "every:8"}})
-    write_run_file(Run(bench.folder, bench.capture, document, bench.store, "cpu"))
+    write_run_file(RunSpec(bench.folder, bench.capture, document, bench.store, "cpu"))
     text = (bench.folder / "run.toml").read_text()
     comment = (
         "# most frames to take, evenly; of a video, the sharpest nearby "
@@ -206,12 +206,12 @@ def test_a_damaged_device_hides_neither_input_nor_store(bench: Bench) -> None:
     shared, recipe = bench.root / "shared", bench.root / "empty.toml"
     recipe.touch()
     (bench.folder / "run.toml").write_text(f'input = "/elsewhere"\nstore = "{shared}"\ndevice = "tpu"\n')
-    run = asked_run(bench.dag, bench.capture, bench.folder, workflow=str(recipe), say=lambda line: None)
+    run = resolve_run(bench.dag, bench.capture, bench.folder, workflow=str(recipe), say=lambda line: None)
     assert run.store == shared
     with pytest.raises(InputError, match="is a run of /elsewhere"), opened_store(shared) as store:
         check_same_input(run, bench.dag, store)
     with pytest.raises(ConfigError, match="damaged"):
-        asked_run(bench.dag, bench.capture, bench.folder, say=lambda line: None)
+        resolve_run(bench.dag, bench.capture, bench.folder, say=lambda line: None)
 
 
 def test_a_pipe_for_a_run_file(bench: Bench) -> None:

@@ -21,8 +21,8 @@ from cleargs.files import write_bytes
 from cleargs.pipeline.config import check_document, merge, parse_override
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
-from cleargs.pipeline.run_file import Run
-from cleargs.pipeline.runner import Outcome, Runner
+from cleargs.pipeline.run_file import RunSpec
+from cleargs.pipeline.runner import Runner, StageOutcome
 from cleargs.pipeline.stage import Estimate, Stage, StageContext, StageResult
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
@@ -242,12 +242,12 @@ class Bench:
         self.journal.unlink(missing_ok=True)
         return lines
 
-    def settings(self, overrides: Sequence[str] = (), seed: int = 0, store: Path | None = None) -> Run:
+    def settings(self, overrides: Sequence[str] = (), seed: int = 0, store: Path | None = None) -> RunSpec:
         document = {"seed": seed}
         for text in overrides:
             document = merge(document, parse_override(text))
         config = check_document(self.dag, document)
-        return Run(self.folder, self.capture, config, store or self.store, "cpu")
+        return RunSpec(self.folder, self.capture, config, store or self.store, "cpu")
 
     def run(
         self,
@@ -258,7 +258,7 @@ class Bench:
         seed: int = 0,
         threads: int = 1,
         store: Path | None = None,
-    ) -> list[Outcome]:
+    ) -> list[StageOutcome]:
         settings = self.settings(overrides, seed, store)
         with DigestMemo(settings.store / "digests.sqlite") as memo:
             runner = Runner(self.dag, settings, Store(settings.store, memo), threads, self.remarks)

@@ -11,17 +11,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cleargs.errors import InputError
-from cleargs.render.paths import Array, framed, seen_point, smooth_path, turntable, upright
+from cleargs.render.paths import framed, seen_point, smooth_path, turntable, up_axis
 from cleargs.splat.camera import Camera, look_at
+from cleargs.types import ArrayF64
 
 UP = np.array([0.0, -1.0, 0.0])
 
 
-def camera(pose: Array) -> Camera:
+def camera(pose: ArrayF64) -> Camera:
     return Camera(96, 54, 90.0, 90.0, 47.0, 28.0, pose)
 
 
-def around(target: Array, angles: Array, radius: float = 2.0, height: float = 0.5) -> list[Camera]:
+def around(target: ArrayF64, angles: ArrayF64, radius: float = 2.0, height: float = 0.5) -> list[Camera]:
     """Cameras on a circle about the vertical through ``target``, which they look at."""
     places = [target + np.array([radius * np.cos(a), -height, radius * np.sin(a)]) for a in angles]
     return [camera(look_at(place, target, UP)) for place in places]
@@ -43,23 +44,23 @@ def handheld(seed: int, count: int = 40) -> list[Camera]:
     return cameras
 
 
-def centres(poses: Array) -> Array:
+def centres(poses: ArrayF64) -> ArrayF64:
     return -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
 
 
-def steps(poses: Array) -> Array:
+def steps(poses: ArrayF64) -> ArrayF64:
     """Length of each step as `smooth_path` counts it: distance over the extent, and angle over pi."""
     places, turns = centres(poses), Rotation.from_matrix(poses[:, :3, :3])
     distance = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.linalg.norm(np.ptp(places, axis=0))
     return np.asarray(distance + (turns[1:] * turns[:-1].inv()).magnitude() / np.pi)
 
 
-def bends(places: Array) -> float:
+def bends(places: ArrayF64) -> float:
     """Mean second difference, over the mean step: how much a path trembles."""
     return float(np.abs(np.diff(places, 2, axis=0)).mean() / np.abs(np.diff(places, axis=0)).mean())
 
 
-def as_poses(cameras: Sequence[Camera]) -> Array:
+def as_poses(cameras: Sequence[Camera]) -> ArrayF64:
     return np.stack([each.world_to_camera for each in cameras])
 
 
@@ -147,7 +148,7 @@ def test_opposite_signs_of_a_quaternion_are_one_turn() -> None:
     first=st.floats(0, 6),
     count=st.integers(3, 100),
 )
-def test_a_turntable_looks_at_the_centre(target: Array, first: float, count: int) -> None:
+def test_a_turntable_looks_at_the_centre(target: ArrayF64, first: float, count: int) -> None:
     cameras = around(target, first + 2 * np.pi * np.arange(12) / 12)
     np.testing.assert_allclose(seen_point(cameras), target, atol=1e-6)
     poses = turntable(cameras, count)
@@ -172,10 +173,10 @@ def test_cameras_on_one_side_that_look_down_do_not_tilt_the_table() -> None:
     cameras = around(np.zeros(3), np.linspace(0, np.pi, 12))
     own = -np.mean([each.world_to_camera[1, :3] for each in cameras], axis=0)
     assert np.degrees(np.arccos(own @ UP / np.linalg.norm(own))) > 8
-    assert np.degrees(np.arccos(upright(cameras) @ UP)) < 0.2
+    assert np.degrees(np.arccos(up_axis(cameras) @ UP)) < 0.2
     # The same axis for all: nothing but their own ups to go by.
     same = [look_at(np.array([x, 0.0, 0]), np.array([x, 0.0, 1]), UP) for x in range(4)]
-    np.testing.assert_allclose(upright([camera(pose) for pose in same]), UP, atol=1e-9)
+    np.testing.assert_allclose(up_axis([camera(pose) for pose in same]), UP, atol=1e-9)
 
 
 @pytest.mark.parametrize("first", [0, 5, 11])
@@ -188,7 +189,7 @@ def test_a_turntable_of_cameras_on_one_side_stays_there(begin: float, first: int
     np.testing.assert_allclose(centres(poses)[0], cameras[first].centre, atol=2e-3)
     seen = np.stack([each.centre for each in cameras])
 
-    def beyond(places: Array) -> Array:
+    def beyond(places: ArrayF64) -> ArrayF64:
         """Angles from the middle of what was seen."""
         middle = (seen[0] + seen[-1])[[0, 2]]
         across = middle[0] * places[:, 2] - middle[1] * places[:, 0]

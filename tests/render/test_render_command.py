@@ -250,18 +250,18 @@ def test_what_is_there_stays(run: Path, tmp_path: Path, capsys: pytest.CaptureFi
 def test_nothing_half_made_is_left(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cleargs.render.output import Photographer
+    from cleargs.render.output import ShotRenderer
 
-    whole = Photographer.picture
+    whole = ShotRenderer.picture
     taken: list[Any] = []
 
-    def breaks_off(self: Photographer, shot: Any) -> Any:
+    def breaks_off(self: ShotRenderer, shot: Any) -> Any:
         taken.append(shot)
         if len(taken) == 4:
             raise KeyboardInterrupt
         return whole(self, shot)
 
-    monkeypatch.setattr(Photographer, "picture", breaks_off)
+    monkeypatch.setattr(ShotRenderer, "picture", breaks_off)
     for output in (tmp_path / "film.mp4", tmp_path / "shots" / "%02d.png"):
         taken.clear()
         assert render(run, output, "--fps", "5", "--seconds", "2") == 130

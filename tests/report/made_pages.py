@@ -9,7 +9,7 @@ from report_run import FinishedRun
 
 from cleargs.batch.loop import Batch
 from cleargs.batch.page import write_batch
-from cleargs.batch.sheet import Scene
+from cleargs.batch.sheet import SceneJob
 from cleargs.digest import DigestMemo
 from cleargs.pipeline.store import Store
 from cleargs.report.page import write_report
@@ -26,7 +26,7 @@ def batch_page(root: Path) -> Path:
     FinishedRun(folder / "scenes", "barn")
     (folder / "logs").mkdir()
     (folder / "logs" / "cellar.log").touch()
-    scenes = [Scene(name, root / name, "smoke", (), name) for name in ("attic", "barn", "cellar")]
+    scenes = [SceneJob(name, root / name, "smoke", (), name) for name in ("attic", "barn", "cellar")]
     batch = Batch(attic.dag, folder, scenes, "cpu")
     done, waiting, failed = (batch.result(scene) for scene in scenes)
     results = [

@@ -28,7 +28,7 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.keys import key_config
 from cleargs.pipeline.plan import Planner
-from cleargs.pipeline.run_file import Run, write_run_file
+from cleargs.pipeline.run_file import RunSpec, write_run_file
 from cleargs.pipeline.store import Store
 from cleargs.progress import SilentReporter
 from cleargs.rivr.tables import Selection, latest_accepted, write_repairs, write_selection
@@ -92,7 +92,7 @@ class FinishedRun:
         self.held_out = held_out
         overrides = ["rva.tau_R=0.61", *(["ingest.holdout=every:3"] if held_out else [])]
         config = load_config(self.dag, "smoke", overrides)
-        self.run = Run(self.folder, root / "gone & <away>.mp4", config, self.folder / ".store", "cpu")
+        self.run = RunSpec(self.folder, root / "gone & <away>.mp4", config, self.folder / ".store", "cpu")
         write_run_file(self.run)
         self._ingest()
         self._rva()

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from colmap_model import write_sparse
-from helpers.chromium import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, TIMEOUT_MS
 from report_run import FinishedRun
 
 from cleargs.capture.tables import load_frames
@@ -86,7 +86,7 @@ def test_the_viewer_shows_what_was_exported(
     write_viewer(tmp_path)
     camera = camera_of(load_frames(run.folder / "ingest")[FRAME])
     page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
-    page.set_default_timeout(PATIENCE_MS)
+    page.set_default_timeout(TIMEOUT_MS)
     complaints: list[str] = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto((tmp_path / "page.html").as_uri())

@@ -23,13 +23,13 @@ from cleargs.errors import InputError
 from cleargs.manifest import linked_manifest, write_manifest
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
-from cleargs.pipeline.runner import Outcome
+from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
 from cleargs.report.charts import weight_colour
 from cleargs.report.frames import FrameRow
 from cleargs.report.page import changed_settings, command, json_in_html, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
-from cleargs.report.verdict import Verdict
+from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene
 
 
@@ -135,8 +135,8 @@ def test_a_run_ends_with_its_report(tmp_path: Path) -> None:
     run = FinishedRun(tmp_path)
     manifests = linked_manifests(run.folder, run.dag.names)
 
-    def outcomes(how: Literal["made", "found"]) -> list[Outcome]:
-        return [Outcome(name, how, manifest, run.folder / name) for name, manifest in manifests.items()]
+    def outcomes(how: Literal["made", "found"]) -> list[StageOutcome]:
+        return [StageOutcome(name, how, manifest, run.folder / name) for name, manifest in manifests.items()]
 
     with DigestMemo(tmp_path / "digests.sqlite") as memo:
         planner = run.planner(Store(tmp_path, memo))
@@ -227,7 +227,7 @@ def test_advice_is_only_what_can_help() -> None:
         lost = FrameRow(SimpleNamespace(registered=False))  # type: ignore[arg-type]
         manifests: Any = {"ingest": SimpleNamespace(summary={"frames_available": available}, missing=())}
         rows: Any = [lost] * frames
-        verdict = Verdict(manifests, rows, load_config(installed(), "default", settings))
+        verdict = ReportVerdict(manifests, rows, load_config(installed(), "default", settings))
         return list(next(verdict.warnings()).settings)
 
     assert advice(40, 40) == []  # every frame is used, and compared with every other

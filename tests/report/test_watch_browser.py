@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.chromium import CHROMIUM, NO_CHROMIUM, PATIENCE_MS
+from helpers.chromium import CHROMIUM, NO_CHROMIUM, TIMEOUT_MS
 from report_run import camera, wall
 from watched import reported, serving, working
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_C
 
 def until(page: Any, condition: str) -> None:
     """Asked from outside: the page's own policy lets nothing evaluate text in it."""
-    for _ in range(PATIENCE_MS // 50):
+    for _ in range(TIMEOUT_MS // 50):
         if page.evaluate(condition):
             return
         page.wait_for_timeout(50)
@@ -35,7 +35,7 @@ def test_the_page_follows_the_run(tmp_path: Path, browser: Any, monkeypatch: pyt
     complaints: list[str] = []
     with serving(made) as port:
         page = browser.new_page()
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         with working(made, "g0") as (reporter, checkpoints), reporter.task("<b>G0</b>", total=200) as task:
             page.goto(f"http://127.0.0.1:{port}/")

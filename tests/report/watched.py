@@ -11,7 +11,7 @@ from pathlib import Path
 from report_run import FinishedRun
 
 from cleargs.digest import DigestMemo
-from cleargs.pipeline.live import noted
+from cleargs.pipeline.live import recorded_progress
 from cleargs.pipeline.lock import file_lock
 from cleargs.pipeline.store import Store
 from cleargs.progress import Reporter, SilentReporter
@@ -50,7 +50,7 @@ def working(made: FinishedRun, stage: str) -> Iterator[tuple[Reporter, Path]]:
     try:
         with (
             file_lock(store / "locks" / "key.lock"),
-            noted(SilentReporter(), made.folder, stage, work) as reporter,
+            recorded_progress(SilentReporter(), made.folder, stage, work) as reporter,
         ):
             yield reporter, work / "checkpoints"
     finally:

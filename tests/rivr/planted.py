@@ -13,10 +13,11 @@ from typing import TypeAlias
 import numpy as np
 
 from cleargs.media.exr import from_layer, read_exr
-from cleargs.rivr.candidates import Image, gaussian_blur
+from cleargs.rivr.candidates import gaussian_blur
 from cleargs.rivr.gates import GateConfig, rejection_reason
+from cleargs.types import ImageF32
 
-Fault: TypeAlias = Callable[[Image, np.random.Generator], Image]
+Fault: TypeAlias = Callable[[ImageF32, np.random.Generator], ImageF32]
 
 SIDE = 64
 """Of the block that a local fault strikes, px."""
@@ -40,7 +41,7 @@ def brightened(share: float) -> Fault:
 def in_block(fault: Fault) -> Fault:
     """``fault`` in one block, anywhere."""
 
-    def apply(image: Image, rng: np.random.Generator) -> Image:
+    def apply(image: ImageF32, rng: np.random.Generator) -> ImageF32:
         y, x = (int(rng.integers(length - SIDE + 1)) for length in image.shape[:2])
         block = slice(y, y + SIDE), slice(x, x + SIDE)
         result = image.copy()
@@ -53,7 +54,7 @@ def in_block(fault: Fault) -> Fault:
 def invented(share: float) -> Fault:
     """A quarter of the image blended with another part of it, turned and in other colours."""
 
-    def apply(image: Image, rng: np.random.Generator) -> Image:
+    def apply(image: ImageF32, rng: np.random.Generator) -> ImageF32:
         height, width = (length // 2 for length in image.shape[:2])
         result = image.copy()
         result[:height, :width] *= 1.0 - share
@@ -87,7 +88,7 @@ FAULTS: Mapping[str, Fault] = {
 }
 
 
-def _clip(image: np.ndarray) -> Image:
+def _clip(image: np.ndarray) -> ImageF32:
     return np.clip(image, 0.0, 1.0).astype(np.float32)
 
 

@@ -6,10 +6,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cleargs.rivr.candidates import Image, fuse, gaussian_blur
+from cleargs.rivr.candidates import fuse, gaussian_blur
+from cleargs.types import ImageF32
 
 
-def noise(seed: int) -> Image:
+def noise(seed: int) -> ImageF32:
     return np.random.default_rng(seed).random((24, 31, 3), dtype=np.float32)
 
 

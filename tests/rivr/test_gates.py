@@ -16,18 +16,18 @@ from tiny_capture import Capture, Contrast, Sharpen, tiny_rivr, write_capture
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.media.exr import read_exr
 from cleargs.progress import SilentReporter
-from cleargs.rivr.candidates import Image
 from cleargs.rivr.gates import GateConfig, all_masked, colour_differences, rejection_reason, shifts
-from cleargs.rivr.rounds import recorded_row
+from cleargs.rivr.rounds import read_row
 from cleargs.rivr.tables import read_selection
 from cleargs.stages import rivr
+from cleargs.types import ImageF32
 
 HEIGHT, WIDTH = 180, 320
 LIMITS = GateConfig()
 
 
 @pytest.fixture(scope="module")
-def sharp() -> Image:
+def sharp() -> ImageF32:
     """Small squares and discs of all colours, before a ground that changes from place to place."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0.1, 0.9, (3, 4, 3)).astype(np.float32)
@@ -43,7 +43,7 @@ def sharp() -> Image:
 
 
 @pytest.fixture(scope="module")
-def observed(sharp: Image) -> Image:
+def observed(sharp: ImageF32) -> ImageF32:
     """The scene through 5 px of horizontal motion, with noise."""
     linear = cv2.blur(sharp**2.2, (5, 1))
     noise = np.random.default_rng(1).normal(0.0, 0.01, sharp.shape)
@@ -51,21 +51,21 @@ def observed(sharp: Image) -> Image:
 
 
 @pytest.fixture(scope="module")
-def render(sharp: Image) -> Image:
+def render(sharp: ImageF32) -> ImageF32:
     """The scene as Gaussians show it: soft, and smeared here and there."""
     soft = cv2.GaussianBlur(sharp, (0, 0), 1.5)
     soft[40:60, 100:160] = soft[40:60, 100:160].mean(axis=(0, 1))
     return soft
 
 
-def test_a_perfect_repair_is_admitted(sharp: Image, observed: Image, render: Image) -> None:
+def test_a_perfect_repair_is_admitted(sharp: ImageF32, observed: ImageF32, render: ImageF32) -> None:
     assert rejection_reason(sharp, observed, render, LIMITS) is None
     # No block is nearer to its limit than a quarter.
     assert shifts(sharp, observed, render).max() < 0.15
     assert colour_differences(sharp, observed, render).max() < 0.01
 
 
-def test_either_witness_suffices(sharp: Image, observed: Image, render: Image) -> None:
+def test_either_witness_suffices(sharp: ImageF32, observed: ImageF32, render: ImageF32) -> None:
     """What lies where the raw frame lies may be far from the render, and the other way round."""
     off = np.roll(render, 4, axis=0)
     assert rejection_reason(sharp, observed, off, LIMITS) is None
@@ -74,7 +74,7 @@ def test_either_witness_suffices(sharp: Image, observed: Image, render: Image) -
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 4])
-def test_a_shift_is_measured(pixels: int, sharp: Image) -> None:
+def test_a_shift_is_measured(pixels: int, sharp: ImageF32) -> None:
     soft = cv2.GaussianBlur(sharp, (0, 0), 1.0)
     found = shifts(np.roll(sharp, -pixels, axis=0), soft, soft)
     # The parabola through a peak of this width is good to a fifth of a pixel.
@@ -89,14 +89,14 @@ FOUND = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_gross_faults_are_found(name: str, sharp: Image, observed: Image, render: Image) -> None:
+def test_gross_faults_are_found(name: str, sharp: ImageF32, observed: ImageF32, render: ImageF32) -> None:
     for seed in range(4):
         faulty = FAULTS[name](sharp, np.random.default_rng(seed))
         assert FOUND[name] in (rejection_reason(faulty, observed, render, LIMITS) or "")
 
 
 def test_one_bad_block_shows_but_does_not_condemn_the_rest(
-    sharp: Image, observed: Image, render: Image
+    sharp: ImageF32, observed: ImageF32, render: ImageF32
 ) -> None:
     strict = LIMITS.model_copy(update={"max_share": 0.0})
     for name in ("block shifted 4 px", "block tinted 16%"):
@@ -105,7 +105,7 @@ def test_one_bad_block_shows_but_does_not_condemn_the_rest(
         assert rejection_reason(faulty, observed, render, strict) is not None
 
 
-def test_along_heavy_blur_the_place_is_uncertain(sharp: Image, render: Image) -> None:
+def test_along_heavy_blur_the_place_is_uncertain(sharp: ImageF32, render: ImageF32) -> None:
     """A shift by 2 px along 15 px of motion explains the raw frame as well; across the motion it does not."""
     observed = cv2.blur(sharp, (15, 1))
     assert rejection_reason(np.roll(sharp, 2, axis=1), observed, render, LIMITS) is None
@@ -135,7 +135,7 @@ def test_any_size_is_compared(height: int, width: int) -> None:
     assert not colour_differences(image, image, image).any()
 
 
-def test_blur_keeps_the_mean_light_but_not_the_mean_of_srgb(sharp: Image) -> None:
+def test_blur_keeps_the_mean_light_but_not_the_mean_of_srgb(sharp: ImageF32) -> None:
     """High contrast under blur would look like a change of colour."""
     contrast = np.where(sharp > 0.5, 1.0, 0.0).astype(np.float32)
     blurred = srgb_from_linear(cv2.blur(linear_from_srgb(contrast), (15, 1)))
@@ -144,7 +144,7 @@ def test_blur_keeps_the_mean_light_but_not_the_mean_of_srgb(sharp: Image) -> Non
     assert abs(float(contrast.mean() - blurred.mean())) > LIMITS.max_colour
 
 
-def test_limits_and_switch(sharp: Image, observed: Image) -> None:
+def test_limits_and_switch(sharp: ImageF32, observed: ImageF32) -> None:
     moved = np.roll(sharp, -4, axis=0)
     assert rejection_reason(moved, observed, observed, LIMITS) is not None
     assert rejection_reason(moved, observed, observed, GateConfig(max_share=1.0)) is None
@@ -157,7 +157,7 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
     """An expert that returns negatives; a scorer that looks for contrast would take them."""
 
     class Negative(Sharpen):
-        def restore(self, image: Image, **options: Any) -> Image:
+        def restore(self, image: ImageF32, **options: Any) -> ImageF32:
             return np.float32(1.0) - super().restore(image, **options)
 
     monkeypatch.setattr("cleargs.models.expert.load_expert", lambda spec, device: Negative())
@@ -175,7 +175,7 @@ def test_refused_repairs_stay_on_disk_and_the_render_is_taken(
         rows = read_selection(context.out / "selection.parquet")
         assert all(row.accepted for row in rows)
         assert all("restored" in read_exr(context.out / row.exr).layers for row in rows)
-        assert [recorded_row(context.out, row.exr) for row in rows] == rows
+        assert [read_row(context.out, row.exr) for row in rows] == rows
         chosen[share], reasons[share] = {row.chosen for row in rows}, {row.reason for row in rows}
     assert "render" not in chosen[1.0]
     assert chosen[0.1] == {"render"}

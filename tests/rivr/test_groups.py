@@ -161,7 +161,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         ("cleargs.splat.trainer.Trainer.step", 4),  # inside the second group's distillation
         ("cleargs.splat.trainer.Trainer.step", 11),  # inside the third's, after its checkpoint
         ("cleargs.rivr.distillation.write_ply", 1),  # at the end of the second's, before its last file
-        ("cleargs.rivr.distillation.superseded", 3),  # between two groups of round 2
+        ("cleargs.rivr.distillation.drop_state", 3),  # between two groups of round 2
         ("cleargs.rivr.distillation._copy", 1),  # while publishing
     ],
 )

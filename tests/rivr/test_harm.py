@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cleargs.rivr.harm import Fidelity, HarmConfig, Verdict, judge_harm
+from cleargs.rivr.harm import Fidelity, HarmConfig, HarmVerdict, judge_harm
 
 
-def verdict(psnr: float, score: float) -> Verdict:
+def verdict(psnr: float, score: float) -> HarmVerdict:
     before, after = Fidelity(25.0, 65.0), Fidelity(25.0 + psnr, 65.0 + score)
     return judge_harm([3, 9], before, after, HarmConfig(psnr_margin=0.5, score_margin=1.0))
 
@@ -26,8 +26,8 @@ def test_either_figure_can_reject() -> None:
 
 
 def test_a_verdict_has_the_figures_that_decided() -> None:
-    assert verdict(-0.25, 1.0) == Verdict([3, 9], 25.0, 24.75, 65.0, 66.0, harm=None)
+    assert verdict(-0.25, 1.0) == HarmVerdict([3, 9], 25.0, 24.75, 65.0, 66.0, harm=None)
 
 
 def test_without_held_back_frames_there_is_no_harm() -> None:
-    assert judge_harm([], None, None, HarmConfig()) == Verdict([], None, None, None, None, harm=None)
+    assert judge_harm([], None, None, HarmConfig()) == HarmVerdict([], None, None, None, None, harm=None)

@@ -13,8 +13,8 @@ from cleargs.rivr.candidates import (
     CANDIDATES,
     CandidateName,
     choose,
-    hardly_changes,
     hide_masked,
+    is_negligible_change,
     unbeaten,
 )
 
@@ -81,9 +81,9 @@ def test_a_repair_that_changes_little_beside_what_is_unexplained() -> None:
     """Powers of 0.1^2 and 1: a tenth of the change that would count; 0.5^2 is a quarter."""
     observed = np.zeros((8, 8, 3), np.float32)
     render = observed + np.float32(1.0)
-    assert hardly_changes(observed, observed + np.float32(0.1), render)
-    assert not hardly_changes(observed, observed + np.float32(0.5), render)
-    assert not hardly_changes(observed, observed, observed)  # nothing to go by
+    assert is_negligible_change(observed, observed + np.float32(0.1), render)
+    assert not is_negligible_change(observed, observed + np.float32(0.5), render)
+    assert not is_negligible_change(observed, observed, observed)  # nothing to go by
 
 
 def test_masked_pixels_are_the_observation_in_every_candidate() -> None:

@@ -45,7 +45,7 @@ from cleargs.rivr.tables import (
     write_selection,
 )
 from cleargs.splat.config import FormationConfig
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 from cleargs.stages import consolidate, rivr
 
 HELD_BACK = 3
@@ -215,7 +215,8 @@ def test_a_frame_that_formation_explains_goes_on_teaching_by_itself(
     capture.use_good_scene()
     blurred = 2
     views = [
-        View(k, orbit(k), 1.0 if ROLES[k] == "strong" else 0.5, "real", lambda: (None, None)) for k in TARGETS
+        TrainingView(k, orbit(k), 1.0 if ROLES[k] == "strong" else 0.5, "real", lambda: (None, None))
+        for k in TARGETS
     ]
     motion = FrameMotion(blur=np.array([0, 0, 0, 0, 6.0, 0]), median_depth=2.0)
     known = {blurred: FrameFormation(blurred, motion, "blur", 0.001, 0.01, 6.0, reach_px=3.0)}

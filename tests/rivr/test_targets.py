@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from cleargs.rivr.targets import Appraisal, Supervision, held_back_frames
+from cleargs.rivr.targets import FrameAssessment, Supervision, select_holdout
 
 
-def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[Appraisal]:
+def appraised(roles: list[str], stand_in: set[int] | None = None) -> list[FrameAssessment]:
     """One frame a role, with ids 10, 11, ..."""
     return [
-        Appraisal(
+        FrameAssessment(
             10 + k, R=0.5, B=0.5, role=role, reliable=role == "strong", stand_in=10 + k in (stand_in or set())
         )
         for k, role in enumerate(roles)
@@ -40,14 +40,14 @@ def test_degraded_leaves_the_strong_ones_out() -> None:
 @pytest.mark.parametrize(("strong", "expected"), [(1, 1), (7, 1), (8, 1), (16, 2), (23, 2), (24, 3)])
 def test_an_eighth_of_the_strong_frames_is_held_back(strong: int, expected: int) -> None:
     frames = appraised(["strong"] * strong + ["suppressed"] * 5)
-    held = held_back_frames(frames)
+    held = select_holdout(frames)
     assert len(set(held)) == expected
     assert all(frame_id < 10 + strong for frame_id in held)
     assert held == sorted(held)
 
 
 def test_held_back_frames_are_spread_over_the_strong_ones() -> None:
-    assert held_back_frames(appraised(["strong"] * 16)) == [14, 22]
+    assert select_holdout(appraised(["strong"] * 16)) == [14, 22]
 
 
 def test_the_sharpest_of_each_part_is_held_back() -> None:
@@ -56,10 +56,10 @@ def test_the_sharpest_of_each_part_is_held_back() -> None:
     frames[2] = replace(frames[2], R=0.9)
     frames[9] = replace(frames[9], R=0.6)
     frames[14] = replace(frames[14], B=0.1)
-    assert held_back_frames(frames) == [12, 24]
+    assert select_holdout(frames) == [12, 24]
 
 
 def test_the_stand_in_set_replaces_missing_strong_frames() -> None:
-    assert held_back_frames(appraised(["suppressed"] * 5, stand_in={12})) == [12]
-    assert held_back_frames(appraised(["strong", "suppressed"], stand_in={11})) == [10]
-    assert held_back_frames(appraised(["suppressed"])) == []
+    assert select_holdout(appraised(["suppressed"] * 5, stand_in={12})) == [12]
+    assert select_holdout(appraised(["strong", "suppressed"], stand_in={11})) == [10]
+    assert select_holdout(appraised(["suppressed"])) == []

@@ -110,7 +110,7 @@ class Capture:
             externals={},
             out=out,
             checkpoints=checkpoints,
-            kept=checkpoints / "kept",
+            cache=checkpoints / "kept",
             seed=0,
             device="cpu",
             threads=threads,
@@ -160,9 +160,9 @@ def write_capture(root: Path) -> None:
     mask[:, :20] = 0
     write_mask(prepared(root / "ingest" / "masks") / f"{MASKED_FRAME:06d}.png", mask)
     write_table(root / "ingest" / "frames.parquet", pa.Table.from_pylist(rows, FRAMES), FRAMES)
-    appraisals = [rva_row(k) for k in range(len(ROLES))]
+    assessments = [rva_row(k) for k in range(len(ROLES))]
     write_table(
-        prepared(root / "rva") / "frames.parquet", pa.Table.from_pylist(appraisals, RVA_FRAMES), RVA_FRAMES
+        prepared(root / "rva") / "frames.parquet", pa.Table.from_pylist(assessments, RVA_FRAMES), RVA_FRAMES
     )
     g0 = prepared(root / "g0")
     noise = np.random.default_rng(1).normal(0, 0.2, truth.log_scales.shape)

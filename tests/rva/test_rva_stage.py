@@ -98,7 +98,7 @@ def run(ingest_dir: Path, out: Path, config: RvaConfig, threads: int = 1) -> dic
         externals={},
         out=out,
         checkpoints=out,
-        kept=out / "kept",
+        cache=out / "kept",
         seed=0,
         device="cpu",
         threads=threads,
@@ -134,13 +134,15 @@ def test_equal_bytes_for_any_number_of_threads(ingest_dir: Path, tmp_path: Path)
 
 def test_a_broken_image_is_named(ingest_dir: Path, tmp_path: Path) -> None:
     from cleargs.errors import StoreError
-    from cleargs.rva.evaluator import View
+    from cleargs.rva.evaluator import EvaluatedFrame
     from cleargs.rva.evaluators import make_evaluator
 
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no image")
     with pytest.raises(StoreError, match=r"broken\.png"):
-        make_evaluator(RvaConfig()).evaluate([View(0, broken)], threads=1, reporter=SilentReporter())
+        make_evaluator(RvaConfig()).evaluate(
+            [EvaluatedFrame(0, broken)], threads=1, reporter=SilentReporter()
+        )
 
 
 @pytest.mark.parametrize(

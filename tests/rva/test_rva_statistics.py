@@ -12,7 +12,7 @@ import pytest
 from cleargs.progress import SilentReporter
 from cleargs.rva import statistics
 from cleargs.rva.allocation import appearance_scores
-from cleargs.rva.evaluator import View
+from cleargs.rva.evaluator import EvaluatedFrame
 from cleargs.rva.measures import (
     Luminance,
     blocking,
@@ -214,7 +214,7 @@ def test_added_frames_are_the_only_ones_measured(
     for k, length in enumerate([1, 9, 5]):
         path = tmp_path / f"{k}.png"
         cv2.imwrite(str(path), photograph(moved(scene, length)))
-        views.append(View(k, path))
+        views.append(EvaluatedFrame(k, path))
     measured: list[Luminance] = []
 
     def counting(luminance: Luminance) -> npt.NDArray[np.float64]:
@@ -224,7 +224,7 @@ def test_added_frames_are_the_only_ones_measured(
     monkeypatch.setattr(statistics, "measure", counting)
     kept = tmp_path / "kept"
 
-    def evaluate(views: list[View]) -> npt.NDArray[np.float64]:
+    def evaluate(views: list[EvaluatedFrame]) -> npt.NDArray[np.float64]:
         return StatisticsEvaluator(kept).evaluate(views, threads=1, reporter=SilentReporter())
 
     evaluate(views[:2])
@@ -238,7 +238,7 @@ def test_added_frames_are_the_only_ones_measured(
     measured.clear()
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.full(SIZE, 255, dtype=np.uint8))
-    evaluate([View(0, views[0].image, mask), *views[1:]])
+    evaluate([EvaluatedFrame(0, views[0].image, mask), *views[1:]])
     assert len(measured) == 1
     for file in kept.iterdir():
         file.write_text(file.read_text()[:40])
@@ -248,7 +248,7 @@ def test_added_frames_are_the_only_ones_measured(
 def test_equal_frames_are_kept_by_threads_at_once(scene: Linear, tmp_path: Path) -> None:
     path = tmp_path / "still.png"
     cv2.imwrite(str(path), photograph(scene))
-    views = [View(k, path) for k in range(16)]
+    views = [EvaluatedFrame(k, path) for k in range(16)]
     cues = StatisticsEvaluator(tmp_path / "kept").evaluate(views, threads=8, reporter=SilentReporter())
     assert (cues == cues[0]).all()
 
@@ -258,7 +258,7 @@ def test_threads_do_not_change_the_cues(scene: Linear, tmp_path: Path) -> None:
     for k, length in enumerate([1, 9, 1, 5, 3, 14]):
         path = tmp_path / f"{k}.png"
         cv2.imwrite(str(path), photograph(moved(scene, length)))
-        views.append(View(k, path))
+        views.append(EvaluatedFrame(k, path))
     one, four = (StatisticsEvaluator().evaluate(views, threads=n, reporter=SilentReporter()) for n in (1, 4))
     np.testing.assert_array_equal(one, four)
     assert one.shape == (6, 11)

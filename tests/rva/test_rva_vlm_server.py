@@ -58,7 +58,7 @@ class Bench:
             externals={},
             out=self.root / "out",
             checkpoints=self.root / "checkpoints",
-            kept=self.root / "kept",
+            cache=self.root / "kept",
             seed=7,
             device="cpu",
             threads=1,
@@ -222,7 +222,7 @@ def test_a_frame_without_a_valid_reply_is_marked_and_tried_again_later(bench: Be
         assert {rows[k][name] for name in scores} == {None}
         assert (rows[k]["role"], rows[k]["weight"], rows[k]["reliable"]) == ("suppressed", 0.0, False)
     assert cues_of(rows[3]) == true_cues(3)
-    supervision = load_supervision(bench.root / "ingest", bench.root / "out", held_back=0.125)
+    supervision = load_supervision(bench.root / "ingest", bench.root / "out", holdout_share=0.125)
     assert sorted(supervision.views) == [0, 1, 3, 5], "what continues with --allow-partial leaves them out"
     assert "frame 2" in bench.remarks.warnings[0] and "defocus lies outside" in bench.remarks.warnings[0]
     assert "frame 4" in bench.remarks.warnings[1] and "500" in bench.remarks.warnings[1]

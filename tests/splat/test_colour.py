@@ -19,12 +19,12 @@ from cleargs.formation.exposure import (
     write_exposure,
 )
 from cleargs.splat.initialise import SparsePoints
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 WALL = 0.2
 
 
-def wall(gains: list[float]) -> tuple[list[View], SparsePoints]:
+def wall(gains: list[float]) -> tuple[list[TrainingView], SparsePoints]:
     """Views of one textured wall, each with its gain, and the points on the wall at the colours of gain 1."""
     rng = np.random.default_rng(0)
     texture = rng.uniform(60, 180, (HEIGHT, WIDTH, 3))
@@ -35,7 +35,7 @@ def wall(gains: list[float]) -> tuple[list[View], SparsePoints]:
     y = (rows + 0.5 - eye.cy) / eye.fy * depth
     xyz = np.stack([x, y, np.full(200, WALL)], axis=1)  # the camera stands at z = -1
     views = [
-        View(index, eye, 1.0, "real", keep(np.rint(texture * gain).astype(np.uint8)))
+        TrainingView(index, eye, 1.0, "real", keep(np.rint(texture * gain).astype(np.uint8)))
         for index, gain in enumerate(gains)
     ]
     everything = np.arange(200)

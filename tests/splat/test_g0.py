@@ -110,7 +110,7 @@ def context(capture: Path, work: Path, config: G0Config = CONFIG, threads: int =
         externals={},
         out=work / "out",
         checkpoints=work / "checkpoints",
-        kept=work / "kept",
+        cache=work / "kept",
         seed=3,
         device="cpu",
         threads=threads,

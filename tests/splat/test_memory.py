@@ -67,7 +67,7 @@ def test_pairs_that_do_not_fit_are_refused_before_they_are_allocated(monkeypatch
     gaussians = make_gaussians(camera, 200)
     buffers = rasteriser.Buffers(torch.device("cpu"))
     monkeypatch.setattr(rasteriser, "Buffers", lambda device: buffers)
-    monkeypatch.setattr(rasteriser, "UNASKED", 0)
+    monkeypatch.setattr(rasteriser, "UNCHECKED_BYTES", 0)
     monkeypatch.setattr(rasteriser, "available_memory", lambda device: 1000)
     engine = rasteriser_for()
     with pytest.raises(StageError, match=r"pairs at 64x48, more than fit: they need another .* GB"):

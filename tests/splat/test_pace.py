@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cleargs.splat import pace
-from cleargs.splat.pace import REFERENCE_MS, machine_pace, remembered_pace
+from cleargs.splat.pace import REFERENCE_MS, cached_pace, machine_pace
 
 Results = list[float | None]
 
@@ -25,14 +25,14 @@ def nobody(text: str) -> None: ...
 
 
 def test_nothing_is_measured_unless_somebody_is_told(results: Results) -> None:
-    assert machine_pace() == 1.0 and remembered_pace() is None
+    assert machine_pace() == 1.0 and cached_pace() is None
 
 
 def test_it_is_measured_once(results: Results) -> None:
     said: list[str] = []
     results.append(1.5 * REFERENCE_MS)
     assert machine_pace(said.append) == 1.5 and len(said) == 1
-    assert machine_pace(said.append) == machine_pace() == remembered_pace() == 1.5
+    assert machine_pace(said.append) == machine_pace() == cached_pace() == 1.5
     assert len(said) == 1, "a second measurement would have found nothing to give"
 
 
@@ -51,7 +51,7 @@ def test_another_machine_is_measured_anew(
             other.setattr(pace, "PROBE", pace.PROBE + 1)
         assert machine_pace() == 1.0
         assert machine_pace(nobody) == 2.0
-    assert remembered_pace() == 1.0, "both are kept"
+    assert cached_pace() == 1.0, "both are kept"
 
 
 @pytest.mark.parametrize(
@@ -67,8 +67,8 @@ def test_a_damaged_note_is_no_note(results: Results, content: str) -> None:
     results += [REFERENCE_MS, 3.0 * REFERENCE_MS]
     machine_pace(nobody)
     pace._note().write_text(content)
-    assert remembered_pace() is None and machine_pace() == 1.0
-    assert machine_pace(nobody) == remembered_pace() == 3.0
+    assert cached_pace() is None and machine_pace() == 1.0
+    assert machine_pace(nobody) == cached_pace() == 3.0
 
 
 def test_what_cannot_be_measured_is_taken_for_the_reference(results: Results) -> None:

@@ -73,7 +73,7 @@ def project(gaussians, camera, antialias=False):
         np.empty(n, np.float32),
     )
     arrays = [tensor.numpy() for tensor in gaussians.tensors().values()]
-    view = projection.View(*view_numbers(camera))
+    view = projection.ProjectionView(*view_numbers(camera))
     projection.project(tuple(arrays), 16, view, antialias, camera.width, camera.height, splats, tiles, radii)
     return splats, tiles, radii
 

@@ -19,10 +19,10 @@ from helpers.splat_toy import HEIGHT, WIDTH, gaussians, images, keep, refuse, st
 from cleargs.errors import InputError, StageError, StoreError
 from cleargs.formation.capture import CaptureFormation
 from cleargs.formation.exposure import Exposure, centred
-from cleargs.formation.photograph import Fit, evaluate_views, photograph, pooled_unseen
+from cleargs.formation.observed import Fit, evaluate_views, pooled_unseen, render_observed
 from cleargs.media.image import read_rgb, to_uint8
 from cleargs.progress import PREVIEW, SilentReporter
-from cleargs.splat.backend import Meter, set_threads
+from cleargs.splat.backend import LossAccumulator, set_threads
 from cleargs.splat.config import FormationConfig, TrainConfig
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
@@ -31,7 +31,7 @@ from cleargs.splat.state import load_state, read_moments, save_state
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.trainer import Trained, Trainer
 from cleargs.splat.types import Moments
-from cleargs.splat.views import ImageCache, View, unseen_pixels
+from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
 CONFIG = TrainConfig(
     steps=40,
@@ -62,7 +62,7 @@ def pictures() -> list[np.ndarray]:
 
 
 def run(pictures_or_views: Any, folder: Path, config: TrainConfig = CONFIG, **options: Any) -> Trained:
-    made = pictures_or_views if isinstance(pictures_or_views[0], View) else views(pictures_or_views)
+    made = pictures_or_views if isinstance(pictures_or_views[0], TrainingView) else views(pictures_or_views)
     folder.mkdir(exist_ok=True)
     arguments = {"scene": start(sh_degree=1), "seed": (7,), "reporter": SilentReporter()} | options
     scene, reporter, round = arguments.pop("scene"), arguments.pop("reporter"), arguments.pop("round", 0)
@@ -146,11 +146,11 @@ def test_weights_of_one_change_no_bit(
 ) -> None:
     weighted = run(views(pictures, weights=[1.0] * 6), tmp_path / "a")
 
-    def without_weight(meter: Meter, *images: Any, weight: float, **options: Any) -> None:
-        add(meter, *images, weight=1.0, **options)
+    def without_weight(losses: LossAccumulator, *images: Any, weight: float, **options: Any) -> None:
+        add(losses, *images, weight=1.0, **options)
 
-    add = Meter.add
-    monkeypatch.setattr(Meter, "add", without_weight)
+    add = LossAccumulator.add
+    monkeypatch.setattr(LossAccumulator, "add", without_weight)
     assert_same(weighted, run(pictures, tmp_path / "b"))
     for row in weighted.rows.to_pylist():
         unweighted = (1.0 - CONFIG.ssim_lambda) * row["l1"] + CONFIG.ssim_lambda * (1.0 - row["ssim"])
@@ -533,5 +533,5 @@ def test_exposure_is_learned_and_centred(pictures: list[np.ndarray], tmp_path: P
     grey = [float((exposure.of(frame) @ [0.5, 0.5, 0.5, 1.0]).mean()) for frame in range(6)]
     # The truth is a ratio of 0.8 between the halves; half of the way is asserted, noise would be near 1.
     assert np.mean(grey[3:]) / np.mean(grey[:3]) < 0.9
-    bright, dark = (photograph(trained.scene, views(darker)[i], exposure) for i in (0, 3))
+    bright, dark = (render_observed(trained.scene, views(darker)[i], exposure) for i in (0, 3))
     assert bright.mean() > dark.mean()

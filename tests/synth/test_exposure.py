@@ -11,7 +11,7 @@ from cleargs.media.colour import linear_from_srgb
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.render import render
 from cleargs.splat.scene import Scene
-from cleargs.synth.image_motion import INSTANTS, ROW_STEP, FrameMotion, duration_for, follow
+from cleargs.synth.image_motion import INSTANTS, ROW_STEP, SimulatedMotion, duration_for, follow
 from cleargs.synth.optics import MIN_SAMPLES, Aperture, Lens, Shutter, World, disc, phone_lens, still
 from cleargs.synth.path import HandheldPath, frame_times
 from cleargs.synth.raycast import room_setting
@@ -21,7 +21,7 @@ EXPOSURE, READOUT = 0.06, 0.05
 
 
 @pytest.fixture(scope="module")
-def motion() -> FrameMotion:
+def motion() -> SimulatedMotion:
     """A fast frame of a walk."""
     setting = room_setting(16, WIDTH, HEIGHT, 0)
     path = HandheldPath(setting.course, 16, 0)
@@ -33,7 +33,7 @@ def motion() -> FrameMotion:
 
 
 @pytest.fixture(scope="module", params=["room", "scene"])
-def world(request: pytest.FixtureRequest, motion: FrameMotion) -> World:
+def world(request: pytest.FixtureRequest, motion: SimulatedMotion) -> World:
     """The room, or 200 splats where the frame sees surfaces."""
     if request.param == "room":
         return room_setting(16, WIDTH, HEIGHT, 0).world
@@ -54,7 +54,7 @@ def world(request: pytest.FixtureRequest, motion: FrameMotion) -> World:
     )
 
 
-def test_the_shutter_samples_the_path_about_the_middle(motion: FrameMotion) -> None:
+def test_the_shutter_samples_the_path_about_the_middle(motion: SimulatedMotion) -> None:
     shutter = motion.shutter(EXPOSURE, 0.0)
     assert shutter.samples >= max(MIN_SAMPLES, motion.blur(EXPOSURE))
     times = motion.time + EXPOSURE * ((np.arange(shutter.samples) + 0.5) / shutter.samples - 0.5)
@@ -63,7 +63,7 @@ def test_the_shutter_samples_the_path_about_the_middle(motion: FrameMotion) -> N
     assert (shutter.index == shutter.index[:, :1]).all()
 
 
-def test_the_blur_length_is_that_of_the_tracked_points(motion: FrameMotion) -> None:
+def test_the_blur_length_is_that_of_the_tracked_points(motion: SimulatedMotion) -> None:
     times = motion.time + EXPOSURE * np.linspace(-0.5, 0.5, INSTANTS)
     total, lens = 0.0, motion.lens
     for point in motion.points:
@@ -77,7 +77,9 @@ def test_the_blur_length_is_that_of_the_tracked_points(motion: FrameMotion) -> N
     assert motion.blur(exposure) == pytest.approx(2.5, abs=1e-3)
 
 
-def test_an_exposure_is_the_mean_of_its_instants_in_linear_light(world: World, motion: FrameMotion) -> None:
+def test_an_exposure_is_the_mean_of_its_instants_in_linear_light(
+    world: World, motion: SimulatedMotion
+) -> None:
     shutter, lens = motion.shutter(EXPOSURE, 0.0), motion.lens
     image = world.render(shutter, lens)
     assert image.min() > 0 and 0.05 < image.mean() < 0.9
@@ -100,7 +102,7 @@ def test_an_exposure_is_the_mean_of_its_instants_in_linear_light(world: World, m
     assert np.abs(image - instant).mean() > 0.01
 
 
-def test_every_row_is_that_of_a_global_shutter_at_its_pose(world: World, motion: FrameMotion) -> None:
+def test_every_row_is_that_of_a_global_shutter_at_its_pose(world: World, motion: SimulatedMotion) -> None:
     shutter, lens = motion.shutter(0.0, READOUT), motion.lens
     image = world.render(shutter, lens)
     for row in (0, HEIGHT // 3, HEIGHT - 1):
@@ -110,7 +112,7 @@ def test_every_row_is_that_of_a_global_shutter_at_its_pose(world: World, motion:
     assert np.abs(image - middle)[[0, -1]].mean() > 0.01
 
 
-def test_rows_see_their_own_pose_to_an_eighth_of_a_pixel(motion: FrameMotion) -> None:
+def test_rows_see_their_own_pose_to_an_eighth_of_a_pixel(motion: SimulatedMotion) -> None:
     shutter = motion.shutter(0.0, READOUT)
     times = motion.time + READOUT * ((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5)
     exact, used = motion.path.poses(times), shutter.poses[shutter.index[0]]
@@ -120,7 +122,7 @@ def test_rows_see_their_own_pose_to_an_eighth_of_a_pixel(motion: FrameMotion) ->
     assert (turn * motion.lens.fx).max() < 1.5 * ROW_STEP / 2
 
 
-def test_blur_and_rolling_shutter_together_integrate_each_row_about_its_time(motion: FrameMotion) -> None:
+def test_blur_and_rolling_shutter_together_integrate_each_row_about_its_time(motion: SimulatedMotion) -> None:
     shutter = motion.shutter(EXPOSURE, READOUT)
     blurred, rolling = motion.shutter(EXPOSURE, 0.0), motion.shutter(0.0, READOUT)
     assert shutter.samples == blurred.samples
@@ -132,7 +134,7 @@ def test_blur_and_rolling_shutter_together_integrate_each_row_about_its_time(mot
     assert len(np.unique(shutter.index[:, 0])) == shutter.samples
 
 
-def test_what_is_in_focus_stays_sharp_and_the_rest_blurs(world: World, motion: FrameMotion) -> None:
+def test_what_is_in_focus_stays_sharp_and_the_rest_blurs(world: World, motion: SimulatedMotion) -> None:
     lens: Lens = phone_lens(WIDTH, HEIGHT)
     pose = motion.path.poses(np.array([motion.time]))[0]
     depth = world.depth(pose, lens)

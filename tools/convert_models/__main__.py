@@ -15,8 +15,8 @@ import click
 
 from cleargs.errors import CleargsError, InputError
 from cleargs.models.install import place, read_checked
-from cleargs.models.registry import Model, file_digest, find_model, model_dir
-from cleargs.untrusted import read_bytes
+from cleargs.models.registry import RegistryEntry, file_digest, find_model, model_dir
+from cleargs.safe_io import read_bytes
 from tools.convert_models import restorer, scorers
 from tools.convert_models.torch_export import require
 
@@ -65,7 +65,7 @@ def main(target: str, checkpoint: Path, accept_licence: bool, directory: Path | 
 
 
 def install_checkpoint(
-    model: Model, directory: Path, checkpoint: Path, *, licence_accepted: bool = False
+    model: RegistryEntry, directory: Path, checkpoint: Path, *, licence_accepted: bool = False
 ) -> list[Path]:
     """Convert the checkpoint into ``directory``; returns the files written.
 

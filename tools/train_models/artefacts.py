@@ -17,30 +17,23 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
-from tools.train_models.degrade import (
-    Degradation,
-    Image,
-    Kernel,
-    degrade,
-    disc_kernel,
-    jpeg,
-    motion_kernel,
-)
+from cleargs.types import ImageF32
+from tools.train_models.degrade import Degradation, Kernel, degrade, disc_kernel, jpeg, motion_kernel
 
 
-def unsharp(image: Image, sigma: float, amount: float) -> Image:
+def unsharp(image: ImageF32, sigma: float, amount: float) -> ImageF32:
     """Unsharp masking: I + amount (I - blur_sigma(I)). Over-sharpening from an amount of about 1."""
     return _clip(image + amount * (image - _gaussian(image, sigma)))
 
 
-def gibbs(image: Image, cutoff: float, gain: float) -> Image:
+def gibbs(image: ImageF32, cutoff: float, gain: float) -> ImageF32:
     """Ringing: an abrupt low pass at ``cutoff`` cycles a pixel (0..0.5) with ``gain`` >= 1 just below it."""
     f = _frequency(image.shape[0] * 2, image.shape[1] * 2)
     response = np.where(f <= cutoff, 1.0 + (gain - 1.0) * (f / cutoff) ** 2, 0.0)
     return _filter(image, response)
 
 
-def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
+def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
     """Wiener deconvolution by ``kernel`` (odd, at most the size of the image) on the encoded values.
 
     With a wrong kernel or too small a ``noise_to_signal`` it rings, as over-eager restorers do.
@@ -52,7 +45,7 @@ def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
     return _filter(image, np.conj(transfer) / (np.abs(transfer) ** 2 + noise_to_signal))
 
 
-def ghost(image: Image, dx: float, dy: float, share: float) -> Image:
+def ghost(image: ImageF32, dx: float, dy: float, share: float) -> ImageF32:
     """A second exposure, shifted by (dx, dy) pixels, that takes ``share`` of the (linear) light."""
     linear = linear_from_srgb(image)
     shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
@@ -61,7 +54,7 @@ def ghost(image: Image, dx: float, dy: float, share: float) -> Image:
     return srgb_from_linear(_clip((1.0 - share) * linear + share * moved))
 
 
-def splat(image: Image, rng: np.random.Generator, spacing: float, stretch: float) -> Image:
+def splat(image: ImageF32, rng: np.random.Generator, spacing: float, stretch: float) -> ImageF32:
     """The image as about one anisotropic Gaussian per ``spacing``² pixels can show it.
 
     Gaussians lie along local edges, elongated by up to ``stretch``, with random footprints; a second pass
@@ -88,7 +81,7 @@ def splat(image: Image, rng: np.random.Generator, spacing: float, stretch: float
     return _clip(out)
 
 
-def floaters(image: Image, rng: np.random.Generator, count: int, needle_share: float) -> Image:
+def floaters(image: ImageF32, rng: np.random.Generator, count: int, needle_share: float) -> ImageF32:
     """``count`` stray Gaussians in front of the image: soft blobs, and needles for a share of them."""
     out = image.copy()
     height, width = image.shape[:2]
@@ -109,18 +102,18 @@ def floaters(image: Image, rng: np.random.Generator, count: int, needle_share: f
     return out
 
 
-def fuse(render: Image, restored: Image, sigma: float) -> Image:
+def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
     """RIVR's third candidate: clip(R + D - blur_sigma(D))."""
     return _clip(render + restored - _gaussian(restored, sigma))
 
 
-def motion(image: Image, rng: np.random.Generator) -> Image:
+def motion(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Motion blur of 1.5-20 px with sensor noise of at most 1/255."""
     kernel = motion_kernel(rng, _log_uniform(rng, 1.5, 20.0))
     return degrade(image, Degradation(kernel, noise=rng.uniform(0.0, 1.0 / 255.0)), rng)
 
 
-def defocus(image: Image, rng: np.random.Generator) -> Image:
+def defocus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Disc or Gaussian-like blur with radius 0.6-6 px."""
     radius = _log_uniform(rng, 0.6, 6.0)
     if rng.random() < 0.5:
@@ -128,7 +121,7 @@ def defocus(image: Image, rng: np.random.Generator) -> Image:
     return degrade(image, Degradation(disc_kernel(radius)), rng)
 
 
-def noise(image: Image, rng: np.random.Generator) -> Image:
+def noise(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """White or slightly smoothed (demosaicked) noise of 2-32/255."""
     level = _log_uniform(rng, 2.0, 32.0) / 255.0
     grain = rng.standard_normal(image.shape, np.float32)
@@ -138,7 +131,7 @@ def noise(image: Image, rng: np.random.Generator) -> Image:
     return _clip(image + np.float32(level) * grain)
 
 
-def ringing(image: Image, rng: np.random.Generator) -> Image:
+def ringing(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Gibbs ringing, or deconvolution of a sharp image by a kernel that never blurred it."""
     if rng.random() < 0.5:
         return gibbs(image, rng.uniform(0.12, 0.4), rng.uniform(1.0, 2.5))
@@ -150,12 +143,12 @@ def ringing(image: Image, rng: np.random.Generator) -> Image:
     return wiener(image, kernel, _log_uniform(rng, 0.01, 0.3))
 
 
-def oversharp(image: Image, rng: np.random.Generator) -> Image:
+def oversharp(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Unsharp masking from barely visible to harsh."""
     return unsharp(image, _log_uniform(rng, 0.6, 4.0), _log_uniform(rng, 0.4, 5.0))
 
 
-def ghosting(image: Image, rng: np.random.Generator) -> Image:
+def ghosting(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """One or two faint shifted copies, 2-16 px away."""
     for _ in range(int(rng.integers(1, 3))):
         angle, distance = rng.uniform(0, 2 * np.pi), _log_uniform(rng, 2.0, 16.0)
@@ -163,12 +156,12 @@ def ghosting(image: Image, rng: np.random.Generator) -> Image:
     return image
 
 
-def blocks(image: Image, rng: np.random.Generator) -> Image:
+def blocks(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """JPEG at quality 8-80."""
     return jpeg(image, int(_log_uniform(rng, 8.0, 80.0)))
 
 
-def rendered(image: Image, rng: np.random.Generator) -> Image:
+def rendered(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
     front.
     """
@@ -181,13 +174,13 @@ def rendered(image: Image, rng: np.random.Generator) -> Image:
     return out
 
 
-def stray(image: Image, rng: np.random.Generator) -> Image:
+def stray(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Floaters and needles over a sharp or slightly soft image."""
     soft = _gaussian(image, rng.uniform(0.2, 1.2)) if rng.random() < 0.6 else image
     return floaters(soft, rng, int(_log_uniform(rng, 2.0, 40.0)), rng.random())
 
 
-def restored(image: Image, rng: np.random.Generator) -> Image:
+def restored(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """A blurred image after restoration: too timid, about right, or ringing."""
     length = rng.uniform(2.0, 14.0)
     kernel = motion_kernel(rng, length) if rng.random() < 0.7 else disc_kernel(length / 4)
@@ -197,7 +190,7 @@ def restored(image: Image, rng: np.random.Generator) -> Image:
     return wiener(blurred, kernel, _log_uniform(rng, 0.001, 0.1))
 
 
-def fused(image: Image, rng: np.random.Generator) -> Image:
+def fused(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """A splat-like render with the detail of a restored frame added; now and then slightly misaligned."""
     detail = restored(image, rng)
     if rng.random() < 0.4:
@@ -208,7 +201,7 @@ def fused(image: Image, rng: np.random.Generator) -> Image:
     return fuse(rendered(image, rng), detail, _log_uniform(rng, 0.8, 5.0))
 
 
-def mixed(image: Image, rng: np.random.Generator) -> Image:
+def mixed(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Two or three of the other artefacts in a random order."""
     names = rng.choice(len(_SIMPLE), size=int(rng.integers(2, 4)), replace=False)
     for index in names:
@@ -216,11 +209,11 @@ def mixed(image: Image, rng: np.random.Generator) -> Image:
     return image
 
 
-_SIMPLE: tuple[Callable[[Image, np.random.Generator], Image], ...] = (
+_SIMPLE: tuple[Callable[[ImageF32, np.random.Generator], ImageF32], ...] = (
     motion, defocus, noise, ringing, oversharp, ghosting, blocks, rendered, stray,
 )  # fmt: skip
 
-KINDS: dict[str, Callable[[Image, np.random.Generator], Image]] = {
+KINDS: dict[str, Callable[[ImageF32, np.random.Generator], ImageF32]] = {
     "clean": lambda image, rng: image,
     "motion": motion,
     "defocus": defocus,
@@ -237,7 +230,7 @@ KINDS: dict[str, Callable[[Image, np.random.Generator], Image]] = {
 }
 
 
-def _clip(image: NDArray[np.floating]) -> Image:
+def _clip(image: NDArray[np.floating]) -> ImageF32:
     return np.asarray(np.clip(image, 0.0, 1.0), np.float32)
 
 
@@ -245,7 +238,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _gaussian(image: Image, sigma: float) -> Image:
+def _gaussian(image: ImageF32, sigma: float) -> ImageF32:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), np.float32)
 
 
@@ -253,7 +246,7 @@ def _frequency(height: int, width: int) -> NDArray[np.float64]:
     return np.asarray(np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]), np.float64)
 
 
-def _filter(image: Image, response: NDArray[np.floating] | NDArray[np.complexfloating]) -> Image:
+def _filter(image: ImageF32, response: NDArray[np.floating] | NDArray[np.complexfloating]) -> ImageF32:
     """Filter in the Fourier domain of the mirrored image, so that its borders do not wrap around."""
     height, width = image.shape[:2]
     mirrored = np.pad(image, ((0, height), (0, width), (0, 0)), mode="symmetric")
@@ -261,13 +254,13 @@ def _filter(image: Image, response: NDArray[np.floating] | NDArray[np.complexflo
     return _clip(np.fft.irfft2(spectrum, s=mirrored.shape[:2], axes=(0, 1))[:height, :width])
 
 
-def _structure(image: Image) -> tuple[Image, Image, Image]:
+def _structure(image: ImageF32) -> tuple[ImageF32, ImageF32, ImageF32]:
     luma = image.mean(axis=2)
     gx, gy = cv2.Sobel(luma, cv2.CV_32F, 1, 0), cv2.Sobel(luma, cv2.CV_32F, 0, 1)
     return gx * gx, gx * gy, gy * gy
 
 
-def patches(height: int, width: int, rng: np.random.Generator) -> Image:
+def patches(height: int, width: int, rng: np.random.Generator) -> ImageF32:
     """A smooth random mask with values from 0 to 1. [H, W, 1]"""
     coarse = rng.standard_normal((height, width), np.float32)
     field = _gaussian(coarse, rng.uniform(8.0, 32.0))
@@ -298,10 +291,10 @@ def _footprint(
 @njit(cache=True)  # numpy takes half a second a patch
 def _splat_mean(
     gaussians: NDArray[np.float64],  # [N, 5] as in _footprint
-    colours: Image,  # [N, 3]
+    colours: ImageF32,  # [N, 3]
     height: int,
     width: int,
-) -> Image:
+) -> ImageF32:
     """The weighted mean of the colours of all Gaussians at every pixel. [H, W, 3]"""
     total = np.zeros((height, width, 3), np.float64)
     weights = np.full((height, width, 1), 1e-6)
@@ -317,5 +310,5 @@ def _splat_mean(
                 weights[row, column, 0] += weight
                 for channel in range(3):
                     total[row, column, channel] += weight * colours[n, channel]
-    mean: Image = (total / weights).astype(np.float32)
+    mean: ImageF32 = (total / weights).astype(np.float32)
     return mean

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.types import ImageF32
 
-Image: TypeAlias = NDArray[np.float32]
 Kernel: TypeAlias = NDArray[np.float32]
 
 IDENTITY: Kernel = np.ones((1, 1), np.float32)
@@ -92,7 +92,7 @@ def disc_kernel(radius: float) -> Kernel:
     return np.asarray(kernel / total, np.float32) if total > 0.0 else IDENTITY
 
 
-def convolve(linear: Image, kernel: Kernel) -> Image:
+def convolve(linear: ImageF32, kernel: Kernel) -> ImageF32:
     """Convolution of an image [H, W, 3] with a kernel, borders reflected."""
     if kernel.shape == (1, 1):
         return linear
@@ -100,7 +100,7 @@ def convolve(linear: Image, kernel: Kernel) -> Image:
     return np.asarray(cv2.filter2D(linear, -1, flipped, borderType=cv2.BORDER_REFLECT_101), np.float32)
 
 
-def jpeg(image: Image, quality: int) -> Image:
+def jpeg(image: ImageF32, quality: int) -> ImageF32:
     """The image after one JPEG round trip at the given quality (4:2:0 chroma, OpenCV's default)."""
     code = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     _, data = cv2.imencode(".jpg", code[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -129,7 +129,7 @@ class Degradation:
     jpeg_quality: int | None = None
 
 
-def degrade(image: Image, degradation: Degradation, rng: np.random.Generator) -> Image:
+def degrade(image: ImageF32, degradation: Degradation, rng: np.random.Generator) -> ImageF32:
     """The degraded image: [H, W, 3] float32 sRGB in [0, 1] in and out. ``rng`` draws the noise."""
     if degradation.kernel.shape == (1, 1) and degradation.second is None:
         out = image
@@ -150,7 +150,7 @@ def degrade(image: Image, degradation: Degradation, rng: np.random.Generator) ->
     return np.ascontiguousarray(out, np.float32)
 
 
-def _ramp(height: int, width: int, direction: float) -> Image:
+def _ramp(height: int, width: int, direction: float) -> ImageF32:
     """Values from 0 to 1 across the image along a direction: [H, W]."""
     y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
     x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
@@ -159,7 +159,7 @@ def _ramp(height: int, width: int, direction: float) -> Image:
     return np.asarray(0.5 + 0.5 * along / reach, np.float32)
 
 
-def shallow_focus(image: Image, rng: np.random.Generator) -> Image:
+def shallow_focus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """The photograph as a lens of little depth of field takes it: [H, W, 3] float32 sRGB in [0, 1].
 
     Out of focus everywhere or, half of the time, through a random mask whose edges range from a slow change

@@ -27,14 +27,8 @@ from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.expert import load_expert
-from tools.train_models.degrade import (
-    IDENTITY,
-    Degradation,
-    Image,
-    Kernel,
-    degrade,
-    motion_kernel,
-)
+from cleargs.types import ImageF32
+from tools.train_models.degrade import IDENTITY, Degradation, Kernel, degrade, motion_kernel
 from tools.train_models.train_restorer import list_photos, read_photo, source_of
 
 BANDS = ((7, 11), (12, 16), (17, 21))
@@ -52,19 +46,19 @@ _PURPOSE_MEAN_KERNEL = 4
 
 
 @dataclass(frozen=True)
-class Case:
+class RestorationCase:
     """A photograph (sRGB [H, W, 3] in [0, 1]), its blurred version and the kernel that made it."""
 
     source: str
-    sharp: Image
-    blurred: Image
+    sharp: ImageF32
+    blurred: ImageF32
     kernel: Kernel
 
 
-Method = Callable[[Case], Image]
+Method = Callable[[RestorationCase], ImageF32]
 
 
-def psnr(image: Image, reference: Image) -> float:
+def psnr(image: ImageF32, reference: ImageF32) -> float:
     """PSNR in dB of sRGB values in [0, 1] without a border of `MARGIN` pixels; infinite for equal images."""
     inner = slice(MARGIN, -MARGIN)
     error = image[inner, inner].astype(np.float64) - reference[inner, inner]
@@ -72,13 +66,13 @@ def psnr(image: Image, reference: Image) -> float:
     return float("inf") if mean == 0.0 else -10.0 * np.log10(mean)
 
 
-def unsharp_mask(image: Image, sigma: float, amount: float) -> Image:
+def unsharp_mask(image: ImageF32, sigma: float, amount: float) -> ImageF32:
     """Sharpening by ``amount`` times the difference to a Gaussian blur of ``sigma`` pixels."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     return np.clip(image + np.float32(amount) * (image - smooth), 0.0, 1.0)
 
 
-def wiener(image: Image, kernel: Kernel, noise_to_signal: float) -> Image:
+def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
     """Wiener deconvolution in linear light: spectrum times conj(K) / (|K|² + noise_to_signal)."""
     reach = 2 * kernel.shape[0]
     padded = np.pad(linear_from_srgb(image), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
@@ -110,7 +104,7 @@ def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:
 
 def make_cases(
     photos: Sequence[Path], band: tuple[int, int] | None, *, crop: int | None, seed: int, purpose: int
-) -> list[Case]:
+) -> list[RestorationCase]:
     """One case a photograph: blurred by a motion of the band, with noise, or sharp without a band.
 
     crop: side of the central square to take; None for the whole photograph.
@@ -124,20 +118,20 @@ def make_cases(
             photo = photo[y : y + crop, x : x + crop]
         sharp = photo.astype(np.float32) / np.float32(255.0)
         if band is None:
-            cases.append(Case(source_of(path), sharp, sharp, IDENTITY))
+            cases.append(RestorationCase(source_of(path), sharp, sharp, IDENTITY))
             continue
         kernel = motion_kernel(rng, rng.uniform(*band))
         blurred = degrade(sharp, Degradation(kernel=kernel, noise=rng.uniform(0.0, 1.0) / 255.0), rng)
-        cases.append(Case(source_of(path), sharp, blurred, kernel))
+        cases.append(RestorationCase(source_of(path), sharp, blurred, kernel))
     return cases
 
 
-def score(method: Method, cases: Iterable[Case]) -> NDArray[np.float64]:
+def score(method: Method, cases: Iterable[RestorationCase]) -> NDArray[np.float64]:
     """PSNR in dB of the method's result on each case."""
     return np.array([psnr(method(case), case.sharp) for case in cases])
 
 
-def _best(candidates: Sequence[Method], cases: Sequence[Case]) -> Method:
+def _best(candidates: Sequence[Method], cases: Sequence[RestorationCase]) -> Method:
     return max(candidates, key=lambda method: float(score(method, cases).mean()))
 
 
@@ -186,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def expert_method(spec: str) -> Method:
         expert = load_expert(spec)
 
-        def restore(case: Case) -> Image:
+        def restore(case: RestorationCase) -> ImageF32:
             started = time.perf_counter()
             restored = expert.restore(case.blurred, threads=options.threads)
             spent[spec] = spent.get(spec, 0.0) + time.perf_counter() - started
@@ -195,7 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return restore
 
     experts = {spec: expert_method(spec) for spec in options.expert or ["embedded"]}
-    columns: list[tuple[str, list[Case], dict[str, Method]]] = []
+    columns: list[tuple[str, list[RestorationCase], dict[str, Method]]] = []
     for band in BANDS:
         cases = make_cases(held_out, band, crop=options.crop, seed=options.seed, purpose=_PURPOSE_EVALUATION)
         columns.append((f"{band[0]}-{band[1]} px", cases, tuned_baselines(training, band, options.seed)))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cleargs.models.lpips import load_lpips
 from cleargs.models.scorer import CLARITY, NATURALNESS, load_scorer
+from cleargs.types import ImageF32
 from tools.train_models import artefacts
-from tools.train_models.degrade import Degradation, Image, degrade, motion_kernel
+from tools.train_models.degrade import Degradation, degrade, motion_kernel
 from tools.train_models.train_restorer import list_photos, read_photo
 from tools.train_models.train_scorer import spearman
 
@@ -26,7 +27,7 @@ _VISIBLE = 0.02  # LPIPS from which on a fault is called visible
 _REDUCTION = 0.67
 
 
-def candidates(image: Image, rng: np.random.Generator) -> dict[str, Image]:
+def candidates(image: ImageF32, rng: np.random.Generator) -> dict[str, ImageF32]:
     """What RIVR chooses among, and the clean image: blur of 4-12 px, sharpening, deconvolution, splats."""
     kernel = motion_kernel(rng, rng.uniform(4.0, 12.0))
     blurred = degrade(image, Degradation(kernel, noise=0.5 / 255.0), rng)
@@ -79,7 +80,7 @@ def choices(scores: NDArray[np.float64], names: list[str]) -> list[str]:
     return lines
 
 
-def _photo(path: Path) -> Image:
+def _photo(path: Path) -> ImageF32:
     image = cv2.resize(read_photo(path), None, fx=_REDUCTION, fy=_REDUCTION, interpolation=cv2.INTER_AREA)
     return image.astype(np.float32) / np.float32(255.0)
 

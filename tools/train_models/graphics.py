@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.train_models.degrade import Image
+from cleargs.types import ImageF32
 
 _OVERSAMPLING = 2  # drawn larger and reduced, so that edges are as soft as a camera's
 
 
-def graphic(side: int, rng: np.random.Generator) -> Image:
+def graphic(side: int, rng: np.random.Generator) -> ImageF32:
     """A square of ``side`` pixels: a gradient behind up to 40 shapes, half of the time with faint texture."""
     n = side * _OVERSAMPLING
     out = _shade(n, rng)

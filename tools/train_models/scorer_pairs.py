@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
 from cleargs.models.lpips import LpipsNetwork
+from cleargs.types import ImageF32
 from tools.train_models.artefacts import KINDS, patches
-from tools.train_models.degrade import Image, convolve, disc_kernel
+from tools.train_models.degrade import convolve, disc_kernel
 from tools.train_models.graphics import graphic
 
 PATCH = 128  # side of a training patch, and of the tiles that the scorer averages over
@@ -92,7 +93,7 @@ def _choose(rng: np.random.Generator, versions: int | None) -> NDArray[np.int64]
     return np.concatenate([[0], 1 + drawn])
 
 
-def _content(photo: Path, rng: np.random.Generator) -> Image:
+def _content(photo: Path, rng: np.random.Generator) -> ImageF32:
     """A patch with margin, from the photo reduced by a random factor (which also hides its JPEG grid)."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     assert image is not None, photo
@@ -109,7 +110,7 @@ def _content(photo: Path, rng: np.random.Generator) -> Image:
     return np.ascontiguousarray(patch[..., ::-1].astype(np.float32) / np.float32(255.0))
 
 
-def _vary(image: Image, rng: np.random.Generator) -> Image:
+def _vary(image: ImageF32, rng: np.random.Generator) -> ImageF32:
     """Another photo of the same thing: other colours, exposure and contrast, often with a part out of focus.
 
     A handful of photo sources look alike in these respects; without this the network learns the look of a
@@ -130,7 +131,7 @@ def _vary(image: Image, rng: np.random.Generator) -> Image:
     return np.asarray(out, np.float32)
 
 
-def _inner(image: Image) -> Image:
+def _inner(image: ImageF32) -> ImageF32:
     return image[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
 
 

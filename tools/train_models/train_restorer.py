@@ -24,12 +24,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from cleargs.errors import InputError
-from tools.train_models.degrade import Image, degrade, handheld_degradation, shallow_focus
+from cleargs.types import ImageF32, ImageU8
+from tools.train_models.degrade import degrade, handheld_degradation, shallow_focus
 from tools.train_models.graphics import graphic
 from tools.train_models.muon import Muon
 
@@ -141,7 +141,7 @@ def list_photos(folder: Path, *, held_out: bool) -> list[Path]:
     return photos
 
 
-def read_photo(path: Path) -> NDArray[np.uint8]:
+def read_photo(path: Path) -> ImageU8:
     """A photograph as [H, W, 3] RGB uint8. Raises InputError when it cannot be decoded."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
@@ -164,11 +164,11 @@ def list_renders(folder: Path) -> list[Path]:
 class Contents:
     """What the patches are cut from: photographs and renders, each [H, W, 3] RGB uint8."""
 
-    photos: Sequence[NDArray[np.uint8]]
-    renders: Sequence[NDArray[np.uint8]]
+    photos: Sequence[ImageU8]
+    renders: Sequence[ImageU8]
 
 
-def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Image]:
+def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[ImageF32, ImageF32]:
     """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each. Defocus is part of the truth
     (`SHALLOW_SHARE`).
     """
@@ -187,7 +187,7 @@ def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[Image, Im
     return blurred[inner, inner], sharp[inner, inner]
 
 
-def _cut(images: Sequence[NDArray[np.uint8]], scale: float, rng: np.random.Generator) -> Image:
+def _cut(images: Sequence[ImageU8], scale: float, rng: np.random.Generator) -> ImageF32:
     """A patch with its margin, shrunk by ``scale``, turned and mirrored; of two random places that with more
     detail.
     """

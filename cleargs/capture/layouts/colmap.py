@@ -14,12 +14,12 @@ from cleargs.capture.folders import (
     folders_to_search,
     frame_key,
     image_files,
-    lies_below,
+    is_inside,
     mask_externals,
     require_most,
 )
 from cleargs.errors import InputError
-from cleargs.untrusted import FAULTS, open_regular, read_text
+from cleargs.safe_io import FAULTS, open_regular, read_text
 
 
 def detect(source: Path, *, poses: bool) -> bool:
@@ -45,7 +45,7 @@ def open_capture(source: Path, config: CaptureConfig) -> Capture:
     models, folder = _models(source), _largest(source)
     model = read_model(folder)
     posed = {image.name: image for image in model.images.values()}
-    outside = [name for name in posed if not lies_below(name)]
+    outside = [name for name in posed if not is_inside(name)]
     if outside:
         raise InputError(
             f"the COLMAP model lists images outside images/ or hidden in it, such as {outside[0]}",

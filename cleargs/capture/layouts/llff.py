@@ -12,7 +12,7 @@ from cleargs.capture.capture import Capture, External, SourceFrame
 from cleargs.capture.config import CaptureConfig
 from cleargs.capture.folders import chosen, image_files, image_folders, mask_externals
 from cleargs.errors import InputError
-from cleargs.untrusted import FAULTS, cause, open_regular
+from cleargs.safe_io import FAULTS, cause, open_regular
 
 if TYPE_CHECKING:
     import numpy as np

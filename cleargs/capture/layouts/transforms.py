@@ -20,10 +20,10 @@ from cleargs.capture.folders import (
     require_most,
 )
 from cleargs.errors import InputError
-from cleargs.untrusted import FAULTS, cause, read_json
+from cleargs.safe_io import FAULTS, cause, read_json
 
 if TYPE_CHECKING:
-    from cleargs.capture.cameras import Camera, Pose
+    from cleargs.capture.cameras import Intrinsics, Pose
 
 _FISHEYE = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"})
@@ -127,9 +127,9 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
     return frames
 
 
-def _camera(values: Mapping[str, Any], image: Path) -> Camera:
+def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
     """The camera of a frame: its own entries over those of the whole file."""
-    from cleargs.capture.cameras import Camera
+    from cleargs.capture.cameras import Intrinsics
 
     try:
         if "w" in values and "h" in values:
@@ -152,17 +152,17 @@ def _camera(values: Mapping[str, Any], image: Path) -> Camera:
         ) from error
     model = str(values.get("camera_model", "OPENCV")).upper()
     if model in _FISHEYE or values.get("is_fisheye"):
-        return Camera("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
+        return Intrinsics("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
     if model not in _PERSPECTIVE or k4:
         what = f"camera_model {model}" if model not in _PERSPECTIVE else "a perspective camera with k4"
         raise InputError(
             f"{what} is not supported", hint="undistort the images first, or use OPENCV or OPENCV_FISHEYE"
         )
     if k3:
-        return Camera("FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))
+        return Intrinsics("FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))
     if k1 or k2 or p1 or p2:
-        return Camera("OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2))
-    return Camera("PINHOLE", width, height, (fx, fy, cx, cy))
+        return Intrinsics("OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2))
+    return Intrinsics("PINHOLE", width, height, (fx, fy, cx, cy))
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int) -> float | None:

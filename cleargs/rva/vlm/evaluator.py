@@ -15,23 +15,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cleargs.errors import StageError
 from cleargs.progress import Reporter
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.evaluator import ItemCache, View, load_view, reduced
+from cleargs.rva.evaluator import EvaluatedFrame, ItemCache, load_view, reduced
 from cleargs.rva.tables import CUE_COLUMNS
+from cleargs.types import ArrayF64, ImageU8
 
 _MASKED = 127  # mid-grey, as the prompt calls it
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class EncodedImage:
     """What is shown to a model."""
 
-    rgb: npt.NDArray[np.uint8]  # [h, w, 3] sRGB
+    rgb: ImageU8  # [h, w, 3] sRGB
     masked: bool
     """Whether parts are painted grey."""
 
@@ -68,7 +67,7 @@ class QwenEvaluator(ABC):
         """Raise InputError where the model cannot be had."""
 
     @abstractmethod
-    def score(self, picture: Picture) -> Floats:  # [11] in [0, 1], as tables.CUE_COLUMNS
+    def score(self, picture: EncodedImage) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
         """The cues of one picture.
 
         Raises UnscoredError where this picture gets none, StageError or InputError where no picture would.
@@ -77,7 +76,7 @@ class QwenEvaluator(ABC):
     def stop(self) -> None:  # noqa: B027
         """Give up what is under way as soon as possible, where a subclass can; called from another thread."""
 
-    def evaluate(self, views: Sequence[View], *, threads: int, reporter: Reporter) -> Floats:
+    def evaluate(self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter) -> ArrayF64:
         """See `Evaluator.evaluate`. ``threads`` is not used: the work is done elsewhere or has its own.
 
         Raises StageError when no frame at all could be scored.
@@ -108,9 +107,9 @@ class QwenEvaluator(ABC):
             reporter.warn(f"frame {views[row].frame_id} was not scored: {faults[row]}")
         return cues
 
-    def _score(self, view: View) -> Floats:
+    def _score(self, view: EvaluatedFrame) -> ArrayF64:
         rgb, mask = load_view(view)
         if mask is not None:
             rgb = np.where(mask[..., None] > 0, rgb, np.uint8(_MASKED))
         masked = mask is not None and not mask.all()
-        return self.score(Picture(reduced(rgb, self._config.image_size), masked))
+        return self.score(EncodedImage(reduced(rgb, self._config.image_size), masked))

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from cleargs.errors import InputError
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig
-from cleargs.rva.vlm.evaluator import Picture, QwenEvaluator, UnscoredError
+from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
+from cleargs.types import ArrayF64
 
 _IMAGE = "<|image_pad|>"
 _ARCHITECTURES = ("qwen3_vl", "qwen3_vl_moe")
@@ -51,13 +51,13 @@ class QwenFolder(QwenEvaluator):
             raise InputError(
                 f"qwen3-vl in process cannot be loaded: {error.msg}", hint="pip install 'cleargs[vlm]'"
             ) from error
-        with self._fault_told():
+        with self._load_errors():
             kind = AutoConfig.from_pretrained(self._folder, local_files_only=True).model_type
             if kind not in _ARCHITECTURES:
                 raise ValueError(f"it is of the kind {kind}, not one of {', '.join(_ARCHITECTURES)}")
 
     @contextmanager
-    def _fault_told(self) -> Iterator[None]:
+    def _load_errors(self) -> Iterator[None]:
         try:
             yield
         except (OSError, ValueError, KeyError) as error:
@@ -80,7 +80,7 @@ class QwenFolder(QwenEvaluator):
         from transformers.utils.logging import disable_progress_bar
 
         disable_progress_bar()
-        with self._fault_told():
+        with self._load_errors():
             tokenizer = AutoTokenizer.from_pretrained(self._folder, local_files_only=True)
             images = Qwen2VLImageProcessorPil.from_pretrained(self._folder, local_files_only=True)
             model = AutoModelForImageTextToText.from_pretrained(
@@ -94,7 +94,7 @@ class QwenFolder(QwenEvaluator):
         matcher = llguidance.LLMatcher(vocabulary, grammar)
         return model.to(self._device).eval(), tokenizer, images, matcher
 
-    def score(self, picture: Picture) -> Floats:
+    def score(self, picture: EncodedImage) -> ArrayF64:
         """See `QwenEvaluator.score`. Greedy decoding: the same picture gets the same scores."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._config.local_threads)
@@ -107,7 +107,7 @@ class QwenFolder(QwenEvaluator):
         except ReplyError as fault:  # a reply cut off at max_tokens
             raise UnscoredError(f"the reply cannot be used: {fault}") from None
 
-    def _reply(self, picture: Picture) -> str:
+    def _reply(self, picture: EncodedImage) -> str:
         """The reply to the prompt about ``picture``; a valid object unless the model runs out of tokens."""
         model, tokenizer, images, matcher = self._loaded
         seen = images(images=[picture.rgb], return_tensors="pt")

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from cleargs.rva.arrays import Floats
 from cleargs.rva.tables import B_CUES, R_CUES
+from cleargs.types import ArrayF64
 
 CUES = R_CUES + B_CUES
 """Keys of a reply, in the order of `tables.CUE_COLUMNS`."""
@@ -47,7 +47,7 @@ class ReplyError(Exception):
     """What is wrong with a reply, in words that the model can be told. Holds no text of the reply."""
 
 
-def parse_reply(text: str) -> Floats:  # [11] in [0, 1], as tables.CUE_COLUMNS
+def parse_reply(text: str) -> ArrayF64:  # [11] in [0, 1], as tables.CUE_COLUMNS
     """The cues in the one JSON object of ``text``; prose around it is passed over.
 
     Raises ReplyError when there is no such object, when it breaks the schema (a missing, unknown or

@@ -22,10 +22,10 @@ from typing import Any
 import httpx2
 
 from cleargs.errors import InputError, StageError
-from cleargs.rva.arrays import Floats
 from cleargs.rva.config import QwenConfig, check_base_url
-from cleargs.rva.vlm.evaluator import Picture, QwenEvaluator, UnscoredError
+from cleargs.rva.vlm.evaluator import EncodedImage, QwenEvaluator, UnscoredError
 from cleargs.rva.vlm.prompt import ReplyError, parse_reply, prompt_text, reply_schema
+from cleargs.types import ArrayF64
 
 URL_VARIABLE = "CLEARGS_VLM_URL"
 KEY_VARIABLE = "CLEARGS_VLM_API_KEY"
@@ -126,7 +126,7 @@ class QwenServer(QwenEvaluator):
                 hint="name one with --set rva.qwen.model=NAME, or serve the other",
             )
 
-    def score(self, picture: Picture) -> Floats:
+    def score(self, picture: EncodedImage) -> ArrayF64:
         """See `QwenEvaluator.score`. A reply outside the schema is answered with what is wrong with it."""
         if self._gone:
             raise UnscoredError(self._gone)  # this frame need not wait for the same end
@@ -214,7 +214,7 @@ class QwenServer(QwenEvaluator):
     def _refusal(self, answer: httpx2.Response, raw: bytes) -> Exception:
         """What an HTTP status other than 2xx means for us."""
         code = answer.status_code
-        reason = f"the server answered {code}{self._words(raw)}"
+        reason = f"the server answered {code}{self._message_of(raw)}"
         if code in _BUSY:
             return PassingError(reason, after=_retry_after(answer.headers.get("Retry-After", "")))
         where = f"{reason} at {self._url}"
@@ -226,7 +226,7 @@ class QwenServer(QwenEvaluator):
             return StageError(f"{where}: it has moved", hint="set rva.qwen.base_url to its new address")
         return RefusedError(reason)
 
-    def _words(self, raw: bytes) -> str:
+    def _message_of(self, raw: bytes) -> str:
         """The server's explanation in one short line, without the key."""
         text = raw.decode("utf-8", "replace")
         with suppress(ValueError, RecursionError):

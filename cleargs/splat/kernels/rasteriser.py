@@ -20,7 +20,7 @@ from cleargs.splat.kernels.splat_layout import MAX_PAIRS, TILE
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 
-UNASKED = 2**28
+UNCHECKED_BYTES = 2**28
 """Bytes that are taken without asking how many are left, which takes about a millisecond."""
 
 
@@ -94,7 +94,7 @@ class Buffers:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ForwardPass:
     """What the backward pass needs of one forward pass; each back end adds its own."""
 
     gaussians: Gaussians
@@ -117,7 +117,7 @@ class Rasteriser(ABC):
 
     def __init__(self, device: torch.device) -> None:
         self._buffers = Buffers(device)
-        self._frame: Any = None
+        self._state: Any = None
         self.radii: Tensor = torch.empty(0, device=device)
         """[N] px, 0 = not visible; of the last forward pass."""
 
@@ -149,10 +149,10 @@ class Rasteriser(ABC):
                 f"the kernels take float32 parameters, not {gaussians.means.dtype}",
                 hint="convert them, or call render(), which sends float64 to the reference",
             )
-        asked = Frame(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
+        inputs = ForwardPass(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
         with self._launching():
-            self._frame = self._bin(asked, background, depth)
-            return self._blend(self._frame, depth)
+            self._state = self._bin(inputs, background, depth)
+            return self._blend(self._state, depth)
 
     def view(
         self, scene: Scene, camera: Camera, *, depth: bool = False, sh_degree: int | None = None
@@ -177,15 +177,15 @@ class Rasteriser(ABC):
 
         Gaussians that are not visible, and SH coefficients above the degree in use, get exactly 0.
         """
-        if self._frame is None:
+        if self._state is None:
             raise RuntimeError("backward() needs a forward() before it")
-        camera: Camera = self._frame.camera
+        camera: Camera = self._state.camera
         expected = (camera.height, camera.width, 3)
         if tuple(grad_image.shape) != expected:
             raise ValueError(f"grad_image has the shape {tuple(grad_image.shape)}, expected {expected}")
         with self._launching():
             return self._differentiate(
-                self._frame,
+                self._state,
                 grad_image.detach().contiguous(),
                 None if grad_alpha is None else grad_alpha.detach().contiguous(),
                 None if grad_depth is None else grad_depth.detach().contiguous(),
@@ -196,16 +196,16 @@ class Rasteriser(ABC):
         """What surrounds the kernels of a pass."""
 
     @abstractmethod
-    def _bin(self, asked: Frame, background: tuple[float, float, float], depth: bool) -> Frame:
+    def _bin(self, inputs: ForwardPass, background: tuple[float, float, float], depth: bool) -> ForwardPass:
         """Project the Gaussians into splats, and list the splats of each tile from near to far."""
 
     @abstractmethod
-    def _blend(self, frame: Any, depth: bool) -> Render:
+    def _blend(self, state: Any, depth: bool) -> Render:
         """Blend the splats of each pixel."""
 
     @abstractmethod
     def _differentiate(
-        self, frame: Any, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, state: Any, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
         """Gradients of the parameters, from contiguous ones of what was rendered."""
 
@@ -214,7 +214,7 @@ class Rasteriser(ABC):
         missing = pairs * self.pair_bytes - self._buffers.held(self.pair_buffers)
         if pairs > MAX_PAIRS:
             excess = f"more than {MAX_PAIRS:.2e}"
-        elif missing > UNASKED and missing > available_memory(self._buffers.device):
+        elif missing > UNCHECKED_BYTES and missing > available_memory(self._buffers.device):
             excess = f"more than fit: they need another {missing / 1e9:.1f} GB of the device's memory"
         else:
             return

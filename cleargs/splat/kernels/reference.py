@@ -22,7 +22,7 @@ CHUNK = 2_000_000
 """(pixel, Gaussian) products that are held at a time."""
 
 
-class Reference(NamedTuple):
+class ReferenceRender(NamedTuple):
     """A reference view; ``margin`` tells how far each pixel is from a discontinuity."""
 
     image: Tensor  # [H, W, 3]
@@ -166,7 +166,7 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sh_count: int = 16,
     antialias: bool = False,
-) -> Reference:
+) -> ReferenceRender:
     """Render a view of float64 Gaussians; see ``cleargs.splat.render.render`` for the arguments."""
     splats = project(gaussians, camera, sh_count, antialias)
     colour = torch.tensor(background, dtype=torch.float64)
@@ -175,7 +175,9 @@ def render(
         # The products keep the result connected to the parameters, so that backward gives zeros.
         nothing = sum((tensor.sum() * 0.0 for tensor in gaussians.tensors().values()), torch.zeros(()))
         empty = torch.zeros(height, width, dtype=torch.float64) + nothing
-        return Reference(empty[..., None] + colour, empty, empty.clone(), torch.full_like(empty, math.inf))
+        return ReferenceRender(
+            empty[..., None] + colour, empty, empty.clone(), torch.full_like(empty, math.inf)
+        )
 
     rows = max(1, CHUNK // (width * len(splats.depths)))
     xs = torch.arange(width, dtype=torch.float64) + constants.PIXEL_CENTRE
@@ -185,7 +187,7 @@ def render(
         pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), -1).reshape(-1, 2)
         chunks.append(checkpoint(blend, splats, pixels, colour, use_reentrant=False))
     image, alpha, depth, margin = (torch.cat(parts) for parts in zip(*chunks, strict=True))
-    return Reference(
+    return ReferenceRender(
         image.reshape(height, width, 3),
         alpha.reshape(height, width),
         depth.reshape(height, width),

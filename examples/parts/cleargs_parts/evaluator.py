@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cleargs.media.image import read_rgb
 from cleargs.progress import Reporter
-from cleargs.rva.evaluator import View
+from cleargs.rva.evaluator import EvaluatedFrame
 from cleargs.rva.tables import CUE_COLUMNS
 
 
@@ -21,7 +21,7 @@ class ContrastEvaluator:
     def __init__(self, *, seed: int, device: str, cache: Path | None) -> None: ...
 
     def evaluate(
-        self, views: Sequence[View], *, threads: int, reporter: Reporter
+        self, views: Sequence[EvaluatedFrame], *, threads: int, reporter: Reporter
     ) -> NDArray[np.float64]:  # [n, 11] in [0, 1]
         detail = np.array([self._detail(view) for view in views])
         sharp = detail / max(detail.max(initial=0.0), 1e-9)
@@ -31,6 +31,6 @@ class ContrastEvaluator:
         cues[:, CUE_COLUMNS.index("b_motion_blur")] = 1.0 - sharp
         return cues
 
-    def _detail(self, view: View) -> float:
+    def _detail(self, view: EvaluatedFrame) -> float:
         grey = cv2.cvtColor(read_rgb(view.image), cv2.COLOR_RGB2GRAY)
         return float(cv2.Laplacian(grey, cv2.CV_64F).std())

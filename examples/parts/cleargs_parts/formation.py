@@ -11,7 +11,7 @@ from torch import Tensor
 from cleargs.splat.camera import Camera
 from cleargs.splat.formation import Renderer
 from cleargs.splat.types import Render
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 
 class Vignette:
@@ -22,7 +22,7 @@ class Vignette:
 
     def form(
         self,
-        view: View,
+        view: TrainingView,
         factor: float,
         progress: float,
         target: Tensor,

@@ -15,10 +15,11 @@ from cleargs.splat.camera import Camera
 from cleargs.splat.constants import ADAM_BETAS, ADAM_EPSILON
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cpu import elementwise, frame_warp, loss
-from cleargs.splat.kernels.cpu.jit import LAUNCHING, Array, Floats
+from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.cpu.pipeline import CpuRasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS, CURVE_STEPS, MOTION_COLUMNS, DisplacementFields
 from cleargs.splat.types import Moments, Rate
+from cleargs.types import AnyArray, ArrayF32
 
 ADAM_BLOCK = 4096
 """Elements per work item, about."""
@@ -68,12 +69,14 @@ def squared_errors(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[
     return math.fsum(row_sums[:, 0]), math.fsum(row_sums[:, 1])
 
 
-def _read(tensor: Tensor) -> Floats:
-    array: Floats = tensor.detach().contiguous().numpy()
+def _read(tensor: Tensor) -> ArrayF32:
+    array: ArrayF32 = tensor.detach().contiguous().numpy()
     return array
 
 
-def _compared(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Floats, Floats, Array | None]:
+def _compared(
+    image: Tensor, target: Tensor, mask: Tensor | None
+) -> tuple[ArrayF32, ArrayF32, AnyArray | None]:
     return _read(image), _read(target), None if mask is None else _read(mask)
 
 
@@ -244,11 +247,11 @@ def times_slope(light: Tensor, slope: Tensor, channels: int) -> Tensor:
 
 
 def misfit(
-    image: Floats,  # [H, W]
-    observed: Floats,  # [H, W]
-    weight: Floats,  # [H, W]
-    fields: tuple[Floats, Floats, Floats],
-    samples: Floats,  # [K, 3]
+    image: ArrayF32,  # [H, W]
+    observed: ArrayF32,  # [H, W]
+    weight: ArrayF32,  # [H, W]
+    fields: tuple[ArrayF32, ArrayF32, ArrayF32],
+    samples: ArrayF32,  # [K, 3]
     limit: float,
 ) -> float:
     rows = np.empty(len(image))
@@ -258,14 +261,14 @@ def misfit(
 
 
 def normal_equations(
-    stack: Floats,  # [H, W, 3]
-    observed: Floats,  # [H, W]
-    weight: Floats,  # [H, W]
-    basis: Floats,  # [6, 2, H, W]
-    down: Floats,  # [H]
-    offset: Floats,
-    sweep: Floats,
-    times: Floats,  # [K]
+    stack: ArrayF32,  # [H, W, 3]
+    observed: ArrayF32,  # [H, W]
+    weight: ArrayF32,  # [H, W]
+    basis: ArrayF32,  # [6, 2, H, W]
+    down: ArrayF32,  # [H]
+    offset: ArrayF32,
+    sweep: ArrayF32,
+    times: ArrayF32,  # [K]
     outlier: float,
     active: npt.NDArray[np.int64],  # [A]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -314,10 +317,10 @@ def warm_up() -> None:
     add_position_noise(scene, amount=0.0, min_opacity=0.005, seed=(0,))
     apply_affine(image, affine)
     affine_backward(image, affine, image)
-    _photograph()
+    _warm_up_formation()
 
 
-def _photograph() -> None:
+def _warm_up_formation() -> None:
     """What a moving camera makes of an image, and the search for its motion."""
     plane, colours = torch.ones(SIZE, SIZE), torch.zeros(SIZE, SIZE, CHANNELS)
     curve, still = torch.zeros(CURVE_STEPS + 1), torch.ones(MOTION_COLUMNS)

@@ -18,7 +18,8 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
-from cleargs.splat.kernels.cpu.jit import Array, Floats, exact, kernel, serial_kernel
+from cleargs.splat.kernels.cpu.jit import exact, kernel, serial_kernel
+from cleargs.types import AnyArray, ArrayF32
 
 REACH_MARGIN = 2e-3
 """Ellipses are taken larger by this much in log2(alpha); the rasteriser decides pixel by pixel."""
@@ -44,7 +45,7 @@ def tile_range(low: float, high: float, tiles: int) -> tuple[int, int]:
 
 
 @exact
-def tile_rows(splat: Floats, height: int) -> tuple[int, int]:
+def tile_rows(splat: ArrayF32, height: int) -> tuple[int, int]:
     """Rows of tiles that the ellipse alpha >= 1/255 may touch."""
     mean = np.float64(splat[layout.MEAN_Y])
     extent = np.float64(splat[layout.EXTENT_Y]) * 1.001 + 0.001
@@ -52,7 +53,7 @@ def tile_rows(splat: Floats, height: int) -> tuple[int, int]:
 
 
 @exact
-def tile_columns(splat: Floats, row: int, width: int) -> tuple[int, int]:
+def tile_columns(splat: ArrayF32, row: int, width: int) -> tuple[int, int]:
     """Tiles of one row of tiles that the ellipse alpha >= 1/255 touches.
 
     Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so
@@ -76,7 +77,7 @@ def tile_columns(splat: Floats, row: int, width: int) -> tuple[int, int]:
 
 
 @exact
-def count_tiles(splat: Floats, width: int, height: int) -> int:
+def count_tiles(splat: ArrayF32, width: int, height: int) -> int:
     """Number of tiles that a splat touches; must agree with ``list_pairs``."""
     count = 0
     top, bottom = tile_rows(splat, height)
@@ -87,7 +88,7 @@ def count_tiles(splat: Floats, width: int, height: int) -> int:
 
 
 @serial_kernel
-def pair_ranges(tile_counts: Array, pair_offsets: Array) -> int:
+def pair_ranges(tile_counts: AnyArray, pair_offsets: AnyArray) -> int:
     """Prefix sum of the tile counts [N] into Gaussian-major offsets [N + 1]; returns how many are visible."""
     total = 0
     visible = 0
@@ -100,7 +101,7 @@ def pair_ranges(tile_counts: Array, pair_offsets: Array) -> int:
 
 
 @serial_kernel
-def depth_order(splats: Floats, tile_counts: Array, keys: Array, ids: Array) -> int:
+def depth_order(splats: ArrayF32, tile_counts: AnyArray, keys: AnyArray, ids: AnyArray) -> int:
     """Visible Gaussians by ascending depth, ties by index.
 
     Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort.
@@ -138,7 +139,9 @@ def depth_order(splats: Floats, tile_counts: Array, keys: Array, ids: Array) -> 
 
 
 @kernel
-def list_pairs(splats: Floats, pair_offsets: Array, width: int, height: int, pair_tiles: Array) -> None:
+def list_pairs(
+    splats: ArrayF32, pair_offsets: AnyArray, width: int, height: int, pair_tiles: AnyArray
+) -> None:
     """The tile of every pair [P], Gaussian-major, row by row."""
     n = splats.shape[0]
     tiles_x = (width + layout.TILE - 1) // layout.TILE
@@ -157,13 +160,13 @@ def list_pairs(splats: Floats, pair_offsets: Array, width: int, height: int, pai
 
 @kernel
 def sort_pairs_by_tile(
-    order: Array,
-    pair_offsets: Array,
-    pair_tiles: Array,
-    counts: Array,
-    tile_offsets: Array,
-    pair_ids: Array,
-    pair_slots: Array,
+    order: AnyArray,
+    pair_offsets: AnyArray,
+    pair_tiles: AnyArray,
+    counts: AnyArray,
+    tile_offsets: AnyArray,
+    pair_ids: AnyArray,
+    pair_slots: AnyArray,
 ) -> None:
     """Stable counting sort of the pairs, visited in depth order, by tile.
 

@@ -11,8 +11,9 @@ import math
 import numpy as np
 from numba import prange
 
-from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.jit import device, kernel
 from cleargs.splat.kernels.cpu.projection import dot, scaled_axes, unit_quaternion
+from cleargs.types import AnyArray, ArrayF32
 
 ONE = np.float32(1)
 BLOCK = 256
@@ -24,11 +25,11 @@ _UNIT = 2.0**-32
 
 @kernel
 def adam(
-    parameter: Floats,
-    gradient: Floats,
-    first: Floats,
-    second: Floats,
-    rates: Floats,
+    parameter: ArrayF32,
+    gradient: ArrayF32,
+    first: ArrayF32,
+    second: ArrayF32,
+    rates: ArrayF32,
     beta1: np.float32,
     beta2: np.float32,
     epsilon: np.float32,
@@ -54,7 +55,7 @@ def adam(
 
 
 @kernel
-def apply_affine(image: Floats, affine: Floats, output: Floats) -> None:
+def apply_affine(image: ArrayF32, affine: ArrayF32, output: ArrayF32) -> None:
     """output = affine[:, :3] image + affine[:, 3] for every pixel; images [H, W, 3], affine [3, 4]."""
     height, width, _ = image.shape
     for y in prange(height):
@@ -67,7 +68,7 @@ def apply_affine(image: Floats, affine: Floats, output: Floats) -> None:
 
 @kernel
 def affine_backward(
-    image: Floats, affine: Floats, grad_output: Floats, grad_image: Floats, row_sums: Array
+    image: ArrayF32, affine: ArrayF32, grad_output: ArrayF32, grad_image: ArrayF32, row_sums: AnyArray
 ) -> None:
     """grad_image = affine[:, :3]ᵀ grad_output, and each row's share of dL/d(affine) [H, 3, 4] float64."""
     height, width, _ = image.shape
@@ -106,10 +107,10 @@ def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
 
 @kernel
 def add_noise(
-    means: Floats,
-    log_scales: Floats,
-    rotations: Floats,
-    logits: Floats,
+    means: ArrayF32,
+    log_scales: ArrayF32,
+    rotations: ArrayF32,
+    logits: ArrayF32,
     amount: float,
     min_opacity: float,
     cut: float,

@@ -26,7 +26,7 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat.kernels import warp_layout as layout
-from cleargs.splat.kernels.cpu.jit import Array, Floats, inlined, kernel
+from cleargs.splat.kernels.cpu.jit import inlined, kernel
 from cleargs.splat.kernels.cpu.pixel import (
     black,
     black_pair,
@@ -44,6 +44,7 @@ from cleargs.splat.kernels.cpu.pixel import (
 )
 from cleargs.splat.kernels.cpu.simd import store
 from cleargs.splat.kernels.warp_layout import CHANNELS
+from cleargs.types import AnyArray, ArrayF32
 
 BAND = 32
 """Rows of the photograph whose light one work item of the transpose sends back."""
@@ -107,14 +108,14 @@ def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float3
 
 @kernel
 def displacements(
-    depth: Floats,  # [H + 2 margin, W + 2 margin] accumulated
-    alpha: Floats,  # likewise
+    depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
+    alpha: ArrayF32,  # likewise
     margin: int,
-    motion: Floats,  # [25]: see `warp_layout`
-    offset: Floats,  # [2, H, W] written
-    sweep: Floats,  # [2, H, W] written
-    radius: Floats,  # [H, W] written
-    reach: Array,  # [H] float64, written: farthest that a pixel of the row looks up or down
+    motion: ArrayF32,  # [25]: see `warp_layout`
+    offset: ArrayF32,  # [2, H, W] written
+    sweep: ArrayF32,  # [2, H, W] written
+    radius: ArrayF32,  # [H, W] written
+    reach: AnyArray,  # [H] float64, written: farthest that a pixel of the row looks up or down
 ) -> None:
     """The fields of a frame's motion and defocus. Nearness is the median depth over the pixel's own.
 
@@ -153,7 +154,7 @@ def displacements(
 
 
 @kernel
-def apply_curve(image: Floats, curve: Floats, out: Floats, slope: Floats) -> None:
+def apply_curve(image: ArrayF32, curve: ArrayF32, out: ArrayF32, slope: ArrayF32) -> None:
     """The three colours of every pixel through a curve, and the curve's slope there.
 
     Images are [H, W, 3] or [H, W, 4]; ``slope`` is [H, W, 3].
@@ -170,13 +171,13 @@ def apply_curve(image: Floats, curve: Floats, out: Floats, slope: Floats) -> Non
 
 @kernel
 def expose(
-    image: Floats,  # [H + 2 margin, W + 2 margin, 4] linear light
+    image: ArrayF32,  # [H + 2 margin, W + 2 margin, 4] linear light
     margin: int,
-    offset: Floats,
-    sweep: Floats,
-    radius: Floats,
-    samples: Floats,  # [K, 3]
-    out: Floats,  # [H, W, 4] linear light, written
+    offset: ArrayF32,
+    sweep: ArrayF32,
+    radius: ArrayF32,
+    samples: ArrayF32,  # [K, 3]
+    out: ArrayF32,  # [H, W, 4] linear light, written
 ) -> None:
     """What the sensor gathers of a still image."""
     height, width, _ = out.shape
@@ -224,14 +225,14 @@ def expose(
 
 @kernel
 def spread(
-    light: Floats,  # [H, W, 4]
+    light: ArrayF32,  # [H, W, 4]
     margin: int,
     reach: int,
-    offset: Floats,
-    sweep: Floats,
-    radius: Floats,
-    samples: Floats,  # [K, 3]
-    bands: Floats,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
+    offset: ArrayF32,
+    sweep: ArrayF32,
+    radius: ArrayF32,
+    samples: ArrayF32,  # [K, 3]
+    bands: ArrayF32,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
     rows: int,
 ) -> None:
     """The transpose of `expose`, before `gather`: what every pixel saw goes back to where it came from.
@@ -294,7 +295,7 @@ def _add_pair(image: Any, offset: Any, light: Any, share: Any) -> None:
 
 
 @kernel
-def gather(bands: Floats, margin: int, reach: int, out: Floats) -> None:
+def gather(bands: ArrayF32, margin: int, reach: int, out: ArrayF32) -> None:
     """The sum of the bands in their order, [H + 2 margin, W + 2 margin, 4]."""
     height, width, _ = out.shape
     for y in prange(height):
@@ -308,7 +309,7 @@ def gather(bands: Floats, margin: int, reach: int, out: Floats) -> None:
 
 
 @kernel
-def multiply(light: Floats, slope: Floats, out: Floats) -> None:
+def multiply(light: ArrayF32, slope: ArrayF32, out: ArrayF32) -> None:
     """light * slope for three colours: ``slope`` is [H, W, 3], the others have three channels or four."""
     height, width, _ = slope.shape
     padded = out.shape[2] > 3
@@ -322,15 +323,15 @@ def multiply(light: Floats, slope: Floats, out: Floats) -> None:
 
 @kernel
 def misfits(
-    image: Floats,  # [H, W]
-    observed: Floats,  # [H, W]
-    weight: Floats,  # [H, W]
-    offset: Floats,
-    sweep: Floats,
-    radius: Floats,
-    samples: Floats,  # [K, 3]
+    image: ArrayF32,  # [H, W]
+    observed: ArrayF32,  # [H, W]
+    weight: ArrayF32,  # [H, W]
+    offset: ArrayF32,
+    sweep: ArrayF32,
+    radius: ArrayF32,
+    samples: ArrayF32,  # [K, 3]
     limit: float,
-    rows: Array,  # [H] float64, written
+    rows: AnyArray,  # [H] float64, written
 ) -> None:
     """Each row's sum of weight * min(|observed - photographed image|, limit); images without a margin.
 
@@ -368,18 +369,18 @@ def misfits(
 
 @kernel
 def normal_equations(
-    stack: Floats,  # [H, W, 3]: image, its derivatives by x and y
-    observed: Floats,  # [H, W]
-    weight: Floats,  # [H, W]
-    basis: Floats,  # [6, 2, H, W]: flow by each component of a twist
-    down: Floats,  # [H]: -1/2 at the first row of the photograph, 1/2 at its last
-    offset: Floats,
-    sweep: Floats,
-    times: Floats,  # [K]
+    stack: ArrayF32,  # [H, W, 3]: image, its derivatives by x and y
+    observed: ArrayF32,  # [H, W]
+    weight: ArrayF32,  # [H, W]
+    basis: ArrayF32,  # [6, 2, H, W]: flow by each component of a twist
+    down: ArrayF32,  # [H]: -1/2 at the first row of the photograph, 1/2 at its last
+    offset: ArrayF32,
+    sweep: ArrayF32,
+    times: ArrayF32,  # [K]
     outlier: float,
-    active: Array,  # [A] int64: which of the 18 numbers of pose, blur and skew are sought
-    matrices: Array,  # [H, A, A] float64, written (lower triangles)
-    sides: Array,  # [H, A] float64, written
+    active: AnyArray,  # [A] int64: which of the 18 numbers of pose, blur and skew are sought
+    matrices: AnyArray,  # [H, A, A] float64, written (lower triangles)
+    sides: AnyArray,  # [H, A] float64, written
 ) -> None:
     """Each row's share of the Gauss-Newton equations of the twists of pose, blur and skew.
 

@@ -12,14 +12,14 @@ from numba import prange
 
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.harmonics import sh_basis, sh_direction_gradient
-from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.jit import device, kernel
 from cleargs.splat.kernels.cpu.projection import (
     BLOCK,
     DILATION,
     QUATERNION_EPSILON,
     ZERO,
     Parameters,
-    View,
+    ProjectionView,
     camera_position,
     cross,
     dot,
@@ -28,6 +28,7 @@ from cleargs.splat.kernels.cpu.projection import (
     scaled_axes,
     unit_quaternion,
 )
+from cleargs.types import AnyArray, ArrayF32
 
 
 @device
@@ -52,14 +53,14 @@ def quaternion_gradient(
 @device
 def colour_gradient(
     g: int,
-    sh: Floats,
+    sh: ArrayF32,
     sh_count: int,
-    splat: Floats,
+    splat: ArrayF32,
     direction: tuple[float, float, float],
-    sums: Array,
-    grad_sh: Floats,
-    basis: Floats,
-    weights: Floats,
+    sums: AnyArray,
+    grad_sh: ArrayF32,
+    basis: ArrayF32,
+    weights: ArrayF32,
 ) -> tuple[float, float, float]:
     """Write dL/dSH of one Gaussian and return dL/d(direction). No gradient where the colour is clamped."""
     red = np.float32(sums[layout.SUM_RED]) if splat[layout.RED] > ZERO else ZERO
@@ -85,13 +86,13 @@ def backpropagate_one(
     g: int,
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
-    splats: Floats,
-    sums: Array,
+    splats: ArrayF32,
+    sums: AnyArray,
     outputs: Parameters,
-    basis: Floats,
-    weights: Floats,
+    basis: ArrayF32,
+    weights: ArrayF32,
 ) -> None:
     """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see splat_layout.SUM_*)."""
     means, log_scales, rotations, logits, sh = parameters
@@ -236,11 +237,11 @@ def clear_gradients(g: int, outputs: Parameters) -> None:
 def backpropagate(
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
-    splats: Floats,
-    pair_offsets: Array,
-    pair_sums: Floats,
+    splats: ArrayF32,
+    pair_offsets: AnyArray,
+    pair_sums: ArrayF32,
     outputs: Parameters,
 ) -> None:
     """Gradients of the five parameters from the (tile, splat) sums of the rasteriser's backward pass.

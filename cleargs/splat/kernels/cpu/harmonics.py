@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import Floats, device
+from cleargs.splat.kernels.cpu.jit import device
+from cleargs.types import ArrayF32
 
 C0, C1 = np.float32(constants.SH_C0), np.float32(constants.SH_C1)
 C20, C21, C22, C23, C24 = (np.float32(c) for c in constants.SH_C2)
@@ -14,7 +15,7 @@ TWO, THREE, FOUR, SIX, EIGHT = (np.float32(n) for n in (2, 3, 4, 6, 8))
 
 
 @device
-def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: Floats) -> None:
+def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: ArrayF32) -> None:
     """The first ``count`` (1, 4, 9 or 16) basis functions at the unit direction (x, y, z)."""
     basis[0] = C0
     if count > 1:
@@ -40,7 +41,7 @@ def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: Flo
 
 @device
 def sh_direction_gradient(
-    count: int, x: np.float32, y: np.float32, z: np.float32, h: Floats
+    count: int, x: np.float32, y: np.float32, z: np.float32, h: ArrayF32
 ) -> tuple[np.float32, np.float32, np.float32]:
     """Σ_k h[k] ∂basis[k]/∂(x, y, z), the direction taken as three free numbers."""
     gx = gy = gz = np.float32(0)

@@ -16,16 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from cleargs import kernel_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 FAST = frozenset({"contract", "nsz", "arcp"})
 

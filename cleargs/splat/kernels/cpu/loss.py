@@ -26,8 +26,9 @@ import numpy as np
 from numba import prange
 
 from cleargs.splat import constants
-from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.jit import device, kernel
 from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, magnitude, select, store
+from cleargs.types import AnyArray, ArrayF32
 
 RADIUS = constants.SSIM_RADIUS
 TAPS = 2 * RADIUS + 1
@@ -42,10 +43,10 @@ MEAN_X, MEAN_Y, MEAN_XX, MEAN_YY, MEAN_XY = range(5)
 BY_MEAN, BY_SQUARE, BY_PRODUCT = range(3)
 
 
-def ssim_window() -> Floats:
+def ssim_window() -> ArrayF32:
     """The normalised one-dimensional window, [11]."""
     weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * constants.SSIM_SIGMA**2))
-    window: Floats = (weights / weights.sum()).astype(np.float32)
+    window: ArrayF32 = (weights / weights.sum()).astype(np.float32)
     return window
 
 
@@ -56,12 +57,12 @@ def padded_length(width: int) -> int:
 
 @kernel
 def pad_images(
-    image: Floats,
-    target: Floats,
-    mask: Array | None,
-    padded_image: Floats,
-    padded_target: Floats,
-    counted: Floats,
+    image: ArrayF32,
+    target: ArrayF32,
+    mask: AnyArray | None,
+    padded_image: ArrayF32,
+    padded_target: ArrayF32,
+    counted: ArrayF32,
 ) -> None:
     """Copy both images [H, W, 3] into padded rows; ``counted`` holds 1 for values that count, else 0."""
     height, width, _ = image.shape
@@ -80,7 +81,7 @@ def pad_images(
 
 
 @device
-def vertical_means(y: int, image: Floats, target: Floats, window: Floats, rows: Floats) -> None:
+def vertical_means(y: int, image: ArrayF32, target: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
     """The five window sums over the rows around ``y``, into the row buffers."""
     height, length = image.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
@@ -105,7 +106,7 @@ def vertical_means(y: int, image: Floats, target: Floats, window: Floats, rows: 
 
 
 @device
-def row_total(values: Floats, length: int) -> float:
+def row_total(values: ArrayF32, length: int) -> float:
     """Sum of a row buffer in float64."""
     total = 0.0
     for i in range(PAD, length - PAD):
@@ -116,13 +117,13 @@ def row_total(values: Floats, length: int) -> float:
 @device
 def similarity_row(
     y: int,
-    image: Floats,
-    target: Floats,
-    counted: Floats,
-    window: Floats,
-    rows: Floats,
-    values: Floats,
-    maps: Floats,
+    image: ArrayF32,
+    target: ArrayF32,
+    counted: ArrayF32,
+    window: ArrayF32,
+    rows: ArrayF32,
+    values: ArrayF32,
+    maps: ArrayF32,
 ) -> None:
     """SSIM of each value of a row into ``values`` and its derivatives into ``maps``."""
     height, length = image.shape
@@ -155,7 +156,7 @@ def similarity_row(
 
 
 @device
-def differences_row(y: int, image: Floats, target: Floats, values: Floats) -> None:
+def differences_row(y: int, image: ArrayF32, target: ArrayF32, values: ArrayF32) -> None:
     """|x - y| of each value of a row into ``values``."""
     length = image.shape[1]
     for i in range(PAD, length - PAD, LANES):
@@ -165,12 +166,12 @@ def differences_row(y: int, image: Floats, target: Floats, values: Floats) -> No
 
 @kernel
 def measure(
-    image: Floats,
-    target: Floats,
-    counted: Floats,
-    window: Floats,
-    maps: Floats,
-    row_sums: Array,
+    image: ArrayF32,
+    target: ArrayF32,
+    counted: ArrayF32,
+    window: ArrayF32,
+    maps: ArrayF32,
+    row_sums: AnyArray,
 ) -> None:
     """Sums of |x - y|, SSIM and counted values of each padded row, [H, 3] float64.
 
@@ -188,7 +189,7 @@ def measure(
 
 
 @device
-def vertical_maps(y: int, maps: Floats, window: Floats, rows: Floats) -> None:
+def vertical_maps(y: int, maps: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
     """Window sums of the three derivative maps over the rows around ``y``."""
     _, height, length = maps.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
@@ -206,14 +207,14 @@ def vertical_maps(y: int, maps: Floats, window: Floats, rows: Floats) -> None:
 
 @kernel
 def differentiate(
-    image: Floats,
-    target: Floats,
-    counted: Floats,
-    window: Floats,
-    maps: Floats,
+    image: ArrayF32,
+    target: ArrayF32,
+    counted: ArrayF32,
+    window: ArrayF32,
+    maps: ArrayF32,
     l1_scale: np.float32,
     ssim_scale: np.float32,
-    gradient: Floats,
+    gradient: ArrayF32,
 ) -> None:
     """gradient [H, W, 3] = l1_scale sign(x - y) + ssim_scale d(sum of SSIM)/dx, zero where masked."""
     height, length = image.shape
@@ -242,7 +243,7 @@ def differentiate(
 
 
 @kernel
-def squared_errors(image: Floats, target: Floats, mask: Array | None, row_sums: Array) -> None:
+def squared_errors(image: ArrayF32, target: ArrayF32, mask: AnyArray | None, row_sums: AnyArray) -> None:
     """Sum of squared differences and number of values of each row, [H, 2] float64."""
     height, width, channels = image.shape
     for y in prange(height):

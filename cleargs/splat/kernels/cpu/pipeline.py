@@ -14,27 +14,28 @@ from torch import Tensor
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels import rasteriser
 from cleargs.splat.kernels.cpu import binning, gradients, projection, rasterise
-from cleargs.splat.kernels.cpu.jit import LAUNCHING, Array, Floats
+from cleargs.splat.kernels.cpu.jit import LAUNCHING
 from cleargs.splat.kernels.splat_layout import PAIR_COLUMNS, SPLAT_COLUMNS, SUM_DEPTH
 from cleargs.splat.types import Render
+from cleargs.types import AnyArray, ArrayF32
 
 TILES_PER_CHUNK = 8
 """Tiles handed to a thread at a time: real scenes are uneven, so the queue must be finer than the threads."""
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(rasteriser.Frame):
+class CpuForwardPass(rasteriser.ForwardPass):
     """What the backward pass needs of one forward pass."""
 
-    view: projection.View
-    background: Floats  # [3]
-    splats: Floats  # [N, 16]
-    pair_offsets: Array  # [N + 1]
-    tile_offsets: Array  # [tiles + 1]
-    pair_ids: Array  # [P]
-    pair_slots: Array  # [P]
-    transmittance: Floats  # [H, W]
-    last: Floats  # [H, W]
+    view: projection.ProjectionView
+    background: ArrayF32  # [3]
+    splats: ArrayF32  # [N, 16]
+    pair_offsets: AnyArray  # [N + 1]
+    tile_offsets: AnyArray  # [tiles + 1]
+    pair_ids: AnyArray  # [P]
+    pair_slots: AnyArray  # [P]
+    transmittance: ArrayF32  # [H, W]
+    last: ArrayF32  # [H, W]
 
 
 def read_parameters(gaussians: Gaussians) -> projection.Parameters:
@@ -54,27 +55,29 @@ class CpuRasteriser(rasteriser.Rasteriser):
     def _launching(self) -> AbstractContextManager[Any]:
         return LAUNCHING
 
-    def _floats(self, name: str, *shape: int) -> Floats:
+    def _floats(self, name: str, *shape: int) -> ArrayF32:
         return self._buffers.take(name, *shape).numpy()
 
-    def _integers(self, name: str, *shape: int) -> Array:  # int64
+    def _integers(self, name: str, *shape: int) -> AnyArray:  # int64
         return self._buffers.take(name, *shape, dtype=torch.int64).numpy()
 
-    def _numbers(self, name: str, *shape: int) -> Array:  # uint32
+    def _numbers(self, name: str, *shape: int) -> AnyArray:  # uint32
         return self._buffers.take(name, *shape, dtype=torch.int32).numpy().view(np.uint32)
 
-    def _bin(self, asked: rasteriser.Frame, background: tuple[float, float, float], depth: bool) -> Frame:
-        gaussians, camera = asked.gaussians, asked.camera
+    def _bin(
+        self, inputs: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
+    ) -> CpuForwardPass:
+        gaussians, camera = inputs.gaussians, inputs.camera
         n, width, height = gaussians.num, camera.width, camera.height
-        view = projection.View(*rasteriser.view_numbers(camera))
+        view = projection.ProjectionView(*rasteriser.view_numbers(camera))
         splats = self._floats("splats", n, SPLAT_COLUMNS)
         tile_counts = self._integers("tile_counts", n)
         radii = self._floats("radii", n)
         projection.project(
             read_parameters(gaussians),
-            asked.sh_count,
+            inputs.sh_count,
             view,
-            asked.antialias,
+            inputs.antialias,
             width,
             height,
             splats,
@@ -98,8 +101,8 @@ class CpuRasteriser(rasteriser.Rasteriser):
         binning.sort_pairs_by_tile(
             order, pair_offsets, pair_tiles, counts, tile_offsets, pair_ids, pair_slots
         )
-        return Frame(
-            **vars(asked),
+        return CpuForwardPass(
+            **vars(inputs),
             view=view,
             background=np.asarray(background, np.float32),
             splats=splats,
@@ -111,24 +114,24 @@ class CpuRasteriser(rasteriser.Rasteriser):
             last=self._floats("last", height, width),
         )
 
-    def _blend(self, frame: Frame, depth: bool) -> Render:
-        width, height = frame.camera.width, frame.camera.height
+    def _blend(self, state: CpuForwardPass, depth: bool) -> Render:
+        width, height = state.camera.width, state.camera.height
         image = self._floats("image", height, width, 3)
         depths = self._floats("depth", height, width) if depth else None
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.forward(
                 width,
                 height,
-                frame.tile_offsets,
-                frame.pair_ids,
-                frame.splats,
-                frame.background,
+                state.tile_offsets,
+                state.pair_ids,
+                state.splats,
+                state.background,
                 image,
-                frame.transmittance,
-                frame.last,
+                state.transmittance,
+                state.last,
                 depths,
             )
-        alpha = np.subtract(np.float32(1), frame.transmittance, out=self._floats("alpha", height, width))
+        alpha = np.subtract(np.float32(1), state.transmittance, out=self._floats("alpha", height, width))
         return Render(
             torch.from_numpy(image),
             torch.from_numpy(alpha),
@@ -136,35 +139,35 @@ class CpuRasteriser(rasteriser.Rasteriser):
         )
 
     def _differentiate(
-        self, frame: Frame, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, state: CpuForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
         columns = SUM_DEPTH if grad_depth is None else PAIR_COLUMNS
-        pair_sums = self._floats("pair_sums", len(frame.pair_ids), columns)
+        pair_sums = self._floats("pair_sums", len(state.pair_ids), columns)
         with numba.parallel_chunksize(TILES_PER_CHUNK):
             rasterise.backward(
-                frame.camera.width,
-                frame.camera.height,
-                frame.tile_offsets,
-                frame.pair_ids,
-                frame.pair_slots,
-                frame.splats,
-                frame.background,
-                frame.transmittance,
-                frame.last,
+                state.camera.width,
+                state.camera.height,
+                state.tile_offsets,
+                state.pair_ids,
+                state.pair_slots,
+                state.splats,
+                state.background,
+                state.transmittance,
+                state.last,
                 grad_image.numpy(),
                 None if grad_alpha is None else grad_alpha.numpy(),
                 None if grad_depth is None else grad_depth.numpy(),
                 pair_sums,
             )
-        parameters = frame.gaussians.tensors()
+        parameters = state.gaussians.tensors()
         outputs = {name: self._floats(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         gradients.backpropagate(
-            read_parameters(frame.gaussians),
-            frame.sh_count,
-            frame.view,
-            frame.antialias,
-            frame.splats,
-            frame.pair_offsets,
+            read_parameters(state.gaussians),
+            state.sh_count,
+            state.view,
+            state.antialias,
+            state.splats,
+            state.pair_offsets,
             pair_sums,
             tuple(outputs.values()),
         )

@@ -32,7 +32,8 @@ from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
 from cleargs.splat.kernels.cpu.binning import count_tiles
 from cleargs.splat.kernels.cpu.harmonics import sh_basis
-from cleargs.splat.kernels.cpu.jit import Array, Floats, device, kernel
+from cleargs.splat.kernels.cpu.jit import device, kernel
+from cleargs.types import AnyArray, ArrayF32
 
 DILATION = constants.DILATION
 NEAR = constants.NEAR
@@ -47,11 +48,11 @@ BLOCK = 128
 
 ZERO = np.float32(0)
 
-Parameters = tuple[Floats, ...]
+Parameters = tuple[ArrayF32, ...]
 """Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
 
 
-class View(NamedTuple):
+class ProjectionView(NamedTuple):
     """A camera as the kernels read it: world-to-camera rotation rows, translation, intrinsics, bounds."""
 
     w00: float
@@ -105,7 +106,7 @@ def is_finite(x: Any) -> bool:
 
 
 @device
-def camera_position(mean: Array, view: View) -> tuple[float, float, float]:
+def camera_position(mean: AnyArray, view: ProjectionView) -> tuple[float, float, float]:
     """The Gaussian's centre in camera coordinates."""
     x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -116,7 +117,7 @@ def camera_position(mean: Array, view: View) -> tuple[float, float, float]:
 
 
 @device
-def unit_quaternion(rotation: Array) -> tuple[float, float, float, float, float]:
+def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, float]:
     """The normalised quaternion w x y z and the norm it was divided by."""
     w, x = np.float64(rotation[0]), np.float64(rotation[1])
     y, z = np.float64(rotation[2]), np.float64(rotation[3])
@@ -138,7 +139,7 @@ def scaled_axes(
 
 @device
 def projection_rows(
-    x: float, y: float, z: float, view: View
+    x: float, y: float, z: float, view: ProjectionView
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """The rows of J W. x/z and y/z are clamped, which keeps the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
@@ -155,10 +156,10 @@ def project_one(
     g: int,
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
-    splats: Floats,
-    basis: Floats,
+    splats: ArrayF32,
+    basis: ArrayF32,
 ) -> bool:
     """Write the packed splat of Gaussian ``g``; False when it is culled (behind, too faint, not finite)."""
     means, log_scales, rotations, logits, sh = parameters
@@ -220,13 +221,13 @@ def project_one(
 def project(
     parameters: Parameters,
     sh_count: int,
-    view: View,
+    view: ProjectionView,
     antialias: bool,
     width: int,
     height: int,
-    splats: Floats,
-    tile_counts: Array,
-    radii: Floats,
+    splats: ArrayF32,
+    tile_counts: AnyArray,
+    radii: ArrayF32,
 ) -> None:
     """Packed splats [N, 16], the number of tiles that each touches [N] and its radius in px [N].
 

@@ -34,7 +34,7 @@ from numba import prange
 
 from cleargs.splat import constants
 from cleargs.splat.kernels import splat_layout as layout
-from cleargs.splat.kernels.cpu.jit import Array, Floats, device, inlined, kernel
+from cleargs.splat.kernels.cpu.jit import device, inlined, kernel
 from cleargs.splat.kernels.cpu.simd import (
     LANES,
     any_lane,
@@ -53,6 +53,7 @@ from cleargs.splat.kernels.cpu.simd import (
     store,
     store_lane_sums,
 )
+from cleargs.types import AnyArray, ArrayF32
 
 ZERO, ONE, HALF = (np.float32(x) for x in (0, 1, 0.5))
 ALPHA_MAX = np.float32(constants.ALPHA_MAX)
@@ -127,7 +128,7 @@ def exp2(t: Any) -> Any:
 
 @inlined
 def set_up_splat(
-    splats: Floats, g: Any, left: np.float32, top: np.float32, buffer: Floats, geometry: int
+    splats: ArrayF32, g: Any, left: np.float32, top: np.float32, buffer: ArrayF32, geometry: int
 ) -> Any:
     """Write the splat's geometry in this tile and return the bit mask of the pieces that it touches."""
     bend_x, bend_y, skew = splats[g, layout.BEND_X], splats[g, layout.BEND_Y], splats[g, layout.SKEW]
@@ -164,7 +165,7 @@ def first_column(piece: Any) -> Any:
 
 
 @inlined
-def splat_offset(pair_ids: Array, pair: Any) -> Any:
+def splat_offset(pair_ids: AnyArray, pair: Any) -> Any:
     """Place of a pair's splat in the array of splats."""
     return np.uint64(pair_ids[np.uint64(pair)]) * np.uint64(layout.SPLAT_COLUMNS)
 
@@ -175,11 +176,11 @@ def forward_tile(
     end: int,
     left: np.float32,
     top: np.float32,
-    pair_ids: Array,
-    splats: Floats,
-    buffer: Floats,
-    touches: Array,
-    depth: Floats | None,
+    pair_ids: AnyArray,
+    splats: ArrayF32,
+    buffer: ArrayF32,
+    touches: AnyArray,
+    depth: ArrayF32 | None,
 ) -> None:
     """Blend the pairs ``begin`` to ``end`` into the pixel buffers. ``touches`` is int64 [BATCH] scratch."""
     zero = broadcast(ZERO)
@@ -241,14 +242,14 @@ def pixel_offset(row: int, column: int) -> Any:
 def forward(
     width: int,
     height: int,
-    tile_offsets: Array,
-    pair_ids: Array,
-    splats: Floats,
-    background: Floats,
-    image: Floats,
-    transmittance: Floats,
-    last: Floats,
-    depth: Floats | None,
+    tile_offsets: AnyArray,
+    pair_ids: AnyArray,
+    splats: ArrayF32,
+    background: ArrayF32,
+    image: ArrayF32,
+    transmittance: ArrayF32,
+    last: ArrayF32,
+    depth: ArrayF32 | None,
 ) -> None:
     """Image [H, W, 3], final transmittance [H, W], last contributor [H, W], and depth [H, W] or None."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE
@@ -295,13 +296,13 @@ def backward_tile(
     end: int,
     left: np.float32,
     top: np.float32,
-    pair_ids: Array,
-    pair_slots: Array,
-    splats: Floats,
-    buffer: Floats,
-    touches: Array,
-    pair_sums: Floats,
-    grad_depth: Floats | None,
+    pair_ids: AnyArray,
+    pair_slots: AnyArray,
+    splats: ArrayF32,
+    buffer: ArrayF32,
+    touches: AnyArray,
+    pair_sums: ArrayF32,
+    grad_depth: ArrayF32 | None,
 ) -> None:
     """Walk the pairs ``end`` - 1 down to ``begin`` and write each one's sums to its row of ``pair_sums``.
 
@@ -396,17 +397,17 @@ def backward_tile(
 def backward(
     width: int,
     height: int,
-    tile_offsets: Array,
-    pair_ids: Array,
-    pair_slots: Array,
-    splats: Floats,
-    background: Floats,
-    transmittance: Floats,
-    last: Floats,
-    grad_image: Floats,
-    grad_alpha: Floats | None,
-    grad_depth: Floats | None,
-    pair_sums: Floats,
+    tile_offsets: AnyArray,
+    pair_ids: AnyArray,
+    pair_slots: AnyArray,
+    splats: ArrayF32,
+    background: ArrayF32,
+    transmittance: ArrayF32,
+    last: ArrayF32,
+    grad_image: ArrayF32,
+    grad_alpha: ArrayF32 | None,
+    grad_depth: ArrayF32 | None,
+    pair_sums: ArrayF32,
 ) -> None:
     """Sums of every (tile, splat) pair, Gaussian-major: [P, 10] with depth, else [P, 9]."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE

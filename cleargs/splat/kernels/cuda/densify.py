@@ -90,9 +90,9 @@ def _halves(gaussians: Gaussians, cut: Tensor, opacity: Tensor, min_opacity: flo
     rows = torch.arange(len(cut), device=cut.device)
     longest = gaussians.log_scales[cut].argmax(dim=1)
     axes = rotation_matrices(gaussians.rotations[cut])[rows, :, longest]
-    away = axes * (densification.PART * gaussians.log_scales[cut, longest].exp())[:, None]
-    faint = (1.0 - (1.0 - opacity) ** (0.5 / densification.PART)).clamp(min_opacity, 1.0 - 1e-6)
-    gaussians.log_scales[cut, longest] += math.log(densification.PART)
+    away = axes * (densification.SPLIT_FRACTION * gaussians.log_scales[cut, longest].exp())[:, None]
+    faint = (1.0 - (1.0 - opacity) ** (0.5 / densification.SPLIT_FRACTION)).clamp(min_opacity, 1.0 - 1e-6)
+    gaussians.log_scales[cut, longest] += math.log(densification.SPLIT_FRACTION)
     gaussians.logit_opacities[cut] = (faint.log() - torch.log1p(-faint)).float()
     others = {name: tensor[cut] for name, tensor in gaussians.tensors().items()}
     gaussians.means[cut] -= away

@@ -39,7 +39,7 @@ SORT_BYTES = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Frame(rasteriser.Frame):
+class CudaForwardPass(rasteriser.ForwardPass):
     """What the backward pass needs of one forward pass."""
 
     view: Tensor  # float64 [23]
@@ -71,49 +71,49 @@ class CudaRasteriser(rasteriser.Rasteriser):
     def _launching(self) -> AbstractContextManager[Any]:
         return memory_errors()
 
-    def _blend(self, frame: Frame, depth: bool) -> Render:
-        take, camera = self._buffers.take, frame.camera
+    def _blend(self, state: CudaForwardPass, depth: bool) -> Render:
+        take, camera = self._buffers.take, state.camera
         shape = (camera.height, camera.width)
         image, alpha = take("image", *shape, 3), take("alpha", *shape)
         depths = take("depth", *shape) if depth else None
         rasterise.forward[(tiles_of(camera),)](
-            frame.tile_starts,
-            frame.chunk_starts,
-            frame.pair_ids,
-            frame.splats,
-            frame.background,
+            state.tile_starts,
+            state.chunk_starts,
+            state.pair_ids,
+            state.splats,
+            state.background,
             image,
             alpha,
-            frame.transmittance,
-            frame.last,
+            state.transmittance,
+            state.last,
             alpha if depths is None else depths,
-            frame.chunk_planes,
-            frame.chunk_tiles,
-            frame.deepest,
+            state.chunk_planes,
+            state.chunk_tiles,
+            state.deepest,
             camera.width,
             camera.height,
             WITH_DEPTH=depth,
-            PLANES=frame.planes,
+            PLANES=state.planes,
             num_warps=FORWARD_WARPS,
         )
         return Render(image, alpha, depths)
 
     def _differentiate(
-        self, frame: Frame, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
+        self, state: CudaForwardPass, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
-        if grad_depth is not None and frame.planes == device_layout.CHUNK_PLANES:
+        if grad_depth is not None and state.planes == device_layout.CHUNK_PLANES:
             raise ValueError("a gradient of the depth needs a forward(depth=True) before it")
-        take, camera, tiles = self._buffers.take, frame.camera, tiles_of(frame.camera)
-        pairs, chunks, n = len(frame.pair_ids), len(frame.chunk_tiles), frame.gaussians.num
+        take, camera, tiles = self._buffers.take, state.camera, tiles_of(state.camera)
+        pairs, chunks, n = len(state.pair_ids), len(state.chunk_tiles), state.gaussians.num
         columns = layout.SUM_DEPTH if grad_depth is None else layout.PAIR_COLUMNS
         chunk_behind = take("chunk_behind", chunks, layout.TILE_PIXELS)
         pair_sums = take("pair_sums", max(pairs, 1), layout.PAIR_COLUMNS)
         rasterise.behind[(tiles,)](
-            frame.chunk_starts,
-            frame.chunk_planes,
-            frame.deepest,
-            frame.background,
-            frame.transmittance,
+            state.chunk_starts,
+            state.chunk_planes,
+            state.deepest,
+            state.background,
+            state.transmittance,
             grad_image,
             grad_image if grad_alpha is None else grad_alpha,
             grad_image if grad_depth is None else grad_depth,
@@ -122,21 +122,21 @@ class CudaRasteriser(rasteriser.Rasteriser):
             camera.height,
             HAS_ALPHA=grad_alpha is not None,
             HAS_DEPTH=grad_depth is not None,
-            PLANES=frame.planes,
+            PLANES=state.planes,
             num_warps=4,
         )
         if pairs:
             rasterise.backward[(chunks,)](
-                frame.tile_starts,
-                frame.chunk_starts,
-                frame.chunk_tiles,
-                frame.chunk_planes,
+                state.tile_starts,
+                state.chunk_starts,
+                state.chunk_tiles,
+                state.chunk_planes,
                 chunk_behind,
-                frame.deepest,
-                frame.pair_ids,
-                frame.pair_slots,
-                frame.splats,
-                frame.last,
+                state.deepest,
+                state.pair_ids,
+                state.pair_slots,
+                state.splats,
+                state.last,
                 grad_image,
                 grad_image if grad_depth is None else grad_depth,
                 pair_sums,
@@ -144,17 +144,17 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 camera.width,
                 camera.height,
                 HAS_DEPTH=grad_depth is not None,
-                PLANES=frame.planes,
+                PLANES=state.planes,
                 COLUMNS=columns,
                 num_warps=BACKWARD_WARPS,
             )
-        parameters = frame.gaussians.tensors()
+        parameters = state.gaussians.tensors()
         outputs = {name: take(f"grad_{name}", *value.shape) for name, value in parameters.items()}
         if n:
             totals = take("totals", layout.PAIR_COLUMNS, n, dtype=torch.float64)
             gradients.total[(-(-n // TOTAL_ROWS),)](
-                frame.tile_counts,
-                frame.pair_starts,
+                state.tile_counts,
+                state.pair_starts,
                 pair_sums,
                 totals,
                 n,
@@ -165,23 +165,25 @@ class CudaRasteriser(rasteriser.Rasteriser):
             )
             gradients.backpropagate[(-(-n // PROJECT_BLOCK),)](
                 *(value.contiguous() for value in parameters.values()),
-                frame.view,
-                frame.splats,
-                frame.tile_counts,
+                state.view,
+                state.splats,
+                state.tile_counts,
                 totals,
                 *outputs.values(),
                 n,
-                SH_STORED=frame.gaussians.sh.shape[1],
-                SH_COUNT=frame.sh_count,
-                ANTIALIAS=frame.antialias,
+                SH_STORED=state.gaussians.sh.shape[1],
+                SH_COUNT=state.sh_count,
+                ANTIALIAS=state.antialias,
                 HAS_DEPTH=grad_depth is not None,
                 BLOCK=PROJECT_BLOCK,
                 num_warps=4,
             )
         return Gaussians(**outputs)
 
-    def _bin(self, asked: rasteriser.Frame, background: tuple[float, float, float], depth: bool) -> Frame:
-        gaussians, camera = asked.gaussians, asked.camera
+    def _bin(
+        self, inputs: rasteriser.ForwardPass, background: tuple[float, float, float], depth: bool
+    ) -> CudaForwardPass:
+        gaussians, camera = inputs.gaussians, inputs.camera
         take, device = self._buffers.take, self._buffers.device
         n, width, height, tiles = gaussians.num, camera.width, camera.height, tiles_of(camera)
         numbers = rasteriser.view_numbers(camera)
@@ -202,8 +204,8 @@ class CudaRasteriser(rasteriser.Rasteriser):
                 width,
                 height,
                 SH_STORED=gaussians.sh.shape[1],
-                SH_COUNT=asked.sh_count,
-                ANTIALIAS=asked.antialias,
+                SH_COUNT=inputs.sh_count,
+                ANTIALIAS=inputs.antialias,
                 BLOCK=PROJECT_BLOCK,
                 num_warps=4,
                 enable_fp_fusion=False,
@@ -241,8 +243,8 @@ class CudaRasteriser(rasteriser.Rasteriser):
         planes = device_layout.CHUNK_PLANES + depth
         # The number of chunks is known on the device alone; this many there can be at most.
         chunks = pairs // device_layout.CHUNK + min(tiles, pairs)
-        return Frame(
-            **vars(asked),
+        return CudaForwardPass(
+            **vars(inputs),
             view=view,
             background=torch.tensor(background, dtype=torch.float32).to(device, non_blocking=True),
             planes=planes,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cleargs.splat.config import TrainConfig
 
 if TYPE_CHECKING:
-    from cleargs.splat.views import View
+    from cleargs.splat.views import TrainingView
 
 # Wall seconds of a step on two quiet cores: fixed, a megapixel, a Gaussian.
 STEP_S, STEP_S_PER_MEGAPIXEL, STEP_S_PER_GAUSSIAN = 0.002, 0.12, 4.5e-7
@@ -63,7 +63,7 @@ def training_cost(
     return float(seconds.sum()), 1.5e-6 * budget
 
 
-def decided(config: Settings, views: Sequence[View]) -> Settings:
+def resolve_config(config: Settings, views: Sequence[TrainingView]) -> Settings:
     """``config`` with the steps and the budget that it leaves open, for these views."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     update = {"steps": config.steps_for(len(views)), "budget": config.budget_for(pixels)}

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cleargs.capture.cameras import Pose, pinhole
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.model import ModelImage, SparseModel, moved, write_model
+from cleargs.capture.model import ModelImage, SparseModel, transform_model, write_model
 
 
 def test_every_point_keeps_its_place_in_every_image(tmp_path: Path) -> None:
@@ -27,7 +27,7 @@ def test_every_point_keeps_its_place_in_every_image(tmp_path: Path) -> None:
     turn, shift = Rotation.from_rotvec([1.0, -0.4, 2.0]).as_matrix(), np.array([4.0, 5.0, -6.0])
     write_model(
         tmp_path,
-        moved(model, scale=2.5, rotation=turn, translation=shift),
+        transform_model(model, scale=2.5, rotation=turn, translation=shift),
         np.full((9, 3), 7, np.uint8),
     )
     found = pycolmap.Reconstruction(str(tmp_path))

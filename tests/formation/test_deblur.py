@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.photographs import ALPHA, MEDIAN, Image, photograph, picture, psnr, soft, twist, wall_fields
+from helpers.observations import ALPHA, MEDIAN, Image, observe, picture, psnr, soft, twist, wall_fields
 
-from cleargs.formation import undo as module
+from cleargs.formation import deblur as module
+from cleargs.formation.deblur import deblur
 from cleargs.formation.motion import FrameMotion
-from cleargs.formation.undo import undo
 from cleargs.formation.warp import Warp
 
 MOTIONS = [
@@ -30,27 +30,27 @@ def warp(motion: FrameMotion) -> Warp:
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=["turn", "long turn with roll", "both", "defocus"])
 def test_undoing_it_is_worth_more_than_frame_or_render(truth: Image, motion: FrameMotion) -> None:
-    observed, render = photograph(truth, motion), soft(truth)
-    image = undo(render, observed, ALPHA, warp(motion))
+    observed, render = observe(truth, motion), soft(truth)
+    image = deblur(render, observed, ALPHA, warp(motion))
     # Measured with the true motion: 0.5 to 3.6 dB above the better one.
     assert psnr(image, truth) > max(psnr(observed, truth), psnr(render, truth)) + 0.3
 
 
 def test_masked_pixels_come_from_the_render(truth: Image) -> None:
-    observed, render = photograph(truth, MOTIONS[0]), soft(truth)
+    observed, render = observe(truth, MOTIONS[0]), soft(truth)
     weight = ALPHA.copy()
     weight[40:90, 60:120] = 0.0
     ruined = np.where(weight[..., None] > 0, observed, render)
-    image = undo(render, ruined, weight, warp(MOTIONS[0]))
+    image = deblur(render, ruined, weight, warp(MOTIONS[0]))
     inner = np.s_[55:75, 75:105]  # farther from the border of the mask than the motion reaches
     np.testing.assert_allclose(image[inner], render[inner], atol=0.01)
 
 
 def test_what_moved_by_itself_spoils_only_its_place(truth: Image) -> None:
-    observed, render = photograph(truth, MOTIONS[0]), soft(truth)
+    observed, render = observe(truth, MOTIONS[0]), soft(truth)
     visited = observed.copy()
     visited[60:100, 90:140] = [0.9, 0.1, 0.1]
-    clean, spoilt = (undo(render, image, ALPHA, warp(MOTIONS[0])) for image in (observed, visited))
+    clean, spoilt = (deblur(render, image, ALPHA, warp(MOTIONS[0])) for image in (observed, visited))
     away = np.ones(ALPHA.shape, np.bool_)
     away[45:115, 75:155] = False
     assert np.abs(clean - spoilt)[away].mean() < 0.004
@@ -59,8 +59,8 @@ def test_what_moved_by_itself_spoils_only_its_place(truth: Image) -> None:
 def test_more_steps_than_the_solver_takes_change_little(
     truth: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    observed = photograph(truth, MOTIONS[0])
-    usual = undo(soft(truth), observed, ALPHA, warp(MOTIONS[0]))
+    observed = observe(truth, MOTIONS[0])
+    usual = deblur(soft(truth), observed, ALPHA, warp(MOTIONS[0]))
     monkeypatch.setattr(module, "STEPS", 60)
-    solved = undo(soft(truth), observed, ALPHA, warp(MOTIONS[0]))
+    solved = deblur(soft(truth), observed, ALPHA, warp(MOTIONS[0]))
     assert np.abs(usual - solved).mean() < 1 / 255

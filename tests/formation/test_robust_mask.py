@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.photograph import pixel_weights
+from cleargs.formation.observed import pixel_weights
 
 HEIGHT, WIDTH = 108, 192
 TOLERANCE = 0.05
@@ -25,8 +25,8 @@ def disc() -> Tensor:
     return torch.from_numpy(np.hypot(x - 60, y - 50) < 0.1 * WIDTH)
 
 
-def counts(photograph: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    return pixel_weights(photograph, target, mask, TOLERANCE)
+def counts(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    return pixel_weights(render, target, mask, TOLERANCE)
 
 
 def test_a_frame_with_nothing_unexplained_counts_whole_to_the_bit() -> None:
@@ -34,8 +34,8 @@ def test_a_frame_with_nothing_unexplained_counts_whole_to_the_bit() -> None:
     seen = picture()
     noise = 2 / 255 * torch.from_numpy(np.random.default_rng(1).standard_normal(seen.shape)).float()
     soft = torch.from_numpy(cv2.GaussianBlur(seen.numpy(), (0, 0), 1.0))
-    for photograph in (seen, seen + noise, soft, 0.8 * seen):
-        assert torch.equal(counts(photograph, seen), torch.ones(HEIGHT, WIDTH))
+    for render in (seen, seen + noise, soft, 0.8 * seen):
+        assert torch.equal(counts(render, seen), torch.ones(HEIGHT, WIDTH))
 
 
 def test_what_stands_in_front_of_the_scene_counts_next_to_nothing_and_the_rest_whole() -> None:

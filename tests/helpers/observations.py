@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cleargs.formation.comparison import Sight, luminance
+from cleargs.formation.comparison import FramePair, luminance
 from cleargs.formation.motion import FrameMotion
 from cleargs.formation.warp import Warp, displacement_fields, padded, samples
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
@@ -49,7 +49,7 @@ def picture() -> Image:
     return np.ascontiguousarray(cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
 
 
-def photograph(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Image:
+def observe(truth: Image, motion: FrameMotion, *, noise: float = 1 / 255) -> Image:
     """What a camera that moves so records, with more samples than the code under test takes."""
     warp = Warp(wall_fields(motion), 0, torch.from_numpy(samples(301)))
     light = warp.forward(torch.from_numpy(padded(linear_from_srgb(truth)))).numpy()[..., :3]
@@ -62,10 +62,10 @@ def soft(image: Image, sigma: float = 0.7) -> Image:
     return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), sigma) * 0.98 + 0.01, 0, 1), np.float32)
 
 
-def sight(render: Image, observed: Image, weight: Image = ALPHA) -> Sight:
+def sight(render: Image, observed: Image, weight: Image = ALPHA) -> FramePair:
     """The raw frame ``observed`` beside the render, without a margin."""
     seen = np.where(weight[..., None] > 0, observed, render)
-    return Sight(luminance(render), wall(), ALPHA, luminance(seen), weight, CAMERA, 0)
+    return FramePair(luminance(render), wall(), ALPHA, luminance(seen), weight, CAMERA, 0)
 
 
 def psnr(image: Image, truth: Image, border: int = 12) -> float:

@@ -24,7 +24,7 @@ from cleargs.splat.formation import Formation
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.scene import Scene
 from cleargs.splat.trainer import Trainer
-from cleargs.splat.views import View
+from cleargs.splat.views import TrainingView
 
 PARTS = Path(__file__).parents[1] / "examples" / "parts"
 
@@ -157,7 +157,7 @@ def toy(count: int = 30) -> Scene:
     )
 
 
-def toy_views(scene: Scene, dim: float = 0.0) -> list[View]:
+def toy_views(scene: Scene, dim: float = 0.0) -> list[TrainingView]:
     """Three views of ``scene``, ``dim`` darker in the corners."""
     made = []
     for number in range(3):
@@ -167,7 +167,7 @@ def toy_views(scene: Scene, dim: float = 0.0) -> list[View]:
         image = cg.render_view(scene, camera).image.detach().clamp(0.0, 1.0).numpy()
         y, x = np.linspace(-1, 1, 24)[:, None], np.linspace(-1, 1, 32)[None, :]
         pixels = (image * (1.0 - dim * ((x * x + y * y) / 2))[..., None]).astype(np.float32)
-        made.append(View(number, camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
+        made.append(TrainingView(number, camera, 1.0, "real", lambda pixels=pixels: (pixels, None)))
     return made
 
 

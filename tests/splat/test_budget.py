@@ -10,8 +10,8 @@ from helpers.splat_toy import gaussians, images, start, views
 from cleargs.cli.main import invoke
 from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
+from cleargs.splat.budget import gaussians_by_step, resolve_config, training_cost
 from cleargs.splat.config import Quality, TrainConfig, budget_from_pixels, steps_from_frames
-from cleargs.splat.effort import decided, gaussians_by_step, training_cost
 from cleargs.splat.trainer import Trainer
 from cleargs.stages.config import DistilConfig
 from cleargs.stages.g0 import G0Config
@@ -37,9 +37,9 @@ def test_the_budget_follows_the_pixels_within_bounds() -> None:
 
 def test_what_is_given_stays() -> None:
     seen = views(images(gaussians(), 3))
-    open_ = decided(G0Config(), seen)
+    open_ = resolve_config(G0Config(), seen)
     assert open_.length == steps_from_frames(3) and open_.budget == budget_from_pixels(0, 10**6)
-    given = decided(G0Config(steps=7, budget=9, quality="high"), seen)
+    given = resolve_config(G0Config(steps=7, budget=9, quality="high"), seen)
     assert (given.length, given.budget) == (7, 9)
     assert DistilConfig().applied_to(G0Config(), 3).length * 16 == steps_from_frames(3)
 

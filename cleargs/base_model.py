@@ -10,7 +10,7 @@ Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 """A number in [0, 1]."""
 
 
-class Record(BaseModel):
+class FrozenModel(BaseModel):
     """A frozen model that forbids unknown fields, so that a misspelt name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -24,7 +24,7 @@ class Inherited(NamedTuple):
     """False where the retired setting had no effect: whatever it held is dropped."""
 
 
-class Settings(Record):
+class Settings(FrozenModel):
     """A table of a run's settings, which also reads the ``run.toml`` of earlier versions.
 
     A name that became a constant of the class, or is in ``RETIRED``, is dropped where it holds the value that

@@ -12,16 +12,16 @@ from pydantic import ValidationError
 
 from benchmarks.comparison.cells import Cell, Cells
 from benchmarks.comparison.choices import Choices
-from benchmarks.comparison.evidence import Outcome, Section
+from benchmarks.comparison.evidence import Section, SectionOutcome
 from benchmarks.comparison.roles import Roles
 from benchmarks.comparison.tables import Results
 from cleargs.evaluate.eval_report import Figures
 from cleargs.files import write_bytes
 from cleargs.progress import Reporter
-from cleargs.untrusted import read_bytes
+from cleargs.safe_io import read_bytes
 
 
-class KeptSection(Figures):
+class SavedSection(Figures):
     """``results/NAME.json``: all that the tables of a section are made from."""
 
     section: Section
@@ -40,10 +40,10 @@ class KeptSection(Figures):
         return Results(Cells(self.cells), self.roles, self.choices)
 
 
-def keep_section(folder: Path, found: Outcome, version: str, machine: str) -> None:
+def save_section(folder: Path, found: SectionOutcome, version: str, machine: str) -> None:
     """Write what was found in a section to ``folder``, in place of what an earlier call found there."""
     compared = found.compared
-    kept = KeptSection(
+    kept = SavedSection(
         section=found.section,
         version=version,
         machine=machine,
@@ -56,7 +56,7 @@ def keep_section(folder: Path, found: Outcome, version: str, machine: str) -> No
     write_bytes(_file(folder, found.section), kept.model_dump_json().encode())
 
 
-def kept_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[KeptSection]:
+def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[SavedSection]:
     """Those of ``sections`` that ``folder`` has, as they are listed now; what was made from another list, or
     cannot be read, is left out with a warning.
     """
@@ -66,7 +66,7 @@ def kept_sections(folder: Path, sections: Iterable[Section], reporter: Reporter)
         if not path.exists():
             continue
         try:
-            kept = KeptSection.model_validate_json(read_bytes(path))
+            kept = SavedSection.model_validate_json(read_bytes(path))
         except (OSError, ValidationError):
             reporter.warn(f"{path} cannot be read: the page leaves {section.title!r} out")
             continue

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cleargs.splat.camera import Camera
-from cleargs.splat.transforms import UP, upright
+from cleargs.splat.transforms import UP, orient_up
 
 AHEAD = {"-y": [0, 0, 1], "y": [0, 0, -1], "z": [0, 1, 0]}
 """Where a program with that up axis looks before its camera is moved: COLMAP's viewers, three.js, Blender."""
@@ -26,7 +26,7 @@ def camera(turn: Rotation) -> Camera:
 @pytest.mark.parametrize("pitch", [0.0, 0.6])
 def test_the_first_camera_looks_ahead_from_the_origin(up: str, pitch: float) -> None:
     first = camera(Rotation.from_euler("YXZ", [2.1, pitch, 0.0 if pitch == 0.0 else 0.3]))
-    move = upright(first, up)
+    move = orient_up(first, up)
     turn = move["rotation"]
     assert np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1.0)
     assert np.allclose(turn @ [0, -1, 0], AXES[up])  # up stays up, whatever the camera's pitch and roll
@@ -36,4 +36,4 @@ def test_the_first_camera_looks_ahead_from_the_origin(up: str, pitch: float) -> 
 
 
 def test_a_camera_that_looks_down_keeps_its_heading() -> None:
-    assert np.allclose(upright(camera(Rotation.from_euler("x", -np.pi / 2)), "-y")["rotation"], np.eye(3))
+    assert np.allclose(orient_up(camera(Rotation.from_euler("x", -np.pi / 2)), "-y")["rotation"], np.eye(3))

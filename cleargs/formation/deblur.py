@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cleargs.formation.motion import Floats
 from cleargs.formation.warp import Warp, padded
 from cleargs.media.colour import linear_from_srgb, srgb_from_linear
+from cleargs.types import ArrayF32
 
 PRIOR = 0.1
 """Variance of what the model of the exposure leaves unexplained, relative to that of the render's error. What
@@ -26,7 +26,7 @@ MIN_LINEAR = 0.002
 """Linear light below which sRGB counts as steep as here."""
 
 
-def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats:
+def deblur(render: ArrayF32, observed: ArrayF32, weight: ArrayF32, warp: Warp) -> ArrayF32:
     """The image that looks like ``observed`` under the frame's formation B, and like ``render`` where that
     leaves it open.
 
@@ -53,7 +53,7 @@ def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats
     data /= np.maximum(1.0, differences / OUTLIER)
     seen = _slope(start)
 
-    def normal(change: Floats) -> Floats:
+    def normal(change: ArrayF32) -> ArrayF32:
         """The normal equations of the change in sRGB: dark and bright parts then converge alike."""
         return transpose(data * forward(change / seen)) / seen + np.float32(PRIOR) * change
 
@@ -63,16 +63,16 @@ def undo(render: Floats, observed: Floats, weight: Floats, warp: Warp) -> Floats
     return np.ascontiguousarray(whole[m : m + height, m : m + width, :3])
 
 
-def _on_arrays(operator: Callable[[Tensor], Tensor], warp: Warp) -> Callable[[Floats], Floats]:
+def _on_arrays(operator: Callable[[Tensor], Tensor], warp: Warp) -> Callable[[ArrayF32], ArrayF32]:
     """Half of a warp, wherever its fields lie, as the solver on the CPU calls it."""
 
-    def called(image: Floats) -> Floats:
+    def called(image: ArrayF32) -> ArrayF32:
         return np.asarray(operator(torch.from_numpy(image).to(warp.samples.device)).cpu())
 
     return called
 
 
-def _conjugate_gradients(matrix: Callable[[Floats], Floats], side: Floats) -> Floats:
+def _conjugate_gradients(matrix: Callable[[ArrayF32], ArrayF32], side: ArrayF32) -> ArrayF32:
     solution = np.zeros_like(side)
     residual, direction = side.copy(), side.copy()
     power = _power(residual, residual)
@@ -88,11 +88,11 @@ def _conjugate_gradients(matrix: Callable[[Floats], Floats], side: Floats) -> Fl
     return solution
 
 
-def _power(a: Floats, b: Floats) -> float:
+def _power(a: ArrayF32, b: ArrayF32) -> float:
     return float(np.multiply(a, b, dtype=np.float64).sum())
 
 
-def _slope(linear: Floats) -> Floats:
+def _slope(linear: ArrayF32) -> ArrayF32:
     """The slope of sRGB over linear light."""
     light = np.maximum(linear, MIN_LINEAR)
     return np.asarray(np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * light ** (1 / 2.4 - 1)), np.float32)

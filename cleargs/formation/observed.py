@@ -29,27 +29,27 @@ from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
-from cleargs.splat.views import ImageCache, View, unseen_pixels
+from cleargs.splat.views import ImageCache, TrainingView, unseen_pixels
 
-CELLS = 24
+ERROR_CELLS = 24
 """Cells along the longer side of a frame. Over a cell, detail that is missing or lies a little beside its
 place cancels out; what does not belong to the scene does not."""
 
-ORDINARY = 5.0
+MEDIAN_FACTOR = 5.0
 """Multiple of the frame's median difference that is an ordinary one still: where all of a frame differs, as
 with an exposure that is not known yet, nothing moves."""
 
-NONE = 1e-6
+EPSILON = 1e-6
 """Difference, and share of the pixels, that stands for none."""
 
 
 def pixel_weights(
-    photograph: Tensor,  # [H, W, 3] sRGB
+    render: Tensor,  # [H, W, 3] sRGB
     target: Tensor,  # [H, W, 3] sRGB
     mask: Tensor | None,  # [H, W], True counts
     tolerance: float,
 ) -> Tensor:
-    """How much each pixel counts, [H, W] in (0, 1], of a frame taken as ``target``, which ``photograph`` must
+    """How much each pixel counts, [H, W] in (0, 1], of a frame taken as ``target``, which ``render`` must
     explain.
 
         w = min(1, rho / r)^2,  rho = max(tolerance, 5 median r)
@@ -58,23 +58,24 @@ def pixel_weights(
     rho, w is 1 to the bit. Differences, in sRGB of [0, 1], are pooled as in Sabour et al., "RobustNeRF"
     (2023).
     """
-    height, width = photograph.shape[:2]
-    per_pixel = CELLS / max(height, width)
+    height, width = render.shape[:2]
+    per_pixel = ERROR_CELLS / max(height, width)
     cells = max(1, round(per_pixel * height)), max(1, round(per_pixel * width))
-    counted = torch.ones_like(photograph[..., 0]) if mask is None else mask.float()
-    difference = (photograph - target).permute(2, 0, 1) * counted
-    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(NONE)
+    counted = torch.ones_like(render[..., 0]) if mask is None else mask.float()
+    difference = (render - target).permute(2, 0, 1) * counted
+    shares = adaptive_avg_pool2d(counted[None], cells).clamp_min(EPSILON)
     unexplained = (adaptive_avg_pool2d(difference, cells) / shares).abs().mean(dim=0)
-    ordinary = (ORDINARY * unexplained.median()).clamp_min(tolerance)
+    ordinary = (MEDIAN_FACTOR * unexplained.median()).clamp_min(tolerance)
     here = interpolate(unexplained[None, None], (height, width), mode="bilinear")[0, 0]
-    return (ordinary / here.clamp_min(NONE)).clamp_max(1.0).square()
+    return (ordinary / here.clamp_min(EPSILON)).clamp_max(1.0).square()
 
 
 @dataclass(eq=False)
 class FormedView:
     """Fulfils `cleargs.splat.formation.Formed`: colour, then motion and defocus in linear light.
 
-    ``doubt`` says how much each pixel [H, W] of a photograph counts (see `pixel_weights`); None: all alike.
+    ``robust_mask`` says how much each pixel [H, W] of a photograph counts (see `pixel_weights`); None: all
+    alike.
     """
 
     camera: Camera
@@ -84,39 +85,39 @@ class FormedView:
     affines: AffineOptimiser | None = None
     formation: FrameFormation | None = None
     factor: float = 1.0
-    doubt: Callable[[Tensor], Tensor] | None = None
+    robust_mask: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
-        self._photo = self.camera
+        self._frame_camera = self.camera
         self._margin = 0
         if self.formation is not None:
-            self._margin = margin_for(self.formation.reach_px * self.factor, self._photo)
-            self.camera = widened(self._photo, self._margin)
+            self._margin = margin_for(self.formation.reach_px * self.factor, self._frame_camera)
+            self.camera = widened(self._frame_camera, self._margin)
         self.needs_depth = self.formation is not None
 
     def forward(self, render: Render) -> Tensor:
-        photograph, device = render.image, render.image.device
+        image, device = render.image, render.image.device
         if self.affine is not None:
             self._rendered = render.image
-            photograph = apply_affine(photograph, self.affine)
+            image = apply_affine(image, self.affine)
         if self.formation is not None:
             self._warp = self.warp(render)
-            linear, self._to_linear = through_curve(photograph, linear_curve(device), CHANNELS)
-            photograph, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
-        if self.doubt is not None:
-            self._counts = self.doubt(photograph)
-        return photograph
+            linear, self._to_linear = through_curve(image, linear_curve(device), CHANNELS)
+            image, self._to_srgb = through_curve(self._warp.forward(linear), srgb_curve(device))
+        if self.robust_mask is not None:
+            self._counts = self.robust_mask(image)
+        return image
 
     def warp(self, render: Render) -> Warp:
         """B of the frame, from a render at ``camera`` with depth."""
         assert self.formation is not None and render.depth is not None
         fields = displacement_fields(
-            self.formation.motion, self._photo, render.depth, render.alpha, self._margin, self.factor
+            self.formation.motion, self._frame_camera, render.depth, render.alpha, self._margin, self.factor
         )
         return Warp.of(fields, self._margin)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        if self.doubt is not None:
+        if self.robust_mask is not None:
             gradient = gradient * self._counts[..., None]
         if self.formation is not None:
             light = times_slope(gradient, self._to_srgb, CHANNELS)
@@ -130,9 +131,9 @@ class FormedView:
             self.affines.step(self.frame_id, self._affine_gradient.cpu().numpy())
 
 
-def photograph(
+def render_observed(
     scene: Scene,
-    view: View,
+    view: TrainingView,
     exposure: Exposure | None = None,
     formation: FrameFormation | None = None,
     *,
@@ -171,7 +172,7 @@ def pooled_unseen(fits: Iterable[Fit]) -> float | None:
 
 def evaluate_views(
     scene: Scene,
-    views: Sequence[View],
+    views: Sequence[TrainingView],
     exposure: Exposure | None = None,
     formations: Mapping[int, FrameFormation] | None = None,
     *,
@@ -184,7 +185,7 @@ def evaluate_views(
     fits = []
     for view in views:
         target, mask = images.get(view)
-        image = photograph(scene, view, exposure, formations.get(view.frame_id), engine=engine)
+        image = render_observed(scene, view, exposure, formations.get(view.frame_id), engine=engine)
         unseen = torch.from_numpy(unseen_pixels(view.frame_id, *target.shape[:2])).to(target.device)
         unseen = unseen if mask is None else unseen & mask
         fits.append(
