@@ -41,7 +41,7 @@ def part_of_model(model: Path, target: Path, images: int) -> None:
     small = type(whole)(whole.cameras, kept, whole.point_ids[:0], whole.xyz[:0], whole.error[:0])
     small = type(whole)(
         whole.cameras,
-        {key: image.kept(np.zeros(len(image.xy), bool)) for key, image in kept.items()},
+        {key: image.select(np.zeros(len(image.xy), bool)) for key, image in kept.items()},
         small.point_ids,
         small.xyz,
         small.error,
