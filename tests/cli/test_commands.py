@@ -512,7 +512,7 @@ def test_the_doctor_tells_the_pace(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for pace, words in ((None, "not measured yet"), (0.934, "takes 0.93 of the reference machine's time")):
-        monkeypatch.setattr("cleargs.cli.doctor.remembered_pace", lambda pace=pace: pace)
+        monkeypatch.setattr("cleargs.cli.doctor.cached_pace", lambda pace=pace: pace)
         invoke(["doctor", "--json"])
         (found,) = (one for one in json.loads(capsys.readouterr().out) if one["what"] == "pace")
         assert found == {"what": "pace", "state": "ok", "text": words}
