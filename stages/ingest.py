@@ -158,8 +158,11 @@ def run(context: StageContext[IngestConfig]) -> StageResult:
     return StageResult(
         summary={
             "kind": capture.kind,
-            "poses": ("refined" if outcome.refined else "input") if capture.posed else "sfm",
+            "poses": {"given": "input", "adjusted": "refined", "sfm": "sfm"}[outcome.method],
             "given_poses_missed_px": outcome.missed_px and round(outcome.missed_px, 6),
+            "pose_convention": outcome.convention if capture.posed else None,
+            "kept_out_matches_off_px": {name: round(px, 6) for name, px in outcome.errors_px.items()} or None,
+            "lens": outcome.lens or None,
             "frames": len(frames),
             "frames_available": capture.n_available,
             "registered": len(model.images),

@@ -138,6 +138,19 @@ class Pose:
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat(canonical=True)
         return float(w), float(x), float(y), float(z)
 
+    def with_flipped_axes(self) -> Pose:
+        """Return the pose that an OpenGL camera-to-world matrix has if its axes are meant as OpenCV's."""
+        rotation = _FLIP @ self.rotation
+        return Pose(rotation, -rotation @ self.centre)
+
+    def inverted(self, *, flip: bool) -> Pose:
+        """Return the pose that an OpenGL camera-to-world matrix has if it is meant as world to camera.
+
+        With ``flip`` its axes are OpenGL's, else OpenCV's.
+        """
+        rotation, translation = self.rotation.T @ _FLIP, self.centre
+        return Pose(_FLIP @ rotation, _FLIP @ translation) if flip else Pose(rotation, translation)
+
     @staticmethod
     def from_quaternion(wxyz: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
         w, x, y, z = wxyz
@@ -184,6 +197,11 @@ class Similarity:
         # From the centre, not from the translation: at world offsets of 1e6 the difference of two large
         # numbers has to be taken once, between centre and origin.
         return Pose(rotation, -rotation @ self.points(pose.centre[None])[0])
+
+    def then(self, after: Similarity) -> Similarity:
+        """Return the similarity that does this one, then ``after``."""
+        origin = self.origin + self.scale * self.rotation.T @ after.origin
+        return Similarity(after.rotation @ self.rotation, origin, self.scale * after.scale)
 
     def to_json(self) -> dict[str, Any]:
         """The way back to the input's world, for ``manifest.json``."""

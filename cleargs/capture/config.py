@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from cleargs.base_model import FrozenModel
 from cleargs.plugins import require_known
 
-SfmModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+SfmModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 
 class CaptureConfig(FrozenModel):
@@ -58,7 +58,9 @@ class SfmConfig(FrozenModel):
         "their points by more than this many pixels (median), and at the adjusted ones by at most half",
     )
     camera_model: SfmModel = Field(
-        "SIMPLE_RADIAL", description="COLMAP camera model that SfM fits when the input brings no cameras"
+        "auto",
+        description="COLMAP camera model that SfM fits; auto: SIMPLE_RADIAL, or OPENCV where that explains "
+        "matches better that took no part in fitting it",
     )
     shared_camera: bool = Field(
         True, description="SfM: one camera for all frames of a size; false: a camera a frame"

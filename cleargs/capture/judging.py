@@ -22,6 +22,12 @@ HELD_OUT = 10
 CAPPED_PX = 4.0
 """Errors count up to this: COLMAP takes a match for right within 4 px of its epipolar line."""
 
+_WITH_MATRIX = (
+    pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+    pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
+)
+"""Pairs whose matches fix a fundamental matrix: the scene is not a plane, and the camera moved."""
+
 Matches = dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Pair of image ids -> pixels in the first and in the second image, [K, 2] each."""
 
@@ -43,13 +49,19 @@ def verified_matches(database: Path) -> Matches:
     return found
 
 
-def keep_out(database: Path) -> Matches:
-    """Remove every `HELD_OUT`-th track from the verified matches in ``database``, and return its matches.
+def keep_out(database: Path) -> tuple[Matches, float]:
+    """Remove every `HELD_OUT`-th track from the verified matches in ``database``.
 
     A track is all features that matches connect. Its matches are kept out together: else the others would
     give its point away.
+
+    Returns:
+        The matches that were removed, and their median distance, px, from the lines of the fundamental
+        matrices that COLMAP fitted to each pair alone: no poses explain them much better. It is 0 where no
+        pair has one.
     """
     kept_out: Matches = {}
+    alone = []
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
         images = sorted(image.image_id for image in opened.read_all_images())
         pixels = {key: np.asarray(opened.read_keypoints(key), np.float64)[:, :2] for key in images}
@@ -62,32 +74,38 @@ def keep_out(database: Path) -> Matches:
         ]
         tracks = _tracks(edges, sum(map(len, pixels.values())))
         sizes = np.bincount(tracks)
+        first = np.unique(tracks, return_index=True)[1]  # by which a track is the same in another database
+        owner = np.repeat(images, [len(pixels[key]) for key in images])[first]
+        number = first - np.array([start[key] for key in owner.tolist()], np.int64)
         # Wrong matches join tracks: one of more features than there are images is none.
-        chosen = (np.arange(len(sizes)) % HELD_OUT == 0) & (sizes <= len(images))
+        chosen = ((owner + number) % HELD_OUT == 0) & (sizes <= len(images))
         for geometry, row, edge, (one, two) in zip(geometries, rows, edges, pairs, strict=True):
             out = chosen[tracks[edge[:, 0]]]
             if out.any():
-                kept_out[one, two] = pixels[one][row[out, 0]], pixels[two][row[out, 1]]
+                kept_out[one, two] = first_xy, second_xy = pixels[one][row[out, 0]], pixels[two][row[out, 1]]
+                if geometry.config in _WITH_MATRIX and geometry.F is not None:
+                    alone.append(_sampson(_homogeneous(first_xy), _homogeneous(second_xy), geometry.F))
                 geometry.inlier_matches = row[~out].astype(np.uint32)
                 opened.update_two_view_geometry(one, two, geometry)
-    return kept_out
+    return kept_out, float(np.median(np.concatenate(alone))) if alone else 0.0
 
 
 def _tracks(edges: list[NDArray[np.int64]], features: int) -> NDArray[np.int64]:
-    """Number of the track of each feature; edges are pairs of features."""
+    """Return the number of the track of each feature; ``edges`` are pairs of features."""
     a, b = np.concatenate([np.zeros((0, 2), np.int64), *edges]).T
     _, labels = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(features, features)))
     return np.asarray(labels, np.int64)
 
 
-def errors(
+def epipolar_errors(
     matches: Matches,
     poses: Mapping[int, NDArray[np.float64]],  # image id -> world to camera, [3, 4]
     cameras: Mapping[int, pycolmap.Camera],  # by image id
 ) -> NDArray[np.float64]:
-    """Distances of ``matches`` from their epipolar lines (Sampson error), px; infinite without a pose.
+    """Return the distances of ``matches`` from their epipolar lines (Sampson error), px.
 
-    Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, equation 11.9.
+    They are infinite where a frame has no pose. Source: Hartley and Zisserman, Multiple View Geometry, 2nd
+    edition, equation 11.9.
     """
     found = [np.zeros(0)]
     for (one, two), (first, second) in matches.items():
@@ -98,15 +116,25 @@ def errors(
         rotation = b[:, :3] @ a[:, :3].T
         x, y, z = b[:, 3] - rotation @ a[:, 3]
         essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-        p = _rays(cameras[one], first)
-        q = _rays(cameras[two], second)
-        to_second, to_first = p @ essential.T, q @ essential
-        weight = (to_second[:, :2] ** 2).sum(axis=1) + (to_first[:, :2] ** 2).sum(axis=1)
-        off = np.abs((q * to_second).sum(axis=1)) / np.sqrt(np.maximum(weight, 1e-300))
+        off = _sampson(_rays(cameras[one], first), _rays(cameras[two], second), essential)
         focal = 0.5 * (cameras[one].mean_focal_length() + cameras[two].mean_focal_length())
         found.append(np.where(np.isfinite(off), off * focal, np.inf))
     return np.concatenate(found)
 
 
+def _sampson(
+    p: NDArray[np.float64],  # [K, 3] points of the first image
+    q: NDArray[np.float64],  # [K, 3] of the second
+    matrix: NDArray[np.float64],  # [3, 3], q^T matrix p = 0
+) -> NDArray[np.float64]:
+    to_second, to_first = p @ matrix.T, q @ matrix
+    weight = (to_second[:, :2] ** 2).sum(axis=1) + (to_first[:, :2] ** 2).sum(axis=1)
+    return np.asarray(np.abs((q * to_second).sum(axis=1)) / np.sqrt(np.maximum(weight, 1e-300)))
+
+
 def _rays(camera: pycolmap.Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:  # [K, 2] -> [K, 3]
-    return np.column_stack([np.asarray(camera.cam_from_img(xy)), np.ones(len(xy))])
+    return _homogeneous(np.asarray(camera.cam_from_img(xy)))
+
+
+def _homogeneous(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.column_stack([xy, np.ones(len(xy))])

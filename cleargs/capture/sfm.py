@@ -6,19 +6,21 @@ COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from cleargs.capture.adjustment import FIRST_LENS
 from cleargs.capture.cameras import Intrinsics, Pose, Similarity, guessed_camera, normalise
 from cleargs.capture.child import run_child
 from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_worker import OUTCOME, Job, SfmOutcome
+from cleargs.capture.sfm_worker import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.progress import Reporter
@@ -79,29 +81,69 @@ def reconstruct(
         if 0 < missed <= config.refine_above:  # some exporters write 0 or -1 for an error they do not know
             placed = _placed_by_input(frames, refined=False)
             return Reconstruction(adopted, similarity, SfmOutcome(placed=placed, missed_px=missed))
-    moved = [similarity.pose(pose) for pose in poses]
-    model, outcome = _run(job_of(posed, moved, folder, config, seed, threads), reporter)
+    worlds = _conventions(poses, similarity) if given is None else {OWN: (similarity, poses)}
+    readings = {name: [world.pose(pose) for pose in read] for name, (world, read) in worlds.items()}
+    model, outcome = _run(job_of(posed, readings, folder, config, seed, threads), reporter)
     if not len(model.point_ids):
         raise StageError(
             "no point could be triangulated at the given poses",
             hint="check that poses, axes (OpenGL camera to world) and images belong together, "
             "or set ingest.poses=sfm",
         )
-    missed, refined = outcome.missed_px or 0.0, outcome.refined
-    if refined:
+    similarity = worlds[outcome.convention][0]
+    if outcome.convention != OWN:
+        reporter.warn(
+            f"the poses do not fit the images as they should be meant: read as {outcome.convention}"
+        )
+    _report_outcome(outcome, float(np.median(model.error)), config, reporter)
+    if outcome.method == "sfm":
+        again = normalise([image.pose for _, image in sorted(model.images.items())])
+        model, similarity = _transformed(model, again), similarity.then(again)
+        placed = _placed_by_input(frames, refined=True) | dict(outcome.placed)
+        return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+    if adopted is not None and len(adopted.error) and not outcome.refined:
+        model = adopted
+    placed = _placed_by_input(frames, outcome.refined)
+    return Reconstruction(model, similarity, outcome.model_copy(update={"placed": placed}))
+
+
+def _conventions(poses: Sequence[Pose], own: Similarity) -> dict[str, tuple[Similarity, Sequence[Pose]]]:
+    """Return the poses of a transforms.json by each convention that its author may have meant.
+
+    The value is the similarity that normalises their world, and the poses in the input's.
+    """
+    meant = {
+        "matrices with OpenCV axes (y down, z forward)": [pose.with_flipped_axes() for pose in poses],
+        "matrices from the world to the camera": [pose.inverted(flip=True) for pose in poses],
+        "matrices from the world to the camera, with OpenCV axes": [
+            pose.inverted(flip=False) for pose in poses
+        ],
+    }
+    found: dict[str, tuple[Similarity, Sequence[Pose]]] = {OWN: (own, poses)}
+    for name, others in meant.items():
+        with suppress(InputError):  # all at one place by this one
+            found[name] = normalise(others), others
+    return found
+
+
+def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, reporter: Reporter) -> None:
+    """Say whether the input's poses were adjusted or found again, and by how much that explains more."""
+    missed = outcome.missed_px or 0.0
+    if outcome.refined:
+        before, after = outcome.errors_px["given"], outcome.errors_px[outcome.method]
+        what = "poses and cameras are adjusted to the images"
+        if outcome.method == "sfm":
+            what = "poses and cameras are found again and laid over the given ones"
         reporter.info(
-            f"at the input's poses features missed their points by {missed:.1f} px (median): adjusted to the "
-            f"images, {np.median(model.error):.1f} px; ingest.refine_above keeps them"
+            f"at the input's poses features missed their points by {missed:.1f} px (median): {what} "
+            f"({outcome.lens}), {found:.1f} px; matches that took no part are off by {after:.2f} px instead of "
+            f"{before:.2f}; ingest.refine_above keeps the input's"
         )
     elif missed > config.refine_above:
         reporter.info(
             f"at the input's poses features miss their points by {missed:.1f} px (median), which no other "
-            "poses explain (a rolling shutter, blur, or a wrong lens may): they stay"
+            "poses and cameras explain (a rolling shutter or blur may): they stay"
         )
-    if adopted is not None and len(adopted.error) and not refined:
-        model = adopted
-    placed = _placed_by_input(frames, refined)
-    return Reconstruction(model, similarity, SfmOutcome(placed=placed, missed_px=missed, refined=refined))
 
 
 def _check_registered(registered: int, total: int, config: SfmConfig, reporter: Reporter) -> None:
@@ -123,7 +165,7 @@ def _run(job: Job, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]:
 
 def job_of(
     frames: Sequence[WorkFrame],
-    poses: Sequence[Pose] | None,
+    poses: Mapping[str, Sequence[Pose]] | None,
     folder: Path,
     config: SfmConfig,
     seed: int,
@@ -146,10 +188,14 @@ def job_of(
     exif_images: list[Path | None] = []
     for frame in (frames[owners.index(owner)] for owner in numbers):
         known = frame.camera if poses is not None else None
-        cameras.append(known or guessed_camera(config.camera_model, frame.width, frame.height))
+        model = FIRST_LENS if config.camera_model == "auto" else config.camera_model
+        cameras.append(known or guessed_camera(model, frame.width, frame.height))
         stated = poses is None and frame.source.pts is None
         exif_images.append(frame.source.path.resolve() if stated else None)
-    matrices = [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in poses or ()]
+    matrices = {
+        name: [np.column_stack([pose.rotation, pose.translation]).tolist() for pose in read]
+        for name, read in (poses or {}).items()
+    }
     return Job(
         folder=folder,
         images=folder / "images",

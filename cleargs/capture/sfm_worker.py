@@ -18,16 +18,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations, count
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from cleargs.base_model import FrozenModel
-from cleargs.capture.cameras import Intrinsics
+from cleargs.capture.adjustment import (
+    FIRST_LENS,
+    SHARED_BY,
+    Adjuster,
+    lay_over,
+    lens_of,
+    median_residual,
+)
+from cleargs.capture.cameras import Intrinsics, guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
 from cleargs.capture.config import SfmConfig
+from cleargs.capture.judging import epipolar_errors, verified_matches
 from cleargs.capture.matching import (
     copy_without_features,
     loop_pairs,
@@ -43,14 +52,20 @@ from cleargs.safe_io import read_json
 _MIN_MODEL = 10
 """COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
 third of its frames: eight of a dozen are a model."""
-_REFINEMENTS = 4
-_CONVINCING = 0.5
-"""Adjusted poses are taken where features then miss their points by at most this share of before. What was
-left on measured captures: 0.05 with random errors of poses, 0.34 and 0.41 with the poses of a depth camera
-and of a headset, but 0.77 with a rolling shutter and all with blur, which other poses do not explain."""
-_HELD_BY = 15
-"""Fewest points that a frame must see to take part in an adjustment."""
+_CONVINCING = 0.6
+"""Adjusted poses and cameras are taken where matches that were kept out are then off by at most this share of
+before (medians). What was left on measured captures: 0.16 with the poses of a depth camera and 0.45 with
+those of a headset, but 0.8 with a rolling shutter, which other poses do not explain."""
+_EXPLAINED = 1.5
+"""Poses are found again where matches that were kept out are off by more than this, in units of what pairs of
+frames alone leave. It is 0.90 and 1.05 with the adjusted poses of a depth camera and of a headset, 3 where an
+adjustment from poses that were off by 4 degrees ended at wrong ones."""
+_FITS_PX, _FITS = 2.0, 0.5
+"""Poses fit the images where at least this share of the matches is within so many px of its epipolar line. On
+a synthetic room it is 0.99 with true poses, 0.21 with the axes of another program, 0.13 inverted."""
 
+OWN = "own"
+"""Convention of an input's poses: as its layout has it."""
 
 OUTCOME = "outcome.json"
 """In the folder of the model: its `SfmOutcome`."""
@@ -66,8 +81,8 @@ class Job(FrozenModel):
     cameras: list[Intrinsics]
     camera_of: list[int]
     """For each image the number of its camera."""
-    poses: list[list[list[float]]] | None
-    """World to camera, 3x4 for each image."""
+    poses: dict[str, list[list[list[float]]]] | None
+    """World to camera, 3x4 for each image, by each of the conventions that the input may mean."""
     exif_images: list[Path | None]
     """For each camera an input image that may state its focal length."""
     config: SfmConfig
@@ -82,8 +97,19 @@ class SfmOutcome(FrozenModel):
     """Working image -> how its pose was found, or why there is none; COLMAP's process knows it of SfM."""
     missed_px: float | None = None
     """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
-    refined: bool = False
-    """Whether they were adjusted."""
+    convention: str = OWN
+    """The convention by which the input's poses fit the images."""
+    method: Literal["given", "adjusted", "sfm"] = "given"
+    """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
+    errors_px: Mapping[str, float] = Field(default_factory=dict)
+    """Method -> median distance of the matches that were kept out from their epipolar lines, px."""
+    lens: str = ""
+    """COLMAP model of the cameras that were adjusted; empty: none was."""
+
+    @property
+    def refined(self) -> bool:
+        """Return True if the poses are not those of the input."""
+        return self.method != "given"
 
 
 @dataclass(frozen=True)
@@ -124,6 +150,8 @@ class _Sfm:
         self._job = job
         self._report = report
         self._database = job.folder / "database.db"
+        self._matched = self._database
+        """The database with the features by which frames were placed."""
         self._output = job.folder / "model.partial"
         self._options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=job.seed, extract_colors=False
@@ -154,17 +182,12 @@ class _Sfm:
         self._match(self._database, pairs, _FIRST)
         make_folder(self._output, empty=True)
         if job.poses is None:
-            model = self._map()
-            model, placed = self._place_the_rest(model, pairs)
-            outcome = SfmOutcome(placed=placed)
+            model, placed = self._found(pairs)
+            if job.config.camera_model == "auto":
+                model = self._adjuster(self._matched).with_measured_lens(model)
+            outcome = SfmOutcome(placed=placed, method="sfm", lens=lens_of(model))
         else:
-            model = self._triangulate()
-            missed = _median_error(model)
-            outcome = SfmOutcome(missed_px=missed)
-            if missed > job.config.refine_above:
-                adjusted = self._refine(copy.deepcopy(model))
-                if adjusted is not None and _median_error(adjusted) <= _CONVINCING * missed:
-                    model, outcome = adjusted, SfmOutcome(missed_px=missed, refined=True)
+            model, outcome = self._from_poses(job.poses, pairs)
         make_folder(self._output, empty=True)
         model.write_binary(self._output)
         write_json(self._output / OUTCOME, outcome.model_dump())
@@ -172,18 +195,95 @@ class _Sfm:
         self._output.rename(job.folder / "model")
         sync(job.folder)
 
+    def _found(self, pairs: Sequence[tuple[int, int]]) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
+        """Return the model of structure from motion, and how each frame was placed."""
+        return self._place_the_rest(self._map(), pairs)
+
+    def _from_poses(
+        self, given: Mapping[str, list[list[list[float]]]], pairs: Sequence[tuple[int, int]]
+    ) -> tuple[pycolmap.Reconstruction, SfmOutcome]:
+        """Return the model at the input's poses, or at others where the images contradict these."""
+        convention = self._convention(given)
+        start = self._triangulate(given[convention])
+        missed = median_residual(start)
+        outcome = SfmOutcome(missed_px=missed, convention=convention)
+        if missed <= self._job.config.refine_above and len(start.points3D):
+            return start, outcome
+        adjuster = self._adjuster(self._database)
+        errors = {"given": adjuster.median_error(start)}
+        models = {}
+        placed: dict[str, str] = {}
+        self._report(phase="adjusting poses and cameras", total=None)
+        shared = len(self._job.names) >= SHARED_BY * len(self._job.cameras)
+        if (adjusted := adjuster.refine(start, cameras=shared)) is not None:
+            models["adjusted"] = adjusted
+            errors["adjusted"] = adjuster.median_error(adjusted)
+        convincing = _CONVINCING * errors["given"]
+        good = min(convincing, _EXPLAINED * adjuster.floor)
+        if (adjusted is None or errors["adjusted"] > good) and (
+            found := self._sfm_over(start, pairs, adjuster)
+        ) is not None:
+            models["sfm"], placed = found
+            errors["sfm"] = adjuster.median_error(models["sfm"])
+        outcome = outcome.model_copy(update={"errors_px": errors})
+        best = min(models, key=lambda method: errors[method], default="")
+        if not best or errors[best] > convincing:
+            return start, outcome
+        model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
+        update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
+        return model, outcome.model_copy(update=update)
+
+    def _adjuster(self, database: Path) -> Adjuster:
+        return Adjuster(database, self._with_points)
+
+    def _convention(self, given: Mapping[str, list[list[list[float]]]]) -> str:
+        """Return the convention by which poses fit the matches best; `OWN` where it fits, or none does."""
+        if len(given) == 1:
+            return OWN
+        matches = verified_matches(self._database)
+        cameras = [_colmap_camera(self._job, number) for number in range(len(self._job.cameras))]
+        camera_of = {index + 1: cameras[number] for index, number in enumerate(self._job.camera_of)}
+        fits = {}
+        for convention, matrices in given.items():
+            poses = {index + 1: np.array(matrix) for index, matrix in enumerate(matrices)}
+            off = epipolar_errors(matches, poses, camera_of)
+            fits[convention] = float((off < _FITS_PX).mean()) if len(off) else 0.0
+        best = max(fits, key=lambda convention: fits[convention])
+        return best if fits[OWN] < _FITS <= fits[best] else OWN
+
+    def _sfm_over(
+        self, given: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]], judge: Adjuster
+    ) -> tuple[pycolmap.Reconstruction, dict[str, str]] | None:
+        """Return the model of structure from motion in the world of ``given``, and how frames were placed.
+
+        The matches that ``judge`` kept out take no part in its last adjustment. None where a frame has no
+        pose.
+        """
+        job = self._job
+        guesses = [guessed_camera(FIRST_LENS, camera.width, camera.height) for camera in job.cameras]
+        self._set_cameras([pycolmap.Camera(**asdict(guess)) for guess in guesses])
+        try:
+            model, placed = self._found(pairs)
+        except StageError:
+            return None
+        if model.num_reg_images() < len(job.names):
+            return None
+        # Frames that were placed again have other features. The tracks of the others are kept out alike.
+        adjuster = judge if self._matched == self._database else self._adjuster(self._matched)
+        model = adjuster.with_measured_lens(adjuster.adjust(model, cameras=True))
+        lay_over(model, given, model.images.values())
+        return model, placed
+
     def _import(self) -> None:
         """Create the database with cameras and images in frame order: ids do not depend on threads."""
         job = self._job
+        cameras = [_colmap_camera(job, number) for number in range(len(job.cameras))]
         if self._database.exists():
             with pycolmap.Database.open(self._database) as opened:
-                if opened.num_images() == len(job.names):
-                    return
+                whole = opened.num_images() == len(job.names)
+            if whole:
+                return self._set_cameras(cameras)  # a killed run may have adjusted them
             remove_database(self._database)
-        cameras = [pycolmap.Camera(**asdict(camera)) for camera in job.cameras]
-        for camera, image in zip(cameras, job.exif_images, strict=True):
-            if image is not None:
-                apply_exif_focal(camera, image)
         with pycolmap.Database.open(self._database) as opened, pycolmap.DatabaseTransaction(opened):
             for index, camera in enumerate(cameras):
                 camera.camera_id = index + 1
@@ -197,6 +297,12 @@ class _Sfm:
                 frame = pycolmap.Frame(frame_id=index + 1, rig_id=number + 1)
                 frame.add_data_id(shot.data_id)
                 opened.write_frame(frame, use_frame_id=True)
+
+    def _set_cameras(self, cameras: Sequence[pycolmap.Camera]) -> None:
+        with pycolmap.Database.open(self._database) as opened:
+            for index, camera in enumerate(cameras):
+                camera.camera_id = index + 1
+                opened.update_camera(camera)
 
     def _extract(self, database: Path, names: Sequence[str], settings: _FeatureSettings) -> None:
         """SIFT on the working images; frames that have features already are skipped by COLMAP."""
@@ -269,12 +375,14 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Go on mapping with the features of the frames without a pose found anew by `_SECOND`; how each
-        frame was placed, or why it was not.
+        """Go on mapping with features by `_SECOND` of the frames without a pose.
+
+        Returns the model and how each frame was placed, or why it was not.
 
         Works in a copy of the database: a killed run finds the first as it was.
         """
         names = self._job.names
+        self._matched = self._database
         first = _names_in(model)
         missing = [index for index, name in enumerate(names) if name not in first]
         if not missing:
@@ -293,14 +401,15 @@ class _Sfm:
         models = pycolmap.incremental_mapping(
             second, self._job.images, self._output, options, input_path=start
         )
-        model = max([model, *models.values()], key=lambda model: model.num_reg_images())
+        best = max([model, *models.values()], key=lambda model: model.num_reg_images())
+        if best is not model:
+            model, self._matched = best, second
         placed = dict.fromkeys(_names_in(model), "sfm at half resolution") | dict.fromkeys(first, "sfm")
         reasons = why_missing(second, [index + 1 for index, name in enumerate(names) if name not in placed])
         return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
 
-    def _triangulate(self) -> pycolmap.Reconstruction:
-        """Points at the given poses and cameras, which stay as they are here."""
-        assert self._job.poses is not None
+    def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
+        """Return points at the given poses and cameras, which stay as they are here."""
         self._report(phase="triangulating", total=None)
         model = pycolmap.Reconstruction()
         with pycolmap.Database.open(self._database) as opened:
@@ -309,52 +418,18 @@ class _Sfm:
             for image in sorted(opened.read_all_images(), key=lambda image: image.image_id):
                 model.add_image_with_trivial_frame(
                     pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
-                    pycolmap.Rigid3d(np.array(self._job.poses[image.image_id - 1])),
+                    pycolmap.Rigid3d(np.array(poses[image.image_id - 1])),
                 )
-        return self._with_points(model)
+        return self._with_points(model, self._database)
 
-    def _with_points(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """``model`` with points triangulated again."""
+    def _with_points(self, model: pycolmap.Reconstruction, database: Path) -> pycolmap.Reconstruction:
+        """Return ``model`` with points triangulated again from the matches in ``database``."""
+        with pycolmap.Database.open(database) as opened:
+            for camera in model.cameras.values():  # COLMAP refuses a model of another lens
+                opened.update_camera(camera)
         return pycolmap.triangulate_points(
-            model, self._database, self._job.images, self._output, options=self._options
+            model, database, self._job.images, self._output, options=self._options
         )
-
-    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | None:
-        """Adjust poses and points to the features; the cameras stay.
-
-        At better poses more features find their points, so both are done in turn. The features leave place,
-        turn and size of the whole open: the adjusted cameras are laid over the given ones by a similarity. A
-        frame that few points hold keeps its given pose. None where few points hold every frame.
-        """
-        given = {
-            frame_id: pycolmap.Rigid3d(frame.rig_from_world.matrix())
-            for frame_id, frame in model.frames.items()
-        }
-        before = {image.name: _centre_and_axes(image) for image in model.images.values()}
-        options = pycolmap.BundleAdjustmentOptions(
-            refine_focal_length=False, refine_extra_params=False, print_summary=False
-        )
-        # Wrong matches are still among them.
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.solver_options.num_threads = 1
-        self._report(phase="adjusting poses", total=_REFINEMENTS)
-        for done in range(_REFINEMENTS):
-            pycolmap.bundle_adjustment(model, options)
-            model = self._with_points(model)
-            self._report(done=done + 1)
-        held = [image for image in model.images.values() if image.num_points3D >= _HELD_BY]
-        if not held:
-            return None
-        similarity = pycolmap.estimate_sim3d(
-            np.array([_centre_and_axes(image) for image in held]).reshape(-1, 3),
-            np.array([before[image.name] for image in held]).reshape(-1, 3),
-        )
-        if similarity is not None:
-            model.transform(similarity)
-        for image in model.images.values():
-            if image.num_points3D < _HELD_BY:
-                model.frames[image.frame_id].rig_from_world = given[image.frame_id]
-        return model
 
 
 def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
@@ -373,18 +448,12 @@ def apply_exif_focal(camera: pycolmap.Camera, image: Path) -> None:
     camera.has_prior_focal_length = True
 
 
-def _median_error(model: pycolmap.Reconstruction) -> float:
-    """Median over the points of their mean reprojection error, px; 0 without any point."""
-    errors = [point.error for point in model.points3D.values()]
-    return float(np.median(errors)) if errors else 0.0
-
-
-def _centre_and_axes(image: pycolmap.Image) -> NDArray[np.float64]:  # [4, 3]
-    """Where a camera is, and the points at distance 1 on its axes: the centres of a straight path alone leave
-    the turn about it open. (1 is the distance of the farthest camera in the normalised world.)
-    """
-    centre: NDArray[np.float64] = image.projection_center()
-    return np.vstack([centre, centre + image.cam_from_world().rotation.matrix()])
+def _colmap_camera(job: Job, number: int) -> pycolmap.Camera:
+    """Return camera ``number`` of the job, from the focal length that its input image states."""
+    camera = pycolmap.Camera(**asdict(job.cameras[number]))
+    if (image := job.exif_images[number]) is not None:
+        apply_exif_focal(camera, image)
+    return camera
 
 
 def _names_in(model: pycolmap.Reconstruction) -> set[str]:
