@@ -75,7 +75,8 @@ def run(
         workflow=workflow,
         overrides=[
             *([f"g0.quality={quality}"] if quality else []),
-            *(f"{name}={_toml(value)}" for name, value in (set or {}).items()),
+            # JSON's spelling of a value is TOML's too.
+            *(f"{name}={json.dumps(x, ensure_ascii=False, default=str)}" for name, x in (set or {}).items()),
         ],
         seed=seed,
         store=None if store is None else Path(store),
@@ -286,11 +287,6 @@ def _reporter(progress: Progress) -> Reporter:
     if callable(progress):
         return LineReporter(progress, lambda text: progress(f"warning: {text}"), progress)
     return progress
-
-
-def _toml(value: Any) -> str:
-    """A plain value or a list as TOML, of which JSON's spelling is a part."""
-    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _floats(image: AnyImage) -> ImageF32:

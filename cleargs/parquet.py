@@ -26,16 +26,16 @@ def schema_of(row: type) -> pa.Schema:
     A field ``Annotated[TYPE, MEANING]`` is a column, nullable where None is allowed. A field without a
     meaning is not a column. An Arrow type before the meaning replaces the usual int32, float64, bool or text.
     """
-    hints = get_type_hints(row, include_extras=True)
-    return pa.schema([_column(name, hint) for name, hint in hints.items() if get_origin(hint) is Annotated])
-
-
-def _column(name: str, hint: Any) -> pa.Field:
-    annotation, *kind, meaning = get_args(hint)
-    members = get_args(annotation) if get_origin(annotation) is UnionType else (annotation,)
-    plain = str if get_origin(members[0]) is Literal else members[0]
-    usual = {int: pa.int32(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
-    return column(name, kind[0] if kind else usual[plain], meaning, nullable=NoneType in members)
+    usual: dict[Any, Any] = {int: pa.int32(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
+    fields = []
+    for name, hint in get_type_hints(row, include_extras=True).items():
+        if get_origin(hint) is Annotated:
+            annotation, *kind, meaning = get_args(hint)
+            members = get_args(annotation) if get_origin(annotation) is UnionType else (annotation,)
+            plain = str if get_origin(members[0]) is Literal else members[0]
+            found = kind[0] if kind else usual[plain]
+            fields.append(column(name, found, meaning, nullable=NoneType in members))
+    return pa.schema(fields)
 
 
 def write_table(path: Path, table: pa.Table, schema: pa.Schema) -> None:

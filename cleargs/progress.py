@@ -18,6 +18,10 @@ PREVIEW = "preview.png"
 """A picture of the work so far, which a stage may leave among its checkpoints."""
 
 
+LINE_EVERY = 10.0
+"""Seconds between two lines of one task."""
+
+
 class Task(Protocol):
     """One piece of counted work."""
 
@@ -94,22 +98,12 @@ class CountedTask:
         return (now - begin) * max(0.0, 1.0 - share) / (share - first) if share > first else None
 
 
-class SilentTask:
-    """A task nobody watches."""
-
-    def advance(self, steps: int = 1) -> None: ...
-
-    def update(
-        self, *, done: int | None = None, note: str | None = None, share: float | None = None
-    ) -> None: ...
-
-
 class SilentReporter:
     """A reporter nobody listens to."""
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        yield SilentTask()
+        yield CountedTask(total, lambda done, note, left: None)
 
     def info(self, text: str) -> None: ...
 
@@ -117,16 +111,27 @@ class SilentReporter:
 
 
 class LineReporter:
-    """A reporter that passes lines on to functions: remarks, warnings, and each task that is done."""
+    """A reporter that passes lines on to functions: remarks, warnings, and how far each task is."""
 
-    def __init__(self, info: Say, warn: Say, done: Say) -> None:
-        self._info, self._warn, self._done = info, warn, done
+    def __init__(self, info: Say, warn: Say, progress: Say) -> None:
+        self._info, self._warn, self._progress = info, warn, progress
 
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
-        begin = time.monotonic()
-        yield SilentTask()
-        self._done(f"{label}: done in {time.monotonic() - begin:.1f} s")
+        last = begin = time.monotonic()
+
+        def show(done: int, note: str, left: float | None) -> None:
+            nonlocal last
+            if time.monotonic() - last >= LINE_EVERY:
+                last = time.monotonic()
+                count = f"{label}: {done}" + (f"/{total}" if total else "")
+                rest = "" if left is None else f"{left:.0f} s left"
+                self._progress(", ".join(filter(None, (count, note, rest))))
+
+        task = CountedTask(total, show)
+        yield task
+        note = f", {task.note}" if task.note else ""
+        self._progress(f"{label}: done in {time.monotonic() - begin:.1f} s{note}")
 
     def info(self, text: str) -> None:
         self._info(text)

@@ -94,18 +94,17 @@ def cause(error: Exception) -> str:
     """Why a file cannot be read, in one line without its path: what one of `FAULTS` says."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
-    if isinstance(error, UnicodeDecodeError):
-        return "it is not UTF-8 text"
-    if isinstance(error, struct.error):
-        return "it breaks off"
-    if isinstance(error, OverflowError):
-        return "a number is too large"
-    if isinstance(error, ZeroDivisionError):
-        return "a number is zero that must not be"
-    if isinstance(error, RecursionError):
-        return TOO_DEEP
     if isinstance(error, KeyError):
         return f"{error.args[0]!r} is missing" if error.args else "something is missing"
+    for kind, words in (
+        (UnicodeDecodeError, "it is not UTF-8 text"),
+        (struct.error, "it breaks off"),
+        (OverflowError, "a number is too large"),
+        (ZeroDivisionError, "a number is zero that must not be"),
+        (RecursionError, TOO_DEEP),
+    ):
+        if isinstance(error, kind):
+            return words
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
@@ -117,14 +116,8 @@ def printable(text: str, keep: str = "") -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(
-        character if character in keep or not _acts(character) else f"\\u{ord(character):04x}"
-        for character in text
-    )
-
-
-def _acts(character: str) -> bool:
-    return unicodedata.category(character) in _HARMFUL or character in _BIDI
+    acting = {c for c in text if unicodedata.category(c) in _HARMFUL or c in _BIDI}.difference(keep)
+    return "".join(f"\\u{ord(character):04x}" if character in acting else character for character in text)
 
 
 def require_utf8(path: Path | str) -> None:

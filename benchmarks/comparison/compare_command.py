@@ -18,7 +18,6 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -126,7 +125,7 @@ def compare(
     quality: tuple[str, ...],
     wants_report: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -161,9 +160,7 @@ def compare(
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=lpips, scorers=SCORERS)
     place = resolve_device(device, reporter.info)
-    recipe = SceneRecipe(
-        dag, workflow, (*quality, *overrides), place, threads_or_all(threads), options, steps
-    )
+    recipe = SceneRecipe(dag, workflow, (*quality, *overrides), place, threads, options, steps)
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             _check_names([run.resolve().name for run in runs], "runs")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, threads_or_all, work_options
+from cleargs.cli.common import DONE_IN_PART, output_option, quiet_option, work_options
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.evaluate.config import INSTALLABLE, LPIPS_NETS, EvalOptions
 from cleargs.pipeline.dag import Dag
@@ -62,7 +62,7 @@ def evidence(
     listed: Path | None,
     dry_run: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     quiet: bool,
 ) -> int:
     """Make the captures, scenes, tables and pictures of the page of results.
@@ -91,9 +91,7 @@ def evidence(
     beside = page.parent / "results"
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
-    recipe = SceneRecipe(
-        dag, RECIPE, (), resolve_device(device, reporter.info), threads_or_all(threads), options
-    )
+    recipe = SceneRecipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads, options)
     command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
     origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
     version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"

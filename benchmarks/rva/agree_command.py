@@ -15,7 +15,6 @@ from cleargs.cli.common import (
     print_json,
     quiet_option,
     run_argument,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -78,7 +77,7 @@ def agree(
     most: int,
     overrides: tuple[str, ...],
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -171,7 +170,7 @@ def _cues_of(
     frames: Sequence[Frame],
     seed: int,
     device: Any,
-    threads: int | None,
+    threads: int,
     reporter: Reporter,
 ) -> EvaluatorCues:
     """Score the frames, or take what RUN/agree keeps of an earlier call."""
@@ -184,7 +183,7 @@ def _cues_of(
         EvaluatedFrame(frame.frame_id, ingest / frame.image, ingest / frame.mask if frame.mask else None)
         for frame in frames
     ]
-    cues = evaluator.evaluate(views, threads=threads_or_all(threads), reporter=reporter)
+    cues = evaluator.evaluate(views, threads=threads, reporter=reporter)
     return EvaluatorCues(label(evaluator), cues)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.speed import torch_tiles
+from benchmarks.speed import reference, torch_tiles
 from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
 from benchmarks.speed.benchmark_results import (
     Benchmark,
@@ -24,13 +24,12 @@ from benchmarks.speed.iteration import Iteration, projected_frame, use_threads
 from benchmarks.speed.oracle import Accuracy, Truth, accuracy, choose_pixels, oracle
 from benchmarks.speed.peak_memory import peak_memory
 from benchmarks.speed.peaks import measure_peaks
+from benchmarks.speed.reference import Splats
 from benchmarks.speed.roofline import roofline
 from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
 from benchmarks.speed.work import size_of, work_of
 from cleargs.progress import Reporter
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
-from cleargs.splat.kernels.reference import Splats
 from cleargs.splat.pace import random_scene
 
 RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagate")

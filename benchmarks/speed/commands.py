@@ -8,9 +8,9 @@ from typing import Any, Literal, get_args
 
 import click
 
-from cleargs.cli.common import json_option, output_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.common import json_option, output_option, print_json, quiet_option
 from cleargs.cli.progress_bars import make_reporter
-from cleargs.pipeline.session import resolve_device
+from cleargs.pipeline.session import resolve_device, usable_cores
 from cleargs.splat.config import Quality
 
 
@@ -67,7 +67,7 @@ def splat(
     from cleargs.files import write_bytes, write_json
     from cleargs.splat.kernels.cpu.backend import warm_up
 
-    counts = tuple(sorted({1, threads_or_all(threads)}))
+    counts = tuple(sorted({1, threads or usable_cores()}))
     plan = (quick_plan if quick else full_plan)(counts)
     warm_up()
     benchmark = run(dataclasses.replace(plan, seed=seed), make_reporter(quiet))
@@ -138,7 +138,7 @@ def train(
     from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
     from benchmarks.speed.iteration import PARTS, WHOLE
 
-    count = threads_or_all(threads)
+    count = threads or usable_cores()
     case = BenchmarkCase(gaussians, width, height)
     plan = Plan(cases=(case,), threads=(count,), rounds=repeats, repetitions=5)
     found = measure(case, plan)
@@ -177,7 +177,7 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
     from cleargs.splat.kernels.cpu.backend import warm_up
 
     warm_up()
-    benchmark = run(plan_of(quick=quick, threads=threads_or_all(threads)), make_reporter(quiet))
+    benchmark = run(plan_of(quick=quick, threads=threads or usable_cores()), make_reporter(quiet))
     text, values = formation_markdown(benchmark), benchmark.as_json()
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -242,7 +242,7 @@ def quality(
     from cleargs.splat.kernels.cpu.backend import warm_up
 
     changed = dict(item for text in overrides for item in flattened(parse_override(text)))
-    plan = QualityPlan(captures, qualities, changed, until, threads_or_all(threads))
+    plan = QualityPlan(captures, qualities, changed, until, threads or usable_cores())
     warm_up()
     benchmark = run(plan, out, make_reporter(quiet))
     text, values = quality_markdown(benchmark), benchmark.as_json()

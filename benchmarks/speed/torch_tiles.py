@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks.speed.reference import Splats
 from cleargs.splat import constants
-from cleargs.splat.kernels.reference import Splats
 
 TILE = 16
 GROUP = 1 << 19

@@ -15,6 +15,7 @@ import csv
 import io
 import subprocess
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
@@ -183,7 +184,11 @@ class Batch:
             return ("partial", "; ".join(missing)) if missing else ("done", "")
         if unfinished.state == "partial":
             return "partial", "; ".join(unfinished.reasons)
-        return ("failed", failure) if (failure := last_error(self.log(scene))) else ("waiting", "")
+        with suppress(OSError):  # no try yet
+            lines = self.log(scene).read_text("utf-8", "replace").splitlines()
+            if errors := [line[7:] for line in lines if line.startswith("error: ")]:
+                return "failed", errors[-1]
+        return "waiting", ""
 
     def _run(self, scene: SceneJob) -> RunSpec:
         run = resolve_run(
@@ -206,15 +211,6 @@ class Batch:
 def program() -> list[str]:
     """Return how ``cleargs`` is started as a child: its script need not be next to the interpreter."""
     return module_command("cleargs.cli.entry")
-
-
-def last_error(log: Path) -> str:
-    """Return the last cause of failure in ``log``; "" without one."""
-    try:
-        lines = log.read_text("utf-8", "replace").splitlines()
-    except OSError:
-        return ""
-    return next((line[7:] for line in reversed(lines) if line.startswith("error: ")), "")
 
 
 def write_summary(path: Path, results: Sequence[Result]) -> None:

@@ -68,28 +68,24 @@ def read_scenes(path: Path) -> list[SceneJob]:
     except FAULTS as error:
         raise InputError(f"cannot read {path}: {cause(error)}", hint="give a sheet, TOML or CSV") from error
     scenes: dict[str, SceneJob] = {}
-    problems = []
+    folder, problems = path.absolute().parent, []
     rows = _csv_rows(path, text) if path.suffix.lower() == ".csv" else _toml_rows(path, text)
     for where, values in rows:
         try:
-            scene = _scene(path.absolute().parent, where, SheetRow.model_validate(values))
+            row = SheetRow.model_validate(values)
         except ValidationError as error:
             problems += [f"{where}: {_problem(found)}" for found in error.errors(include_url=False)]
             continue
-        if scene.name in scenes:
-            problems.append(f"{where}: the name {scene.name!r} is taken by {scenes[scene.name].where}")
-        scenes[scene.name] = scene
+        if row.name in scenes:
+            problems.append(f"{where}: the name {row.name!r} is taken by {scenes[row.name].where}")
+        recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
+        overrides = tuple(f"{name}={value}" for name, value in row.set.items())
+        scenes[row.name] = SceneJob(row.name, folder / row.input, recipe, overrides, where)
     if problems:
         raise SheetError(path, problems)
     if not scenes:
         raise InputError(f"{path} lists no scene", hint='write [[scene]], name = "room", input = "room.mp4"')
     return list(scenes.values())
-
-
-def _scene(folder: Path, where: str, row: SheetRow) -> SceneJob:
-    recipe = str(folder / row.recipe) if row.recipe.endswith(".toml") else row.recipe
-    overrides = tuple(f"{name}={value}" for name, value in row.set.items())
-    return SceneJob(row.name, folder / row.input, recipe, overrides, where)
 
 
 def _problem(found: Any) -> str:

@@ -66,7 +66,6 @@ class Layout(Protocol):
 
         Looks at names only; without ``poses``, files of poses count for nothing.
         """
-        ...
 
     def externals(self, source: Path, config: CaptureConfig) -> Mapping[str, External]:
         """Role -> file, folder, or single files by name: all that is read.
@@ -74,10 +73,8 @@ class Layout(Protocol):
         Looks at names only and imports nothing heavy: the runner asks this of every run, also of one with
         nothing to do. A missing input is left to `open_capture` to name.
         """
-        ...
 
     def open_capture(self, source: Path, config: CaptureConfig) -> Capture:
         """The frames in trajectory order, at most ``config.max_frames``, with what is known of cameras and
         poses. Decodes no frame; changes nothing. Raises InputError.
         """
-        ...

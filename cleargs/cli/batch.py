@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,12 @@ from cleargs.cli.common import (
     quality_option,
     quiet_option,
     report_option,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.session import DeviceChoice, resolve_device
-from cleargs.progress import Reporter
 
 
 @click.command(
@@ -69,7 +66,7 @@ def batch(
     wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -82,7 +79,7 @@ def batch(
     reporter = make_reporter(quiet)
     looks_only = dry_run or summary  # at the results of a cluster, from a machine without its device
     options = (
-        *([] if looks_only else ["--threads", str(threads_or_all(threads))]),
+        *([] if looks_only else ["--threads", str(threads)]),
         *(["--allow-partial"] if allow_partial else []),
         *([] if wants_report else ["--no-report"]),
     )
@@ -107,7 +104,14 @@ def batch(
             write_summary(root / "summary.csv", results)
             reporter.info(_line(result))
             task.advance()
-    page = _page(scenes, results, reporter) if wants_report else None
+    page = None
+    if wants_report:
+        from cleargs.batch.page import write_batch
+
+        try:
+            page = write_batch(scenes, results)
+        except CleargsError as error:  # no failure of the batch
+            reporter.warn(f"there is no report: {error}; {error.hint}")
     states = Counter(result.state for result in results)
     if as_json:
         print_json([asdict(result) for result in results])
@@ -116,17 +120,6 @@ def batch(
         click.echo(", ".join(f"{count} {state}" for state, count in states.items()))
         click.echo(f"summary: {root / 'summary.csv'}" + (f"\nreport: {page}" if page else ""))
     return 1 if states["failed"] or states["waiting"] else 3 if states["partial"] else 0
-
-
-def _page(batch: Batch, results: Sequence[Result], reporter: Reporter) -> Path | None:
-    """Write the page; return None where that fails, which is no failure of the batch."""
-    from cleargs.batch.page import write_batch
-
-    try:
-        return write_batch(batch, results)
-    except CleargsError as error:
-        reporter.warn(f"there is no report: {error}; {error.hint}")
-        return None
 
 
 def _line(result: Result) -> str:

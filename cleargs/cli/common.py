@@ -40,6 +40,14 @@ scene_option = click.option(
 )
 
 
+threads_option = click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    default=usable_cores,
+    help="CPU threads; results do not depend on it.  [default: all cores]",
+)
+
+
 def output_option(
     help: str, name: str, *, metavar: str | None = None, required: bool = True
 ) -> Callable[[F], F]:
@@ -72,14 +80,10 @@ def parse_size(
     return int(match[1]), int(match[2])
 
 
-def _quality(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...]:
-    return () if value is None else (f"g0.quality={value}",)
-
-
 quality_option = click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
-    callback=_quality,
+    callback=lambda context, parameter, value: () if value is None else (f"g0.quality={value}",),
     help="What trainings may cost: draft is a look within minutes, standard what you would publish, high "
     "four times its steps and twice its Gaussians. Steps and budgets that a recipe names stay.  "
     "[default: standard]",
@@ -95,16 +99,7 @@ def work_options(command: F) -> F:
         show_default=True,
         help="Where to compute. auto is the CPU today: the GPU back end is untested on GPU hardware.",
     )(command)
-    return click.option(
-        "--threads",
-        type=click.IntRange(min=1),
-        help="CPU threads; results do not depend on it.  [default: all cores]",
-    )(command)
-
-
-def threads_or_all(threads: int | None) -> int:
-    """The given number of threads, or that of the cores which this process may use."""
-    return threads or usable_cores()
+    return threads_option(command)
 
 
 def manifest_json(manifest: Manifest) -> dict[str, Any]:

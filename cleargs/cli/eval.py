@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from cleargs.cli.common import json_option, print_json, quiet_option, threads_or_all
+from cleargs.cli.common import json_option, print_json, quiet_option, threads_option
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.digest import file_digest
 from cleargs.errors import InputError
@@ -108,7 +108,7 @@ stages and options stay there as long as their scenes do.
 )
 @click.option("--save-renders", type=click.Path(path_type=Path), help="Keep the evaluated images (PNG) here.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Result file (.json).")
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads; results do not depend on it.")
+@threads_option
 @click.option("-v", "--per-image", is_flag=True, help="Show every image in the table.")
 @json_option
 @quiet_option
@@ -127,7 +127,7 @@ def eval(
     refine_poses: int,
     save_renders: Path | None,
     output: Path | None,
-    threads: int | None,
+    threads: int,
     per_image: bool,
     as_json: bool,
     quiet: bool,
@@ -152,20 +152,20 @@ def eval(
     from cleargs.evaluate.evaluate import evaluate_images, evaluate_scene
     from cleargs.evaluate.references import reference_of, views_trained_on
 
-    reporter, count = make_reporter(quiet), threads_or_all(threads)
+    reporter = make_reporter(quiet)
     reference = reference_of(run, directory, poses=poses, align=align, reporter=reporter)
     evaluations = []
     for subject, scene in scenes.items():
         save = save_renders / subject if save_renders is not None and len(scenes) > 1 else save_renders
         found = evaluate_scene(
-            scene, reference, options=options, threads=count, reporter=reporter, subject=subject, save=save
+            scene, reference, options=options, threads=threads, reporter=reporter, subject=subject, save=save
         )
         trained = None if run is None else views_trained_on(run, subject, reference)
         evaluations.append(found.model_copy(update={"trained_on": trained}))
     if renders is not None:
         evaluations.append(
             evaluate_images(
-                renders, reference, options=options, threads=count, reporter=reporter, save=save_renders
+                renders, reference, options=options, threads=threads, reporter=reporter, save=save_renders
             )
         )
     report = Report(evaluations=tuple(evaluations))
@@ -247,11 +247,14 @@ def _print(report: Report, per_image: bool, output: Path | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from cleargs.evaluate.eval_report import LOWER_IS_BETTER
+
     first = report.evaluations[0]
     metrics = [name for name in first.options.metrics if name not in first.unavailable]
     table = Table("subject", "image", box=None, header_style="bold")
     for metric in metrics:
-        table.add_column(_label(metric), justify="right")
+        arrow = "↓" if metric in LOWER_IS_BETTER else "↑"
+        table.add_column(f"{_LABELS.get(metric, Path(metric).stem)} {arrow}", justify="right")
     for evaluation in report.evaluations:
         shown = [(image.name, image.values) for image in evaluation.images] if per_image else []
         for name, values in [*shown, (f"mean of {len(evaluation.images)}", evaluation.means)]:
@@ -290,12 +293,6 @@ def _regions(evaluation: Evaluation) -> str:
         if part is not None
     )
     return f"{evaluation.subject}: {'; '.join(words)}"
-
-
-def _label(metric: str) -> str:
-    from cleargs.evaluate.eval_report import LOWER_IS_BETTER
-
-    return f"{_LABELS.get(metric, Path(metric).stem)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
 
 
 def _figure(metric: str, value: float | None) -> str:

@@ -9,7 +9,7 @@ import click
 
 from cleargs.cli.common import file_option, run_argument, scene_option
 from cleargs.errors import InputError
-from cleargs.files import disk_error
+from cleargs.files import disk_errors, write_json
 from cleargs.manifest import linked_manifest
 from cleargs.pipeline.dag import Dag
 from cleargs.run_results import SCENE, scene_stage
@@ -105,7 +105,6 @@ def export(
     from cleargs.capture.cameras import Similarity
     from cleargs.capture.model import read_model, transform_model, write_model
     from cleargs.capture.tables import load_frames, load_points
-    from cleargs.files import write_json
     from cleargs.formation.frames import view_of
     from cleargs.splat.camera import cameras_json
     from cleargs.splat.ply import read_ply
@@ -142,10 +141,8 @@ def export(
         remarks.append(remark)
     if scene.gaussians.num == 0:
         raise InputError("no Gaussian is left", hint="prune or crop less")
-    try:
+    with disk_errors(output):
         output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(error, output) from error
     write_scene(output, scene, kind, turned=up is not None, spz_version=version)
     write_json(cameras, cameras_json(named, **similarity))
     sparse = read_model(ingest / MODEL)

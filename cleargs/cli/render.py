@@ -15,7 +15,6 @@ from cleargs.cli.common import (
     quiet_option,
     run_argument,
     scene_option,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -115,7 +114,7 @@ def render(
     output: Path,
     force: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -166,7 +165,7 @@ def render(
 
     reporter = make_reporter(quiet)
     on = resolve_device(device, reporter.info)
-    set_threads(threads_or_all(threads))
+    set_threads(threads)
     capture = CaptureShots(run / dag.names[0], size, even=kind == "film", side_by_side=side_by_side)
     count = max(2, round(fps * (seconds or SECONDS)))
     if poses is not None:

@@ -17,7 +17,7 @@ from cleargs.cli.common import (
     quiet_option,
     run_argument,
     store_option,
-    threads_or_all,
+    threads_option,
 )
 from cleargs.cli.progress_bars import make_reporter
 from cleargs.errors import CleargsError
@@ -35,19 +35,19 @@ Examples:
 """
 )
 @run_argument
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all cores]")
+@threads_option
 @store_option
 @json_option
 @quiet_option
 @click.pass_obj
-def report(dag: Dag, run: Path, threads: int | None, store: Path | None, as_json: bool, quiet: bool) -> None:
+def report(dag: Dag, run: Path, threads: int, store: Path | None, as_json: bool, quiet: bool) -> None:
     """Write RUN/report/index.html: the scene before and after in 3D, every frame and what became of it."""
     from cleargs.report.page import write_report
 
     settings = read_run_file(run, dag, store=store)
     reporter = make_reporter(quiet)
     with opened_store(settings.store) as opened:
-        page = write_report(Planner(dag, settings, opened, threads_or_all(threads), reporter))
+        page = write_report(Planner(dag, settings, opened, threads, reporter))
     answer(as_json, {"report": str(page)}, f"report: {page}")
 
 
@@ -117,15 +117,11 @@ def watch(dag: Dag, run: Path, host: str, port: int, store: Path | None) -> None
     from cleargs.report.serve import Server
 
     with Server(dag, read_run_file(run, dag, store=store), host, port) as server:
-        if not _is_loopback(host):
+        loopback = host == "localhost"
+        with suppress(ValueError):
+            loopback = ip_address(host).is_loopback
+        if not loopback:
             click.echo(f"warning: whoever reaches {host} can read the report of this run", err=True)
         click.echo(f"{server.address}  (Ctrl-C ends it)")
         with suppress(KeyboardInterrupt):
             server.serve_forever()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -22,7 +22,6 @@ from cleargs.cli.common import (
     report_option,
     run_argument,
     store_option,
-    threads_or_all,
     work_options,
 )
 from cleargs.cli.progress_bars import make_reporter
@@ -31,7 +30,7 @@ from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan, cost_line
 from cleargs.pipeline.run_file import read_run_file
 from cleargs.pipeline.runner import Runner, StageOutcome, check_same_input
-from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device, resolve_run
+from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device, resolve_run, usable_cores
 from cleargs.report.formatting import duration
 from cleargs.safe_io import printable
 
@@ -99,7 +98,7 @@ def run(
     dry_run: bool,
     allow_partial: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     store: Path | None,
     as_json: bool,
     quiet: bool,
@@ -128,10 +127,10 @@ def run(
     with opened_store(settings.store) as opened:
         check_same_input(settings, dag, opened)
         if dry_run:
-            planner = Planner(dag, settings, opened, threads_or_all(threads), reporter)
+            planner = Planner(dag, settings, opened, threads, reporter)
             print_plans(planner.plan(until, tuple(dag.check(name) for name in force)), as_json)
             return 0
-        runner = Runner(dag, settings, opened, threads_or_all(threads), reporter)
+        runner = Runner(dag, settings, opened, threads, reporter)
         outcomes = runner.run_until(until, force=force, allow_partial=allow_partial)
         page = report_on(runner.planner, outcomes) if wants_report else None
         if not wants_report and (line := older_report(settings.folder, dag)):
@@ -168,7 +167,7 @@ def stage(
     wants_report: bool,
     allow_partial: bool,
     device: DeviceChoice,
-    threads: int | None,
+    threads: int,
     store: Path | None,
     as_json: bool,
     quiet: bool,
@@ -181,7 +180,7 @@ def stage(
     resolved = None if device == "auto" else resolve_device(device, click.echo)
     settings = read_run_file(run, dag, store=store, device=resolved)
     with opened_store(settings.store) as opened:
-        runner = Runner(dag, settings, opened, threads_or_all(threads), make_reporter(quiet))
+        runner = Runner(dag, settings, opened, threads, make_reporter(quiet))
         outcome = runner.run_stage(name, force=force, allow_partial=allow_partial)
         if wants_report:
             report_on(runner.planner, [outcome])
@@ -208,7 +207,7 @@ def status(dag: Dag, run: Path, store: Path | None, as_json: bool) -> None:
     """Say for each stage of RUN whether it is done, partial or missing, and what changed."""
     settings = read_run_file(run, dag, store=store)
     with opened_store(settings.store) as opened:
-        planner = Planner(dag, settings, opened, threads_or_all(None), make_reporter())
+        planner = Planner(dag, settings, opened, usable_cores(), make_reporter())
         print_plans(planner.plan(), as_json)
 
 
@@ -310,16 +309,13 @@ def outcome_json(outcome: StageOutcome) -> dict[str, Any]:
 
 def print_plans(plans: list[StagePlan], as_json: bool) -> None:
     """The state of each stage and its reasons; then the expected cost."""
-    lines = []
+    lines, facts = [], []
     for plan in plans:
         first, *others = plan.reasons or ("",)
         lines.append(f"{plan.stage:<12} {plan.state:<8} {first}".rstrip())
         lines += [f"{'':<21} {reason}" for reason in others]
-    answer(as_json, [_plan_json(plan) for plan in plans], *lines, *filter(None, [cost_line(plans)]))
-
-
-def _plan_json(plan: StagePlan) -> dict[str, Any]:
-    figures = ("minutes", "memory_gb", "disk_gb")
-    estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
-    facts = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}
-    return {**facts, "estimate": estimate}
+        figures = ("minutes", "memory_gb", "disk_gb")
+        estimate = plan.estimate and {name: getattr(plan.estimate, name) for name in figures}
+        known = {"stage": plan.stage, "state": plan.state, "key": plan.key, "reasons": list(plan.reasons)}
+        facts.append({**known, "estimate": estimate})
+    answer(as_json, facts, *lines, *filter(None, [cost_line(plans)]))

@@ -1,12 +1,13 @@
-"""``cleargs show``: the tables and figures of a run in the terminal."""
+"""``cleargs show``: the tables and figures of a run in the terminal, and single frames in words."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -18,17 +19,22 @@ from rich.table import Table
 from cleargs.cli.common import FILE, answer, json_option, manifest_json, print_json, run_argument
 from cleargs.errors import InputError
 from cleargs.manifest import Manifest
-from cleargs.parquet import read_any_table
+from cleargs.parquet import read_any_table, read_table
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.live import preview_of, running_stage
 from cleargs.pipeline.run_file import RunSpec, read_run_file
 from cleargs.report.report_json import linked_manifests
 
-MAX_LISTED = 16
-"""Most items of a list that are spelt out."""
+if TYPE_CHECKING:
+    from cleargs.report.frames import FrameRow
 
-HIDDEN = frozenset({"similarity", "holdout_hash", "round"})
-"""Figures for programs."""
+MAX_LISTED = 16  # items of a list that are spelt out
+MAX_COUNTED = 12  # different values of a column of words that are counted value by value
+MAX_NAME_LENGTH = 14  # characters of a frame's name in a table
+MIN_FAULT = 0.2  # distance of a cue from its best value from which it is reported
+LAYERS_ACROSS, MAX_LAYER_WIDTH = 3, 640  # of the picture of a frame; px
+PLOT = "rva-plot.png"  # the picture of --plot in the run's folder, unless another is named
+HIDDEN = frozenset({"similarity", "holdout_hash", "round"})  # figures for programs
 
 LABELS: Mapping[str, str] = {
     "registered": "frames with a pose",
@@ -49,24 +55,35 @@ LABELS: Mapping[str, str] = {
 }
 """Figure of a manifest -> its label, where its name is not enough."""
 
-PLOT = "rva-plot.png"
-"""The picture of ``--plot`` in the run's folder, unless another is named."""
+OVERVIEW = ("frames", "registered", "test", "points", "roles", "gaussians", "psnr_unseen", "repairs")
+"""Figures that the overview of a run shows, next to the scene that was ``published``."""
 
-MAX_COUNTED = 12
-"""A column of words with more different values than this is not counted value by value."""
+MODELS = {
+    "none": "nothing found",
+    "blur": "motion blur",
+    "skew": "rolling shutter",
+    "both": "motion blur and rolling shutter",
+    "defocus": "defocus",
+}
+"""Model of a frame's formation -> its name."""
 
-HEADLINES = (
-    "frames",
-    "registered",
-    "test",
-    "points",
-    "roles",
-    "gaussians",
-    "psnr_unseen",
-    "repairs",
-    "published",
-)
-"""Figures that the overview of a run shows."""
+SOURCES = {
+    "observation": "the frame as filmed",
+    "deblurred": "the frame without its motion",
+    "render": "the render",
+}
+"""Input of the expert -> its name."""
+
+SCORES = {
+    "R": "reliable appearance",
+    "B": "risk of degradation",
+    "G": "worth of its place",
+    "C": "coverage gained",
+    "D": "new directions",
+    "O": "seen already",
+    "Z": "middle of its stretch",
+}
+"""Score of RVA -> its meaning."""
 
 
 @click.command(
@@ -117,33 +134,23 @@ def show(
     as_json: bool,
 ) -> None:
     """Show what the stages of RUN found, or the tables of one STAGE."""
-    pictured = plot or frame is not None
-    for wrong, cause, example in (
-        (plot and stage != "rva", "--plot draws the stage rva", "rva --plot"),
-        (frame is not None and stage is not None, "--frame is about all stages", f"--frame {frame}"),
+    draws = output is not None and output.suffix.lower() == ".png" and (plot or frame is not None)
+    for cause, wrong, example in (
+        ("--plot draws the stage rva", plot and stage != "rva", "rva --plot"),
+        ("--frame is about all stages", frame is not None and stage is not None, f"--frame {frame}"),
         (
-            stage is None and (columns or rows is not None),
             "--rows and --columns are about the tables of a stage",
+            stage is None and (columns or rows is not None),
             "rva --columns",
         ),
-        (
-            output is not None and (not pictured or output.suffix.lower() != ".png"),
-            "--output names the PNG of --plot or --frame",
-            "rva --plot -o FILE.png",
-        ),
+        ("--output names the PNG of --plot or --frame", output and not draws, "rva --plot -o FILE.png"),
     ):
         if wrong:
             raise InputError(cause, hint=f"cleargs show {run} {example}")
     settings = read_run_file(run, dag)
     done = linked_manifests(run, dag.names)
     if frame is not None:
-        from cleargs.cli.show_frame import show_frame
-
-        picture = output or run / f"frame-{frame:06d}.png"
-        facts, lines = show_frame(run, done, frame, picture)
-        if not as_json:
-            _print_table(lines, title=f"frame {frame}")
-        answer(as_json, facts, f"written: {picture}")
+        _show_frame(run, done, frame, output or run / f"frame-{frame:06d}.png", as_json)
     elif stage is None:
         if as_json:
             print_json({name: manifest_json(done[name]) if name in done else None for name in dag.names})
@@ -170,7 +177,7 @@ def _print_run(run: RunSpec, manifests: Mapping[str, Manifest | None]) -> None:
             continue
         cells = (f"{manifest.seconds:.1f}", f"{manifest.bytes / 1e6:.1f}", str(len(manifest.files)))
         found = manifest.summary
-        chosen = {key: found[key] for key in HEADLINES if key in found} or found
+        chosen = {key: found[key] for key in (*OVERVIEW, "published") if key in found} or found
         text = ", ".join(f"{label} {value}" for label, value in labelled(chosen))
         rows.append([name, manifest.status, *cells, text])
     _print_table(rows, "stage", "state", "seconds", "MB", "files", "figures")
@@ -192,8 +199,6 @@ def _show_stage(
     tables = {name: read_any_table(run / stage / name) for name in names}
     frames = None
     if stage == "rva":
-        from cleargs.cli.show_frame import frame_rows, short_name
-
         repairs = read_any_table(run / "rivr" / "selection.parquet").to_pylist() if "rivr" in done else None
         frames = frame_rows(tables["frames.parquet"].to_pylist(), manifest.parts.config, repairs)
     if as_json:
@@ -306,6 +311,201 @@ def text_of(value: Any) -> str:
                 return ", ".join(f"{names[name]} {text_of(item)}" for name, item in value.items())
             return ", ".join(f"{count} {names[name]}" for name, count in value.items() if count) or "none"
     return str(value)
+
+
+# -- frames in words ----------------------------------------------------------------------------------------
+
+
+def frame_rows(
+    rows: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any],
+    repairs: Sequence[Mapping[str, Any]] | None,
+) -> list[dict[str, Any]]:
+    """Return role, scores, worst cue, reason and repair of every frame.
+
+    rows: those of rva/frames.parquet; settings: the configuration that they were made with; repairs: the rows
+    of rivr/selection.parquet, None before RIVR (then there is no "repair").
+    """
+    latest = {row["frame_id"]: row for row in sorted(repairs or (), key=lambda row: int(row["round"]))}
+    found = []
+    for row in rows:
+        line = {"frame": row["frame_id"], **{key: row[key] for key in ("name", "role", "weight", "R", "B")}}
+        line |= {"worst cue": worst_cue(row), "reason": reason(row, settings)}
+        if repairs is not None:
+            line["repair"] = _repair(latest.get(row["frame_id"]))
+        found.append(line)
+    return found
+
+
+def short_name(name: str) -> str:
+    """The end of a frame's name, which tells it from the others."""
+    last = name.rpartition("/")[2]
+    return last if len(last) <= MAX_NAME_LENGTH else f"…{last[1 - MAX_NAME_LENGTH :]}"
+
+
+def worst_cue(row: Mapping[str, Any]) -> str:
+    """The cue farthest from its best value, and its value: "motion blur 0.82"; "" without a fault."""
+    off = {name: 1.0 - value for name, value in row.items() if name.startswith("r_") and value is not None}
+    off |= {name: value for name, value in row.items() if name.startswith("b_") and value is not None}
+    worst = max(off, key=lambda name: off[name], default="")
+    if not worst or off[worst] < MIN_FAULT:
+        return ""
+    return f"{worst[2:].replace('_', ' ')} {row[worst]:.2f}"
+
+
+def reason(row: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """The threshold that a frame passed or missed, which gave it its role."""
+    if row["R"] is None:
+        return "not scored"
+    if row["G"] is None:
+        return "no pose found"
+    if not settings["enabled"]:
+        return "all frames count"
+    if row["role"] == "strong":
+        return "reliable"
+    if settings["weighting"] == "binary":
+        return "among the best" if row["role"] == "auxiliary" else "not among the best"
+    low = _missed(row, settings["auxiliary_R"], settings["auxiliary_B"])
+    missed = low or _missed(row, settings["tau_R"], settings["tau_B"])
+    if row["reactivated_for"] == "coverage":
+        return f"{missed}, fills a gap"
+    weak = missed if low else f"{missed}, no new view"
+    return {"geometric": f"{missed}, adds views", "auxiliary": f"{missed}, usable"}.get(row["role"], weak)
+
+
+def _missed(row: Mapping[str, Any], min_R: float, max_B: float) -> str:
+    """The threshold of the two that the frame misses; "" for none."""
+    if row["R"] < min_R:
+        return f"R < {min_R:.4g}"
+    return f"B > {max_B:.4g}" if row["B"] > max_B else ""
+
+
+def _repair(row: Mapping[str, Any] | None) -> str:
+    """RIVR's choice in a frame's last round: the layer that supervises, refused, or none."""
+    from cleargs.rivr.gates import REFUSED
+
+    if row is None:
+        return "none"
+    if row["chosen"] == "observed":
+        return "as filmed"
+    return "refused" if not row["accepted"] or row["reason"].startswith(REFUSED) else str(row["chosen"])
+
+
+# -- one frame -----------------------------------------------------------------------------------------------
+
+
+def _show_frame(run: Path, done: Mapping[str, Manifest], number: int, picture: Path, as_json: bool) -> None:
+    """Write the picture of a frame's layers; print all facts for programs, or lines for readers.
+
+    Raises InputError, StoreError.
+    """
+    from cleargs.report.frames import MEANINGS, camera_of, load_rows
+    from cleargs.rivr.tables import REPAIRS
+
+    if "ingest" not in done:
+        raise InputError(f"{run} has no frames yet", hint=f"see cleargs status {run}")
+    rows = {row.frame.frame_id: row for row in load_rows(run, done)}
+    if number not in rows:
+        raise InputError(f"{run} has no frame {number}", hint=f"choose one from {min(rows)} to {max(rows)}")
+    row = rows[number]
+    frame, judged, repairs = row.frame, dict(row.judged), []
+    if judged:
+        judged |= {"reason": reason(judged, done["rva"].parts.config), "worst_cue": worst_cue(judged)}
+    if "consolidate" in done:
+        repairs = read_table(run / "consolidate/repairs.parquet", REPAIRS).to_pylist()
+    formation = row.formation.items()
+    facts = {
+        **asdict(frame),
+        "centre": camera_of(frame).centre.tolist() if frame.registered else None,
+        "rva": judged or None,
+        "exposure_stops": row.gain_ev,
+        "formation": {name: {"value": value, "meaning": MEANINGS.get(name, "")} for name, value in formation},
+        "rounds": [asdict(found) for found in row.rounds],
+        "distilled": next((line for line in repairs if line["frame_id"] == number), None),
+        "layers": _write_layers(picture, run, done, row),
+        "picture": str(picture),
+    }
+    if not as_json:
+        _print_table(_lines(row, facts, run), title=f"frame {number}")
+    answer(as_json, facts, f"written: {picture}")
+
+
+def _write_layers(path: Path, run: Path, stages: Collection[str], row: FrameRow) -> list[str]:
+    """Write the layers of a frame side by side, labelled, as a PNG; returns their names.
+
+    They are the frame as filmed, those of the latest round's EXR, and the last scene at the frame.
+    """
+    from cleargs.media.contact_sheet import Tile, contact_sheet
+    from cleargs.media.image import write_rgb
+    from cleargs.report.frames import LAYERS, camera_of, last_scene, layers_of
+    from cleargs.splat.ply import read_ply
+    from cleargs.splat.render import Viewer
+
+    images, scene = layers_of(row, run), last_scene(stages)
+    if scene is not None and row.frame.registered:
+        images["final"] = Viewer(read_ply(run / scene / "scene.ply")).view(camera_of(row.frame), row.affine)
+    shown = [name for name in LAYERS if name in images]
+    labels = {name: LAYERS[name] + (" (chosen)" if name == row.chosen else "") for name in shown}
+    tiles = [Tile(images[name], labels[name], marked=name == row.chosen) for name in shown]
+    lines = [tiles[start : start + LAYERS_ACROSS] for start in range(0, len(tiles), LAYERS_ACROSS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_rgb(path, contact_sheet(lines, tile_width=min(MAX_LAYER_WIDTH, max(240, row.frame.width))))
+    return shown
+
+
+def _lines(row: FrameRow, facts: Mapping[str, Any], run: Path) -> Iterator[tuple[str, str]]:
+    """Label and text of every line for a reader."""
+    from cleargs.report.frames import CHOICES, scores_of
+
+    frame, judged = row.frame, facts["rva"]
+    yield "file", frame.name
+    yield "image", f"{run / 'ingest' / frame.image}, {frame.width}x{frame.height} px"
+    if frame.time_s is not None:
+        yield "time", f"{frame.time_s:.2f} s"
+    if frame.split == "test":
+        yield "held out", "for testing: it enters no training"
+    if not frame.registered:
+        yield "pose", f"none found: {frame.placed}" if frame.placed else "none found"
+    else:
+        centre = ", ".join(f"{value:.3f}" for value in facts["centre"])
+        quaternion = ", ".join(f"{facts[name]:.3f}" for name in ("qw", "qx", "qy", "qz"))
+        yield "pose", f"at ({centre}) of the run's world, world to camera ({quaternion}), w first"
+        if frame.placed:
+            yield "placed by", frame.placed
+        yield "points", f"{frame.n_points} sparse points seen"
+    if judged:
+        yield "role", f"{judged['role']}, weight {row.weight:.2f}: {judged['reason']}"
+        known = {name: value for name, value in judged.items() if value is not None}
+        yield (
+            "scores",
+            ", ".join(f"{name} {known[name]:.2f} {SCORES[name]}" for name in SCORES if name in known),
+        )
+        for label, prefix in (("good, of 1", "r_"), ("bad, of 1", "b_")):
+            cues = (name for name in known if name.startswith(prefix))
+            yield label, ", ".join(f"{name[2:].replace('_', ' ')} {known[name]:.2f}" for name in cues)
+        yield "worst cue", judged["worst_cue"] or "none"
+    if row.gain_ev is not None:
+        yield "exposure", f"{row.gain_ev:+.2f} stops compared with the scene's"
+    if found := row.formation:
+        model = MODELS.get(found["model"], found["model"])
+        if found["model"] == "none":
+            yield "formation", model
+        else:
+            share = f"{100 * found['explained']:.0f} %"
+            yield "formation", f"{model}, which takes away {share} of the frame's misfit"
+            lengths = {"blur": "blur_px", "rolling shutter": "skew_px", "defocus": "defocus_px"}
+            yield "", ", ".join(f"{label} {found[name]:.2f} px" for label, name in lengths.items())
+        yield "weight", f"{found['weight_before']:.2f} before, {found['weight_after']:.2f} after it"
+    for choice in row.rounds:
+        refused = ", refused" if not choice.accepted and choice.chosen != "observed" else ""
+        yield f"round {choice.round}", f"{CHOICES[choice.chosen]}{refused} ({choice.reason})"
+        for metric, scores in scores_of(choice):
+            yield "", f"{metric}: " + ", ".join(f"{name} {score:.1f}" for name, score in scores.items())
+        moved = choice.blur_px is not None
+        motion = f": blur {choice.blur_px:.1f} px, skew {choice.skew_px:.1f} px" if moved else ""
+        yield "", f"restored from {SOURCES[choice.restored_from]}{motion}"
+    if repair := facts["distilled"]:
+        yield "final scene", f"trained on {CHOICES[repair['chosen']]} of round {repair['round']}"
 
 
 # -- on the terminal -----------------------------------------------------------------------------------------

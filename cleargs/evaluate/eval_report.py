@@ -213,9 +213,12 @@ def table_schema(metrics: Sequence[str]) -> pa.Schema:
 
 def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
     """The columns that one image has; the others of the table are null."""
+    options = evaluation.options
+    fitted = ["colours"] if options.align_colour else []
+    fitted += [f"poses in {options.refine_poses} steps"] if options.refine_poses else []
     row = {
         "subject": evaluation.subject,
-        "adjusted": _adjusted(evaluation.options),
+        "adjusted": ", ".join(fitted) or "nothing",
         **dict(image),
         **image.values,
         "colour": None if image.colour is None else [x for line in image.colour for x in line],
@@ -224,9 +227,3 @@ def _row(evaluation: Evaluation, image: ImageResult) -> dict[str, Any]:
     for name, part in parts.items():
         row |= {f"{name}_{figure}": value for figure, value in part or ()}
     return row
-
-
-def _adjusted(options: EvalOptions) -> str:
-    fitted = ["colours"] if options.align_colour else []
-    fitted += [f"poses in {options.refine_poses} steps"] if options.refine_poses else []
-    return ", ".join(fitted) or "nothing"

@@ -19,7 +19,6 @@ from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
 from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
 from cleargs.evaluate.metrics import (
-    MetricSet,
     apply_affine,
     clipped_pixels,
     depth_of_points,
@@ -148,20 +147,16 @@ def _renderer(scene: Scene, refine_steps: int, points: NDArray[np.float64] | Non
     def predict(view: ReferenceView, target: ImageU8, mask: MaskBool | None) -> _Prediction:
         camera, refinement, far = view.camera, None, None
         if refine_steps:
-            depth = _median_depth(*depth_and_alpha(camera))
-            camera, refinement = refine_pose(render, camera, depth, target, mask, refine_steps)
+            depth, alpha = depth_and_alpha(camera)
+            shown = alpha > 0.5
+            distance = float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
+            camera, refinement = refine_pose(render, camera, distance, target, mask, refine_steps)
         farthest = None if points is None else depth_of_points(points, camera)
         if farthest is not None:
             far = far_pixels(*depth_and_alpha(camera), farthest)
         return _Prediction(render(camera), refinement, far)
 
     return predict
-
-
-def _median_depth(depth: PlaneF32, alpha: PlaneF32) -> float:
-    """Median depth of what a view shows; 1 where it shows nothing."""
-    shown = alpha > 0.5
-    return float(np.median(depth[shown] / alpha[shown])) if shown.any() else 1.0
 
 
 def _evaluate(
@@ -179,6 +174,28 @@ def _evaluate(
     if save is not None:
         with disk_errors(save):
             save.mkdir(parents=True, exist_ok=True)
+
+    def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
+        image, affine = prediction.image, None
+        if options.align_colour:
+            affine = fit_affine(image, target / 255.0, mask)
+            image = apply_affine(image, affine)
+        pixels = to_uint8(image)
+        if save is not None:
+            write_rgb(save / f"{name}.png", pixels)
+        return ImageResult(
+            name=name,
+            width=pixels.shape[1],
+            height=pixels.shape[0],
+            values=metrics.measure(pixels, target, mask),
+            prediction=_digest(pixels),
+            reference=_digest(target, mask),
+            colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
+            refinement=prediction.refinement,
+            far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
+            clipped=region(pixels, target, clipped_pixels(target), mask),
+        )
+
     images: list[ImageResult] = []
     waiting: deque[Future[ImageResult]] = deque()
     with (
@@ -188,8 +205,7 @@ def _evaluate(
     ):
         for view in reference.views:
             target, mask = view.load()
-            prediction = predict(view, target, mask)
-            waiting.append(pool.submit(_measure, metrics, options, view.name, prediction, target, mask, save))
+            waiting.append(pool.submit(measured, view.name, predict(view, target, mask), target, mask))
             if len(waiting) > 2 * threads:  # so that memory does not grow with the number of images
                 images.append(waiting.popleft().result())
                 task.advance()
@@ -215,36 +231,6 @@ def _evaluate(
             "onnxruntime": installed_runtimes(),
         },
         images=tuple(images),
-    )
-
-
-def _measure(
-    metrics: MetricSet,
-    options: EvalOptions,
-    name: str,
-    prediction: _Prediction,
-    target: ImageU8,
-    mask: MaskBool | None,
-    save: Path | None,
-) -> ImageResult:
-    image, affine = prediction.image, None
-    if options.align_colour:
-        affine = fit_affine(image, target / 255.0, mask)
-        image = apply_affine(image, affine)
-    pixels = to_uint8(image)
-    if save is not None:
-        write_rgb(save / f"{name}.png", pixels)
-    return ImageResult(
-        name=name,
-        width=pixels.shape[1],
-        height=pixels.shape[0],
-        values=metrics.measure(pixels, target, mask),
-        prediction=_digest(pixels),
-        reference=_digest(target, mask),
-        colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
-        refinement=prediction.refinement,
-        far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
-        clipped=region(pixels, target, clipped_pixels(target), mask),
     )
 
 

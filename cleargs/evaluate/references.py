@@ -291,15 +291,14 @@ def views_trained_on(run: Path, stage: str, reference: Reference) -> int | None:
     except StoreError:
         return None
     own = {stem_of(frame.name): frame for frame in load_frames(run / "ingest") if frame.frame_id in trained}
-    return sum(view.name in own and _about_there(view.camera, own[view.name]) for view in reference.views)
-
-
-def _about_there(camera: Camera, frame: Frame) -> bool:
-    pose = _run_pose(frame)
-    near = np.linalg.norm(camera.centre - pose.centre) < SAME_VIEW
-    return bool(near) and rotation_between(camera.world_to_camera[:3, :3], pose.rotation) < np.degrees(
-        SAME_VIEW
-    )
+    count = 0
+    for view in reference.views:
+        if view.name in own:
+            there, pose = view.pose, _run_pose(own[view.name])
+            apart = rotation_between(there.rotation, pose.rotation)
+            if np.linalg.norm(there.centre - pose.centre) < SAME_VIEW and apart < np.degrees(SAME_VIEW):
+                count += 1
+    return count
 
 
 # -- a folder ----------------------------------------------------------------------------------------------

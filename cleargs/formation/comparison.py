@@ -115,7 +115,6 @@ class SearchKernels(Protocol):
         limit: float,
     ) -> float:
         """Return the sum of weight * min(|observed - exposed image|, limit)."""
-        ...
 
     def normal_equations(
         self,
@@ -131,7 +130,6 @@ class SearchKernels(Protocol):
         active: NDArray[np.int64],
     ) -> tuple[ArrayF64, ArrayF64]:
         """Return matrix [A, A] and right side [A] of a Gauss-Newton step over the ``active`` numbers."""
-        ...
 
 
 class Level:

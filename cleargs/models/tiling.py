@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TypeAlias
 
 import numpy as np
@@ -153,14 +153,10 @@ def mean_over_tiles(
     Raises InputError as `require_scorable` does.
     """
     require_scorable(image)
-    rows, columns = (_cover(length, side) for length, side in zip(image.shape, sides, strict=False))
-    tiles = [image[row, column] for row in rows for column in columns]
+    places = []
+    for length, side in zip(image.shape, sides, strict=False):
+        tile = min(side or length, length)
+        starts = np.linspace(0, length - tile, -(-length // tile)).round().astype(int).tolist()
+        places.append([slice(start, start + tile) for start in starts])
+    tiles = [image[place] for place in product(*places)]
     return float(np.mean(list(figures(tiles)), dtype=np.float64))
-
-
-def _cover(length: int, tile: int | None) -> list[slice]:
-    if tile is None or length <= tile:
-        return [slice(0, length)]
-    count = -(-length // tile)
-    starts = np.linspace(0, length - tile, count).round().astype(int).tolist()
-    return [slice(start, start + tile) for start in starts]

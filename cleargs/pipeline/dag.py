@@ -12,17 +12,13 @@ from cleargs.pipeline.stage import Stage
 from cleargs.progress import Say
 
 
-def _same_pace(say: Say | None) -> float:
-    return 1.0
-
-
 @dataclass(frozen=True)
 class Dag:
     """Stages in an order in which each comes after all that it reads, and how to load one by name."""
 
     names: tuple[str, ...]
     load: Callable[[str], Stage]
-    pace: Callable[[Say | None], float] = _same_pace
+    pace: Callable[[Say | None], float] = lambda say: 1.0
     """This machine's time over what the stages' estimates were made for. It may take seconds to measure, and
     is measured only where somebody is told (``say``)."""
 

@@ -27,7 +27,10 @@ def file_lock(path: Path, *, shared: bool = False, wait: bool = True) -> Iterato
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             held = _acquire(handle, kind if wait else kind | fcntl.LOCK_NB)
-            if held and not _still_there(path, handle):
+            there = None
+            with suppress(FileNotFoundError):
+                there = path.stat().st_ino
+            if held and there != os.fstat(handle).st_ino:
                 continue  # its last holder removed the file while we waited: lock the new one
             yield held
             return
@@ -44,10 +47,14 @@ def only_one(path: Path, reporter: Reporter, what: str) -> Iterator[bool]:
     with ExitStack() as stack:
         held = stack.enter_context(file_lock(path, wait=False))
         if held is False:
-            reporter.info(f"{what}: {_holder(path)} works on it; waiting")
+            holder = ""
+            with suppress(OSError, UnicodeDecodeError):
+                holder = path.read_text(encoding="utf-8")
+            reporter.info(f"{what}: {holder or 'another process'} works on it; waiting")
             held = stack.enter_context(file_lock(path))
+        job = f" (Slurm job {os.environ['SLURM_JOB_ID']})" if os.environ.get("SLURM_JOB_ID") else ""
         with suppress(OSError):  # the note only serves messages
-            path.write_text(_this_process(), encoding="utf-8")
+            path.write_text(f"process {os.getpid()} on {socket.gethostname()}{job}", encoding="utf-8")
         yield held is not None
 
 
@@ -63,18 +70,6 @@ def is_locked(path: Path) -> bool:
         os.close(handle)
 
 
-def _this_process() -> str:
-    job = os.environ.get("SLURM_JOB_ID", "")
-    return f"process {os.getpid()} on {socket.gethostname()}" + (f" (Slurm job {job})" if job else "")
-
-
-def _holder(path: Path) -> str:
-    """The process that took the lock file ``path`` last."""
-    with suppress(OSError, UnicodeDecodeError):
-        return path.read_text(encoding="utf-8") or "another process"
-    return "another process"
-
-
 def _acquire(handle: int, kind: int) -> bool | None:
     try:
         fcntl.flock(handle, kind)
@@ -83,10 +78,3 @@ def _acquire(handle: int, kind: int) -> bool | None:
     except OSError:
         return None
     return True
-
-
-def _still_there(path: Path, handle: int) -> bool:
-    try:
-        return path.stat().st_ino == os.fstat(handle).st_ino
-    except FileNotFoundError:
-        return False

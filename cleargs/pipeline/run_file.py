@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
 
 import tomli_w
 
@@ -13,7 +12,6 @@ from cleargs.errors import ConfigError, InputError
 from cleargs.files import disk_errors, write_bytes
 from cleargs.pipeline.config import Config, Document, check_document, read_toml
 from cleargs.pipeline.dag import Dag
-from cleargs.pipeline.settings import Setting
 from cleargs.pipeline.stage import Device as Device
 from cleargs.pipeline.store import STORE_FOLDER
 
@@ -47,41 +45,34 @@ class RunSpec:
 
 def write_run_file(run: RunSpec) -> None:
     """Create the run folder and write its ``run.toml``. Raises StoreError when that is not allowed."""
-    path, text = run.folder / RUN_FILE, _text(run).encode()
+    document: Document = {"input": str(run.source), "device": run.device}
+    if run.store != run.folder / STORE_FOLDER:
+        document["store"] = str(run.store)
+    document["seed"] = run.config.seed
+    path, text = run.folder / RUN_FILE, (HEADER + tomli_w.dumps(document) + _commented(run.config)).encode()
     with disk_errors(path):
         run.folder.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_bytes() != text:
             write_bytes(path, text)
 
 
-def _text(run: RunSpec) -> str:
-    document: Document = {"input": str(run.source), "device": run.device}
-    if run.store != run.folder / STORE_FOLDER:
-        document["store"] = str(run.store)
-    return HEADER + tomli_w.dumps({**document, "seed": run.config.seed}) + _commented(run.config)
-
-
 def _commented(config: Config) -> str:
     """All settings as TOML, each below its meaning, range and default; unset ones as a comment."""
     tables: dict[str, list[str]] = {}
     for setting, value in config.settings():
-        lines = tables.setdefault(setting.table, [])
-        lines += wrap(_comment(setting), WIDTH, initial_indent="# ", subsequent_indent="# ")
-        lines.append(f"# {setting.field} =" if value is None else _toml_line(setting.field, value))
+        table, _, field = setting.name.rpartition(".")
+        lines = tables.setdefault(table, [])
+        facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
+        comment = f"{setting.meaning} ({facts})" if setting.meaning else facts
+        lines += wrap(comment, WIDTH, initial_indent="# ", subsequent_indent="# ")
+        if value is None:
+            lines.append(f"# {field} =")
+        elif isinstance(value, list):  # tomli_w spreads lists over lines
+            items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
+            lines.append(f"{field} = [{', '.join(items)}]")
+        else:
+            lines.append(tomli_w.dumps({field: value}).rstrip())
     return "".join(f"\n[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
-
-
-def _comment(setting: Setting) -> str:
-    facts = "; ".join(filter(None, (setting.allowed, f"default {setting.default_text}")))
-    return f"{setting.meaning} ({facts})" if setting.meaning else facts
-
-
-def _toml_line(name: str, value: Any) -> str:
-    # tomli_w spreads lists over lines.
-    if isinstance(value, list):
-        items = (tomli_w.dumps({"_": item}).partition("=")[2].strip() for item in value)
-        return f"{name} = [{', '.join(items)}]"
-    return tomli_w.dumps({name: value}).rstrip()
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import resource
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -36,7 +39,6 @@ from cleargs.pipeline.plan import (
 )
 from cleargs.pipeline.run_file import LOCK, RUN_FILE, RunSpec, read_source, write_run_file
 from cleargs.pipeline.store import Entry, Store
-from cleargs.pipeline.usage import Usage
 from cleargs.progress import Reporter
 
 
@@ -294,3 +296,40 @@ def check_same_input(run: RunSpec, dag: Dag, store: Store) -> None:
         f"{run.folder} is a run of {before}, not of {run.source}",
         hint="choose another folder with -o, or delete this one",
     )
+
+
+class Usage:
+    """What a stage used of the machine, counted from where this is made.
+
+    The kernel's mark of the peak is set back where it can be (Linux). Elsewhere the peak is that of the
+    process so far, which may be an earlier stage's.
+    """
+
+    def __init__(self) -> None:
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # sets the mark back
+        self._cpu_seconds, self._peak_of_children = _cpu_seconds(), _peak(resource.RUSAGE_CHILDREN)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of all threads, and of children that have ended, seconds."""
+        return _cpu_seconds() - self._cpu_seconds
+
+    @property
+    def peak_memory_gb(self) -> float:
+        """Largest resident memory, GB (1e9 bytes); a child counts where it was larger than any before."""
+        own, children = _peak(resource.RUSAGE_SELF), _peak(resource.RUSAGE_CHILDREN)
+        with suppress(OSError):
+            if found := re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()):
+                own = int(found[1]) * 1024
+        return max(own, children if children > self._peak_of_children else 0) / 1e9
+
+
+def _cpu_seconds() -> float:
+    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(used.ru_utime + used.ru_stime for used in both)
+
+
+def _peak(who: int) -> int:
+    """Bytes; macOS counts in bytes, Linux in units of 1024."""
+    return resource.getrusage(who).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -12,7 +12,7 @@ from typing import Literal
 
 from cleargs.digest import DigestMemo
 from cleargs.errors import ConfigError, InputError
-from cleargs.pipeline.config import Config, check_document, load_config
+from cleargs.pipeline.config import check_document, load_config
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.run_file import (
     RUN_FILE,
@@ -27,6 +27,7 @@ from cleargs.pipeline.store import STORE_FOLDER, Store
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
+MOST_NAMED = 3  # settings of an existing run that are named
 UNUSED_GPU = "there is an NVIDIA GPU, which --device auto does not use yet: --device cuda does"
 
 
@@ -115,13 +116,12 @@ def resolve_run(
     config = load_config(dag, workflow or "default" if kept is None else kept.document(), overrides, seed)
     root = (store or metadata.store or folder / STORE_FOLDER).absolute()
     chosen = resolve_device(metadata.device or device if device == "auto" else device, say)
-    if kept is not None and (line := _own_settings(kept)):
-        say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
+    if kept is not None:
+        own = [f"seed={kept.seed}"] if kept.seed else []
+        own += [f"{setting.name}={value}" for setting, value in kept.settings() if value != setting.default]
+        line = ", ".join(own[:MOST_NAMED]) + (
+            f" and {len(own) - MOST_NAMED} more" if own[MOST_NAMED:] else ""
+        )
+        if own:
+            say(f"as in {folder / RUN_FILE}: {line}; --reset starts from the recipe")
     return RunSpec(folder, source.absolute(), config, root, chosen)
-
-
-def _own_settings(config: Config, most: int = 3) -> str:
-    """The first few settings that are not the default, in one line; "" where there are none."""
-    own = [f"seed={config.seed}"] if config.seed else []
-    own += [f"{setting.name}={value}" for setting, value in config.settings() if value != setting.default]
-    return ", ".join(own[:most]) + (f" and {len(own) - most} more" if len(own) > most else "")

@@ -39,16 +39,6 @@ class Setting:
     meaning: str
 
     @property
-    def table(self) -> str:
-        """The name without its last part."""
-        return self.name.rpartition(".")[0]
-
-    @property
-    def field(self) -> str:
-        """The last part of the name."""
-        return self.name.rpartition(".")[2]
-
-    @property
     def default_text(self) -> str:
         """The default as it is written after ``--set NAME=``; "unset" for None."""
         match self.default:

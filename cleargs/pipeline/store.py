@@ -157,8 +157,10 @@ class Store:
         with only_one(self.root / "locks" / f"{key}.lock", reporter, stage) as alone:
             try:
                 yield alone
-            finally:
-                self._release(key)
+            finally:  # this process's own work folders are left to the next try
+                for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
+                    with suppress(OSError):  # another process left something there already
+                        folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def _only_readable(self) -> bool:
         return self.root.is_dir() and not os.access(self.root, os.W_OK)
@@ -166,12 +168,6 @@ class Store:
     def _owner_suffix(self) -> str:
         """The ending of this process's own work folders, where no lock keeps another one out."""
         return f"@{socket.gethostname()}-{os.getpid()}"
-
-    def _release(self, key: str) -> None:
-        """Leave this process's own work folders of ``key`` to the next try."""
-        for folder in (self.root / "work").glob(f"{key}*{self._owner_suffix()}"):
-            with suppress(OSError):  # another process left something there already
-                folder.rename(folder.with_name(folder.name.removesuffix(self._owner_suffix())))
 
     def open_work(
         self,
@@ -305,7 +301,12 @@ class Store:
                     f"the file system of {self.root} has no locks, which would keep data in use",
                     hint="when no run works there, delete the folders that --dry-run lists",
                 )
-            linked = self._linked(stages)
+            runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
+            for note in (self.root / ROOTS).glob("*"):
+                with suppress(*FAULTS):
+                    runs.append(Path(read_text(note).rstrip("\n")))
+            links = [run / stage for run in runs for stage in stages]
+            linked = {link.resolve() for link in links if link.is_symlink()}
             folders: list[tuple[Path, Kind]] = [
                 (folder, "finished")
                 for stage in stages
@@ -329,13 +330,6 @@ class Store:
                     if lock.name != "store.lock":
                         lock.unlink(missing_ok=True)
         return found
-
-    def _linked(self, stages: tuple[str, ...]) -> set[Path]:
-        runs = [self.root.parent] if self.root.name == STORE_FOLDER else []
-        for note in (self.root / ROOTS).glob("*"):
-            with suppress(*FAULTS):
-                runs.append(Path(read_text(note).rstrip("\n")))
-        return {(run / stage).resolve() for run in runs for stage in stages if (run / stage).is_symlink()}
 
 
 @dataclass(frozen=True)
@@ -372,12 +366,9 @@ def _link_files(source: Path, target: Path) -> None:
     """
     beside = target.with_name(f"{target.name}.carried")
     shutil.rmtree(beside, ignore_errors=True)
-    shutil.copytree(source, beside, copy_function=_link_or_copy)
-    beside.rename(target)
-
-
-def _link_or_copy(source: str, target: str) -> None:
     try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
+        shutil.copytree(source, beside, copy_function=os.link)
+    except OSError:  # shutil.Error is one
+        shutil.rmtree(beside)
+        shutil.copytree(source, beside)
+    beside.rename(target)

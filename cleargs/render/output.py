@@ -18,8 +18,8 @@ from cleargs.media.exr import write_view
 from cleargs.media.image import read_rgb, write_rgb
 from cleargs.progress import Task
 from cleargs.splat.camera import Camera, cameras_json
+from cleargs.splat.render import Viewer
 from cleargs.splat.scene import Scene
-from cleargs.splat.viewer import Viewer
 from cleargs.types import ImageU8
 
 Kind = Literal["film", "still", "folder"]

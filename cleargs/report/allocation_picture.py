@@ -58,12 +58,26 @@ def plot_allocation(path: Path, rva: Path, ingest: Path, title: str) -> None:
     layout: list[Any] = [["plan", "scores"], ["plan", "weights"], *([name, name] for name in pictured)]
     heights = [3.0, 3.0, *(2.4 for _ in pictured)]
     figure = Figure(figsize=(16.0, sum(heights)), dpi=150, layout="constrained")
-    figure.suptitle(_headline(rows, covered, title), fontsize=12, parse_math=False)  # names may hold dollars
+    weight = np.array([row["weight"] for row in rows])
+    stand_in = sum(row["stand_in"] for row in rows)
+    headline = (
+        f"{title}: {np.count_nonzero(weight)} of {len(weight)} frames active, effective sample size "
+        f"{effective_sample_size(weight):.1f}; {covered.count(False)} of {len(covered)} trajectory bins "
+        f"uncovered before compensation; "
+        f"{f'no reliable frame, {stand_in} in their place; ' if stand_in else ''}"
+        f"judged by {rows[0]['evaluator']}"
+    )
+    figure.suptitle(fill(headline, 140), fontsize=12, parse_math=False)  # names may hold dollars
     panels = figure.subplot_mosaic(layout, width_ratios=(1.0, 1.6), height_ratios=heights)
     _draw_plan(panels["plan"], [row for row in rows if frames[row["frame_id"]].registered], frames)
     _draw_along(panels["scores"], panels["weights"], rows, frames, covered)
     for name, shown in pictured.items():
-        tiles = [_tile(ingest / frames[row["frame_id"]].image, row) for row in shown]
+        tiles = []
+        for row in shown:
+            place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
+            label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
+            image = read_rgb(ingest / frames[row["frame_id"]].image)
+            tiles.append(Tile(image, label, marked=bool(row["weight"])))
         sheet = contact_sheet([tiles], tile_width=_TILE)
         panels[name].imshow(sheet)
         # The same scale in every row, also in one of few frames.
@@ -94,19 +108,6 @@ def extremes(rows: Sequence[Row], most: int = SHOWN) -> dict[str, list[Row]]:
         found[title] = chosen
     found[f"reactivated: {len(places)} of {len(revived)}"] = [revived[place] for place in places]
     return {title: [rows[k] for k in chosen] for title, chosen in found.items() if chosen}
-
-
-def _headline(rows: Sequence[Row], covered: Sequence[bool], title: str) -> str:
-    weight = np.array([row["weight"] for row in rows])
-    stand_in = sum(row["stand_in"] for row in rows)
-    facts = [
-        f"{np.count_nonzero(weight)} of {len(weight)} frames active, effective sample size "
-        f"{effective_sample_size(weight):.1f}",
-        f"{covered.count(False)} of {len(covered)} trajectory bins uncovered before compensation",
-        *([f"no reliable frame, {stand_in} in their place"] if stand_in else []),
-        f"judged by {rows[0]['evaluator']}",
-    ]
-    return fill(f"{title}: " + "; ".join(facts), 140)
 
 
 def _draw_plan(panel: Axes, rows: Sequence[Row], frames: Mapping[int, Frame]) -> None:
@@ -154,9 +155,3 @@ def _mark_frames(panel: Axes, x: NDArray[Any], y: NDArray[Any], rows: Sequence[R
         if among:
             label = f"{role} ({len(among)})"
             panel.scatter(x[among], y[among], s=sizes, c=colour, marker=shape, label=label, zorder=4)
-
-
-def _tile(path: Path, row: Row) -> Tile:
-    place = "no pose" if row["G"] is None else f"G {row['G']:.2f} weight {row['weight']:.2f}"
-    label = f"{row['frame_id']} {row['role']} R {row['R']:.2f} B {row['B']:.2f} {place}"
-    return Tile(read_rgb(path), label, marked=bool(row["weight"]))

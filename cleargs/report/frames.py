@@ -26,7 +26,7 @@ from cleargs.parquet import read_any_table, read_table
 from cleargs.rivr.tables import Selection, read_selection
 from cleargs.rva.tables import FRAMES
 from cleargs.splat.camera import Camera
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 from cleargs.types import ImageU8
 
 HELD_OUT, UNPLACED = "held out", "not placed"

@@ -11,21 +11,24 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import tomli_w
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from matplotlib.ticker import MaxNLocator
 from rich.filesize import decimal
 
 import cleargs
 from cleargs.errors import InputError
 from cleargs.files import whole_folder
-from cleargs.manifest import Manifest, plain_json
+from cleargs.manifest import plain_json
+from cleargs.parquet import read_table
 from cleargs.pipeline.config import Config, load_config, recipe_names
 from cleargs.pipeline.dag import Dag
 from cleargs.pipeline.plan import Planner, StagePlan
 from cleargs.pipeline.run_file import RunSpec
 from cleargs.pipeline.settings import flattened
-from cleargs.report import charts
 from cleargs.report.formatting import duration
 from cleargs.report.frames import (
     CHOICES,
@@ -46,7 +49,8 @@ from cleargs.report.web_scene import level_camera, opening, viewer_data, write_s
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.splat.backend import set_threads
 from cleargs.splat.ply import read_ply
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
+from cleargs.splat.tables import TRAIN
 
 _STILL = 960  # px, long side of the pictures that stand for the viewers
 
@@ -77,7 +81,7 @@ def page_environment() -> Environment:
     static = files("cleargs.report").joinpath("static")
     environment.filters |= {"json": json_in_html, "duration": duration, "bytes": decimal}
     environment.globals["static"] = lambda name: Markup(static.joinpath(name).read_text(encoding="utf-8"))
-    environment.globals["weight_colour"] = charts.weight_colour
+    environment.globals["weight_colour"] = weight_colour
     return environment
 
 
@@ -99,6 +103,14 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
     rows = load_rows(run, manifests)
     placed = [row for row in rows if row.frame.registered]
     trained = [stage for stage in SCENES if stage in manifests]
+    plans: dict[str, StagePlan] = {}
+    try:
+        plans = {plan.stage: plan for plan in planner.plan()}
+    except InputError as error:  # the capture has gone
+        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
+    versions: dict[str, str] = {}
+    for manifest in manifests.values():
+        versions |= {**manifest.versions, **manifest.parts.libraries}
     with whole_folder(page_of(run).parent, replace=True) as folder:
         scenes, final = _scenes(folder, run, trained, placed) if trained and placed else ([], None)
         pictures = write_pictures(rows, run, folder, final, planner.threads)
@@ -112,15 +124,15 @@ def write_report(planner: Planner, last: LastRun | None = None) -> Path:
             verdict=ReportVerdict(manifests, rows, planner.run.config),
             scenes=scenes,
             viewer=write_viewer(folder) if scenes else "",
-            plan=charts.plan_of(rows),
-            curves=charts.training_curves(run, trained),
-            bars=charts.fitted_bars(rows),
+            plan=plan_of(rows),
+            curves=training_curves(run, trained),
+            bars=fitted_bars(rows),
             stages=planner.dag.names,
             manifests=manifests,
-            plans=_plans(planner),
+            plans=plans,
             last=last,
             settings=changed_settings(planner.run.config),
-            versions=_versions(manifests),
+            versions=versions,
             command=command(planner.run, planner.dag),
             aspect=f"{rows[0].frame.width} / {rows[0].frame.height}" if rows else "16 / 9",
             data={
@@ -173,15 +185,6 @@ def _scenes(
     return views, renderer
 
 
-def _plans(planner: Planner) -> dict[str, StagePlan]:
-    """The state of every stage; empty when the capture has gone."""
-    try:
-        return {plan.stage: plan for plan in planner.plan()}
-    except InputError as error:
-        planner.reporter.warn(f"whether the results are still those of the input is unknown: {error}")
-        return {}
-
-
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     """Name, value, default and meaning of each setting of the stages that differs from its default."""
     return [
@@ -214,14 +217,6 @@ def _toml(value: Any) -> str:
     if value is None:
         return "unset"
     return " ".join(tomli_w.dumps({"v": value}).removeprefix("v = ").split())
-
-
-def _versions(manifests: Mapping[str, Manifest]) -> dict[str, str]:
-    """Program or library -> version, of all stages together."""
-    found: dict[str, str] = {}
-    for manifest in manifests.values():
-        found |= {**manifest.versions, **{name: str(v) for name, v in manifest.parts.libraries.items()}}
-    return found
 
 
 def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | None) -> dict[str, Any]:
@@ -259,3 +254,116 @@ def _frame_data(row: FrameRow, layers: Mapping[str, ImageFile], time: float | No
         "layers": {name: picture.path for name, picture in layers.items()},
         "time": time,
     }
+
+
+# -- drawings: SVG paths of curves, and cameras seen from above ----------------------------------------------
+
+
+WIDTH, HEIGHT = 640, 220
+"""Of a curve's drawing area, in units of its SVG."""
+
+_POINTS = 120  # of a curve
+_LOW, _HIGH = np.array([222.0, 135.0, 38.0]), np.array([22.0, 146.0, 138.0])  # amber, teal
+
+
+def training_curves(run: Path, stages: Sequence[str]) -> list[dict[str, Any]]:
+    """Loss and PSNR on real frames, and Gaussians, over the steps of these stages. Raises StoreError.
+
+    Places (of ticks, and of the parts where each training starts) are in `WIDTH` x `HEIGHT`.
+    """
+    paths = {stage: run / stage / "train.parquet" for stage in stages}
+    tables = {stage: read_table(path, TRAIN) for stage, path in paths.items() if path.is_file()}
+    tables = {stage: table for stage, table in tables.items() if table.num_rows}
+    if not tables:
+        return []
+    steps = pa.concat_tables(tables.values())
+    real = np.array(steps["kind"].to_pylist()) == "real"
+    starts = np.cumsum([0, *(table.num_rows for table in tables.values())])
+    parts = [(start / len(real) * WIDTH, stage) for start, stage in zip(starts, tables, strict=False)]
+
+    def curve(title: str, unit: str, name: str, digits: int, *, only_real: bool) -> dict[str, Any]:
+        values = steps[name].to_numpy().astype(np.float64)
+        known = np.flatnonzero(real & np.isfinite(values)) if only_real else np.arange(len(values))
+        # Medians of equal stretches: a step shows one view, and views differ more than steps do.
+        stretches = np.array_split(known, min(_POINTS, max(1, len(known) // 6)))
+        x = np.array([part.mean() for part in stretches]) / max(len(values) - 1, 1) * WIDTH
+        y = np.array([np.median(values[part]) for part in stretches])
+        ticks = MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)).tick_values(float(y.min()), float(y.max()))
+        down = np.interp(y, (ticks[0], ticks[-1]), (HEIGHT, 0.0))
+        return {
+            "title": title,
+            "unit": unit,
+            "path": "M" + " L".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, down, strict=True)),
+            "ticks": list(zip(np.linspace(HEIGHT, 0.0, len(ticks)), (f"{t:,g}" for t in ticks), strict=True)),
+            "parts": parts,
+            "steps": len(values),
+            "first": f"{y[0]:,.{digits}f}",
+            "last": f"{y[-1]:,.{digits}f}",
+        }
+
+    return [
+        curve("PSNR of the frames trained on", "dB", "psnr", 1, only_real=True),
+        curve("Loss", "", "loss", 3, only_real=True),
+        curve("Gaussians", "", "n_gaussians", 0, only_real=False),
+    ]
+
+
+def weight_colour(weight: float) -> str:
+    """Amber (barely used) to teal (fully), which people with any colour vision can tell apart."""
+    red, green, blue = np.rint(_LOW + (_HIGH - _LOW) * min(max(weight, 0.0), 1.0)).astype(int)
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+def plan_of(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
+    """The cameras of the placed frames from above (x to the right, z up), in units of the SVG; None without
+    any. The tip of a mark ends the line that shows where it looks.
+    """
+    placed = [row for row in rows if row.frame.registered]
+    if not placed:
+        return None
+    cameras = [camera_of(row.frame) for row in placed]
+    centres = np.array([camera.centre[[0, 2]] for camera in cameras]) * [1.0, -1.0]
+    looks = np.array([camera.world_to_camera[2, [0, 2]] for camera in cameras]) * [1.0, -1.0]
+    looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    scale = 520.0 / max(float((high - low).max()), 1e-6)
+    size = (high - low) * scale
+    height = float(np.clip(size[1], 160.0, 420.0))
+    at = (centres - (low + high) / 2.0) * min(scale, height / max(float(high[1] - low[1]), 1e-6))
+    at += np.array([size[0], height]) / 2.0 + 60.0
+    marks = [
+        {
+            "frame_id": row.frame.frame_id,
+            "x": round(float(x), 1),
+            "y": round(float(y), 1),
+            "radius": 5.0 + 3.0 * (row.weight or 0.0),
+            "colour": weight_colour(row.weight or 0.0),
+            "tip": (round(float(x + 26 * dx), 1), round(float(y + 26 * dy), 1)),
+            "active": bool(row.weight),
+        }
+        for row, (x, y), (dx, dy) in zip(placed, at, looks, strict=True)
+    ]
+    path = "M" + " L".join(f"{mark['x']},{mark['y']}" for mark in marks)
+    return {"width": float(size[0]) + 120.0, "height": height + 120.0, "path": path, "marks": marks}
+
+
+def fitted_bars(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
+    """The figures of each frame's exposure, as far as they are known: frame id and value of each bar."""
+    bars = []
+    for title, unit, found in (
+        ("Motion blur", "px", [row.motion("blur_px") for row in rows]),
+        ("Rolling shutter", "px", [row.motion("skew_px") for row in rows]),
+        ("Defocus", "px", [row.formation.get("defocus_px") for row in rows]),
+        ("Exposure", "stops", [row.gain_ev for row in rows]),
+    ):
+        numbered = zip(rows, found, strict=True)
+        known = [(row.frame.frame_id, float(value)) for row, value in numbered if value is not None]
+        if not known:
+            continue
+        values = [value for _, value in known]
+        summary = f"median {np.median(values):.1f} {unit}, at most {max(values):.1f} {unit}"
+        if unit == "stops":
+            summary = f"from {min(values):+.2f} to {max(values):+.2f} {unit}"
+        span = {"low": min(0.0, *values), "high": max(0.0, *values) or 1.0}
+        bars.append({"title": title, "unit": unit, "known": known, "summary": summary, **span})
+    return bars

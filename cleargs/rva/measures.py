@@ -228,21 +228,19 @@ def ghosting(luminance: PlaneF32, noise: float) -> float:
     energy = float(np.sum(np.square(window, dtype=np.float64)))
     floor = (noise**2 + 1.0 / 12.0) * energy  # rounding is noise as well
     spectrum = np.zeros((size, size // 2 + 1))
-    starts = list(product(*(_tile_starts(length, size) for length in luminance.shape)))
-    for y, x in starts:
+    starts = []
+    for length in luminance.shape:  # tiles that overlap by about a half
+        count = max(1, round(2.0 * (length - size) / size) + 1)
+        starts.append([round(k * (length - size) / max(1, count - 1)) for k in range(count)])
+    places = list(product(*starts))
+    for y, x in places:
         tile = luminance[y : y + size, x : x + size]
         power = np.abs(np.fft.rfft2((tile - tile.mean(dtype=np.float64)) * window)) ** 2
         spectrum += np.log(power + 4.0 * floor)
-    cepstrum = np.fft.irfft2(spectrum / len(starts), s=(size, size))
+    cepstrum = np.fft.irfft2(spectrum / len(places), s=(size, size))
     cepstrum = np.roll(cepstrum, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     smooth = cv2.GaussianBlur(cepstrum, (0, 0), 3.0)
     offset = np.arange(2 * reach + 1) - reach
     distance = np.hypot(offset[:, None], offset[None, :])
     lags = (distance >= _NEAREST_LAG) & (distance <= reach - 4)  # the smoothed rim is no background
     return max(float((cepstrum - smooth)[lags].max()), 0.0)
-
-
-def _tile_starts(length: int, size: int) -> list[int]:
-    """Starts of tiles that cover ``length`` with about half a tile of overlap."""
-    count = max(1, round(2.0 * (length - size) / size) + 1)
-    return [round(k * (length - size) / max(1, count - 1)) for k in range(count)]

@@ -37,21 +37,13 @@ _STEEPNESS = 3.0  # exponent of the blur curves
 _NOTICEABLE = 0.5  # extent, px, that sharp frames reach by their content alone
 _MOTION_HALF = 1.2  # visible extent in the worst direction at which b_motion_blur is 1/2
 _DEFOCUS_HALF = 1.2  # visible extent in the best direction at which b_defocus is 1/2
-_ISOTROPY = (
-    0.80,
-    0.92,
-)  # least extent over largest at which a blur is taken for a motion's, and for a disc's
+_ISOTROPY = (0.80, 0.92)  # least extent over largest of a motion's blur, and of a disc's
 _DETAIL = (0.10, 1.0)  # share of the content's fine detail at which r_texture is 0 and 1: content varies it
-_CONTRAST = (
-    0.02,
-    0.10,
-)  # spread of the luma (of 1) at which texture is not to be relied on at all, and fully
+_CONTRAST = (0.02, 0.10)  # spread of the luma (of 1) at which texture is not relied on at all, and fully
 _NOISE_HALF = 8.0  # noise, levels of 255, at which r_cleanness is 1/2
 _BLOCKING_HALF = 4.0  # blocking at which the artifacts cue is 1/2; videos of good quality stay below 2
 _RINGING_HALF = 10.0  # ringing, levels, at which the artifacts cue is 1/2
-_GHOST_CONTENT = (
-    0.10  # content explains at most this height of a cepstral side peak, whatever the neighbours'
-)
+_GHOST_CONTENT = 0.10  # height of a cepstral side peak that content explains at most
 _GHOST = (0.04, 0.16)  # excess of the side peak at which b_ghosting is 0 and 1
 _CLIPPED = (0.10, 0.50)  # share of clipped pixels beyond the least clipped neighbour's: good, and lost
 _DARK = (0.20, 0.04)  # mean luma (of 1) at which darkness begins to hurt and exposure is lost

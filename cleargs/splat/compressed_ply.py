@@ -102,9 +102,11 @@ def _chunks(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint3
         places.append(((chunked - low[:, None]) / width).reshape(-1, 3)[:count])
     position, scale, colour = places
     alpha = torch.sigmoid(gaussians.logit_opacities).numpy()
+    largest, smaller = smaller_parts(gaussians.rotations.numpy())
+    rotation = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
     packed = [
         _pack(position, (11, 10, 11)),
-        _pack_rotation(gaussians.rotations.numpy()),
+        (largest.astype(np.uint32) << np.uint32(30)) | rotation,
         _pack(scale, (11, 10, 11)),
         _pack(np.column_stack([colour, alpha]), (8, 8, 8, 8)),
     ]
@@ -118,14 +120,6 @@ def _pack(values: NDArray[np.float32], bits: tuple[int, ...]) -> NDArray[np.uint
         top = 2**width - 1
         steps = np.clip(np.floor(values[:, column] * top + 0.5), 0, top)
         packed = (packed << np.uint32(width)) | steps.astype(np.uint32)
-    return packed
-
-
-def _pack_rotation(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:  # [N, 4] -> [N]
-    """Which of w, x, y, z is largest (2 bits), and the other three in their order, times sqrt(1/2)."""
-    largest, smaller = smaller_parts(quaternions)
-    places = _pack((smaller * np.sqrt(0.5) + 0.5).astype(np.float32), (10, 10, 10))
-    packed: NDArray[np.uint32] = (largest.astype(np.uint32) << np.uint32(30)) | places
     return packed
 
 

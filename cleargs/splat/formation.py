@@ -26,15 +26,12 @@ class Formed(Protocol):
 
     def forward(self, render: Render) -> Tensor:
         """The photograph [H, W, 3] sRGB."""
-        ...
 
     def backward(self, gradient: Tensor) -> Tensor:
         """The gradient by the render's image, from that by the photograph."""
-        ...
 
     def learn(self) -> None:
         """Step the numbers that follow the gradient of the last `backward`."""
-        ...
 
 
 class Formation(Protocol):
@@ -53,20 +50,15 @@ class Formation(Protocol):
 
         None where the view shows the render as it is.
         """
-        ...
 
     def digest(self) -> str:
         """A digest of all that it starts from."""
-        ...
 
     def state(self) -> dict[str, Tensor]:
         """All that changes while it learns, for a checkpoint."""
-        ...
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Resume from what `state` gave."""
-        ...
 
     def fault(self) -> str | None:
         """What in it is not finite; None where all is."""
-        ...

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from cleargs.errors import InputError
-from cleargs.files import write_bytes
+from cleargs.files import atomic_path, write_bytes
 from cleargs.plugins import load_part, plugins
 from cleargs.splat.compressed_ply import compressed_ply
 from cleargs.splat.gaussians import Gaussians
@@ -23,11 +23,41 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.sog import sog
 from cleargs.splat.spz import spz
 from cleargs.splat.transforms import transform_scene
-from cleargs.splat.usd import write_usd
 
 _AS_IS = (1.0, 1.0, 1.0)
 _ABOUT_X = (1.0, -1.0, -1.0)  # to x right, y up, z back: the axes of SPZ
 _ABOUT_Z = (-1.0, -1.0, 1.0)  # to y up, z still forward: how glTF and PlayCanvas's tools show PLYs
+
+
+def write_usd(path: Path, scene: Scene) -> None:
+    """Write OpenUSD's ParticleField3DGaussianSplat (26.03 and later), atomically; y is up in ``scene``.
+
+    Raises InputError where the extra ``usd`` is not installed.
+    """
+    try:
+        from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
+        schema = UsdVol.ParticleField3DGaussianSplat
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            "OpenUSD 26.03 or later is not installed", hint="pip install 'cleargs[usd]', or export a .glb"
+        ) from error
+    gaussians = scene.gaussians.to("cpu").detach()
+    unit = torch.nn.functional.normalize(gaussians.rotations.double(), dim=1).tolist()
+    with atomic_path(path) as temporary:
+        stage = Usd.Stage.CreateNew(str(temporary))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        splats = schema.Define(stage, "/scene")
+        stage.SetDefaultPrim(splats.GetPrim())
+        splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))
+        splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(gaussians.log_scales.exp().numpy()))
+        splats.CreateOrientationsAttr(Vt.QuatfArray([Gf.Quatf(*quaternion) for quaternion in unit]))
+        splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(torch.sigmoid(gaussians.logit_opacities).numpy()))
+        splats.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
+        splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(
+            Vt.Vec3fArray.FromNumpy(gaussians.sh.reshape(-1, 3).contiguous().numpy())
+        )
+        stage.Save()
 
 
 @dataclass(frozen=True)

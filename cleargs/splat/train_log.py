@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from cleargs.files import write_bytes
-from cleargs.splat.camera import Camera
 from cleargs.splat.tables import TRAIN
 from cleargs.splat.types import Reading
 from cleargs.splat.views import TrainingView
@@ -29,7 +28,7 @@ _ROW = np.dtype(
 _RECENT = 50
 """Steps that a running mean looks back."""
 
-_SIDE = 640
+PREVIEW_SIDE = 640
 """Longer side of a preview in px, at most."""
 
 
@@ -86,11 +85,6 @@ class TrainLog:
             "kind": np.where(rows["kind"], "pseudo", "real"),
         }
         return pa.table({name: pa.array(columns[name]) for name in TRAIN.names}).cast(TRAIN)
-
-
-def preview_camera(camera: Camera) -> Camera:
-    """``camera`` reduced to the size of a preview."""
-    return camera.scaled(min(1.0, _SIDE / max(camera.width, camera.height)))
 
 
 def write_preview(path: Path, image: Tensor) -> None:  # [H, W, 3] sRGB

@@ -9,7 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Collection, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,10 +35,9 @@ from cleargs.splat.kernels.cuda import support
 from cleargs.splat.scene import Scene
 from cleargs.splat.schedule import Schedule
 from cleargs.splat.state import load_state, save_state
-from cleargs.splat.train_log import TrainLog, preview_camera, write_preview
+from cleargs.splat.train_log import PREVIEW_SIDE, TrainLog, write_preview
 from cleargs.splat.types import Moments, Render, group
 from cleargs.splat.views import ImageCache, TrainingView, require_views
-from cleargs.termination import deferred_sigterm
 
 _NOTE_INTERVAL = 10
 """Steps between updates of the progress bar, and of the log where the losses lie on a GPU."""
@@ -180,7 +182,10 @@ class Trainer:
         config, view, at = self._config, self._view(self.done), self._at
         factor = self._schedule.image_factor(at)
         target, mask = self._cache.get(view, factor)
-        formed = self._formed(view, factor, target, mask)
+        formed, render_with_depth = None, partial(self._render, depth=True)
+        if self._formation is not None:
+            progress = at / config.planned
+            formed = self._formation.form(view, factor, progress, target, mask, render_with_depth)
         weight = view.weight if formed is None else formed.weight
         weight *= self._pseudo_weight if view.kind == "pseudo" else 1.0
         camera = view.camera.scaled(factor) if formed is None else formed.camera
@@ -211,7 +216,8 @@ class Trainer:
     def preview(self) -> Tensor:
         """The scene so far [H, W, 3], at the view that counts most, reduced; valid until the next step."""
         view = max(self._real or self._pseudo, key=lambda view: view.weight)
-        return self._render(preview_camera(view.camera), depth=False).image
+        camera = view.camera.scaled(min(1.0, PREVIEW_SIDE / max(view.camera.width, view.camera.height)))
+        return self._render(camera, depth=False).image
 
     def shares_of_work(self) -> list[float]:
         """For 0 to ``length`` steps done, the share of the work that is behind us: growth makes later steps
@@ -286,14 +292,6 @@ class Trainer:
         order = np.random.default_rng([*self._seed, stream, epoch]).permutation(len(views))
         return views[int(order[position])]
 
-    def _formed(
-        self, view: TrainingView, factor: float, target: Tensor, mask: Tensor | None
-    ) -> Formed | None:
-        if self._formation is None:
-            return None
-        progress = self._at / self._config.planned
-        return self._formation.form(view, factor, progress, target, mask, partial(self._render, depth=True))
-
     def _render(self, camera: Camera, *, depth: bool) -> Render:
         return self._rasteriser.view(self.scene, camera, depth=depth, sh_degree=self._sh_degree())
 
@@ -367,7 +365,11 @@ class Trainer:
 def _fault(gaussians: Gaussians) -> str | None:
     """The first parameter that holds NaN or infinity, and in how many Gaussians; None where none does."""
     tensors = gaussians.tensors()
-    if _all_finite(tensors.values()):
+    if gaussians.device.type == "cpu":  # which NumPy tests far sooner
+        finite = all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors.values())
+    else:  # waits for the GPU once
+        finite = bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all())
+    if finite:
         return None
     for name, tensor in tensors.items():
         sound = int(torch.isfinite(tensor).reshape(gaussians.num, -1).all(1).sum())
@@ -376,26 +378,38 @@ def _fault(gaussians: Gaussians) -> str | None:
     return None
 
 
-def _all_finite(tensors: Collection[Tensor]) -> bool:
-    """Whether no number is NaN or infinite. Waits for a GPU once; a CPU's numbers NumPy tests far sooner."""
-    if not any(tensor.is_cuda for tensor in tensors):
-        return all(bool(np.isfinite(tensor.numpy()).all()) for tensor in tensors)
-    return bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors]).all())
-
-
-def _numbers(camera: Camera) -> list[float]:
-    size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return [*size, *camera.world_to_camera.ravel().tolist()]
-
-
 def _fingerprint(
     scene: Scene, views: Sequence[TrainingView], config: TrainConfig, starts: Sequence[float | str]
 ) -> Tensor:
     """A digest [32] of what a training starts from (pixels aside), by which its checkpoints are known."""
     settings = config.model_dump(mode="json", exclude={"checkpoint_interval", "cache_mb"})
-    seen = [(view.frame_id, view.kind, view.weight, _numbers(view.camera)) for view in views]
+    seen = []
+    for view in views:
+        *lens, pose = vars(view.camera).values()
+        seen.append((view.frame_id, view.kind, view.weight, [*lens, *pose.ravel().tolist()]))
     parts = [settings, seen, scene.antialias, scene.background, list(starts)]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for tensor in scene.gaussians.tensors().values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return torch.tensor(list(digest.digest()), dtype=torch.uint8)
+
+
+@contextmanager
+def deferred_sigterm() -> Iterator[Callable[[], bool]]:
+    """Hold SIGTERM back for the block, and yield a function that returns True once it came.
+
+    The block is expected to save its state and to raise KeyboardInterrupt then. A cluster sends SIGTERM
+    before a time limit, so that a job can save. Nothing is held back outside the main thread, where Python
+    runs no signal handlers, nor in a program that does not answer SIGTERM itself.
+    """
+    asked = threading.Event()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM)
+    if not in_main_thread or not callable(before):
+        yield asked.is_set
+        return
+    signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGTERM, before)

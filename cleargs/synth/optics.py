@@ -76,11 +76,9 @@ class World(Protocol):
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
         """The mean over the samples in linear light, [H, W, 3]; 1 is sensor white."""
-        ...
 
     def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
         """Distance along the optical axis through the pixel centres, [H, W]; 0 where there is nothing."""
-        ...
 
 
 def low_discrepancy(count: int) -> ArrayF64:

@@ -27,11 +27,9 @@ class Course(Protocol):
 
     def poses(self, shares: ArrayF64) -> ArrayF64:
         """Poses [T, 3, 4] at ``shares`` [T] of the way; a little beyond 0 and 1 is allowed."""
-        ...
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
         """A pose [3, 4] off the course, near ``share``, that looks at what the course looks at."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,10 @@ class Hand:
         axes = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 0.2, count)], 1)
         self._swing_turns = rng.uniform(*SWING_RADIANS, (count, 1)) * axes  # [swings, 3] radians
         self._phases = rng.uniform(0, 2 * np.pi, (12, 3))
-        self.stretches = _stretches(duration, seed) if stretched else np.empty((0, 2))
+        count = max(1, round(duration * FPS / FRAMES_PER_STRETCH)) if stretched else 0
+        free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
+        starts = np.arange(count) + free
+        self.stretches = np.stack([starts, starts + STRETCH_SHARE], 1) * duration / max(count, 1)
         """Seconds [stretches, 2] from and to which the hand shakes."""
 
     def turns(self, times: ArrayF64) -> ArrayF64:  # [T]
@@ -145,13 +146,6 @@ class Hand:
         inside = np.minimum(times[:, None] - start, end - times[:, None])
         share = np.clip(inside / STRETCH_EDGE + 0.5, 0, 1)
         return np.asarray((share**2 * (3 - 2 * share)).sum(1))
-
-
-def _stretches(duration: float, seed: int) -> ArrayF64:
-    count = max(1, round(duration * FPS / FRAMES_PER_STRETCH))
-    free = np.random.default_rng([seed, Stream.SHAKY_STRETCHES]).uniform(0, 1 - STRETCH_SHARE, count)
-    starts = np.arange(count) + free
-    return np.stack([starts, starts + STRETCH_SHARE], 1) * duration / count
 
 
 class HandheldPath:

@@ -227,16 +227,6 @@ def _light_at(
 
 
 @njit(cache=True, error_model="numpy")
-def _passes_by(item: np.void, origin: ArrayF64, ray: ArrayF64) -> bool:
-    """Whether the ray misses the sphere around the primitive."""
-    centre = item["centre"]
-    x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
-    along = x * ray[0] + y * ray[1] + z * ray[2]
-    bound: float = item["bound"]
-    return bool(x * x + y * y + z * z - along * along > bound * bound)
-
-
-@njit(cache=True, error_model="numpy")
 def _trace(
     origin: ArrayF64,
     ray: ArrayF64,
@@ -252,8 +242,11 @@ def _trace(
     normal, best_normal, local_point, local_ray = scratch[0], scratch[1], scratch[2], scratch[3]
     for number in range(primitives.shape[0]):
         item = primitives[number]
-        if _passes_by(item, origin, ray):
-            continue
+        centre, bound = item["centre"], item["bound"]
+        x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
+        along = x * ray[0] + y * ray[1] + z * ray[2]
+        if x * x + y * y + z * z - along * along > bound * bound:
+            continue  # the ray misses the sphere around the primitive
         _to_local(item, origin, True, local_point)
         _to_local(item, ray, False, local_ray)
         if item["kind"] == BOX:

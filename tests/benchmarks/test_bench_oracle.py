@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks.speed import oracle as oracle_module
+from benchmarks.speed import reference
 from benchmarks.speed.iteration import Iteration
 from benchmarks.speed.oracle import (
     Truth,
@@ -20,7 +21,6 @@ from benchmarks.speed.oracle import (
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
 from cleargs.splat.pace import random_scene
 
 SPLATS, WIDTH, HEIGHT = 90, 45, 33

@@ -6,13 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.speed import torch_tiles
+from benchmarks.speed import reference, torch_tiles
+from benchmarks.speed.reference import Splats
 from benchmarks.speed.torch_tiles import TILE, groups, pixel_centres, rasterise, tile_lists
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
-from cleargs.splat.kernels.reference import Splats
 from cleargs.splat.pace import random_scene
 
 WIDTH, HEIGHT = 45, 35

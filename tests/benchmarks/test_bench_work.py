@@ -7,6 +7,7 @@ from importlib import import_module
 import pytest
 import torch
 
+from benchmarks.speed import reference
 from benchmarks.speed.iteration import Iteration, projected_frame
 from benchmarks.speed.peaks import Peaks, measure_peaks
 from benchmarks.speed.probe import KERNELS, PACKAGE, timed_kernels
@@ -16,7 +17,6 @@ from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
 from benchmarks.speed.work import KernelWork, size_of, work_of
 from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
 from cleargs.splat.kernels.cpu.backend import warm_up
 from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.pace import random_scene

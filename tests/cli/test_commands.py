@@ -15,14 +15,14 @@ import pyarrow as pa
 import pytest
 from toy import Bench
 
-from cleargs.cli.common import threads_or_all
 from cleargs.cli.main import COMMANDS, explanation, invoke
-from cleargs.cli.progress_bars import PlainTextReporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.run import print_outcomes
 from cleargs.cli.show import describe_table, sampled_rows
 from cleargs.manifest import FileRecord, KeyParts, Manifest
 from cleargs.parquet import column
 from cleargs.pipeline.runner import StageOutcome
+from cleargs.pipeline.session import usable_cores
 
 
 @pytest.fixture
@@ -152,13 +152,6 @@ def test_settings_lists_what_the_models_say(shell: Shell) -> None:
     code, out, _ = shell("settings")
     assert code == 0 and "at most so many numbers" in out and "power" in out and "offset" in out
     assert shell("settings", "cuont")[2].endswith("hint: did you mean count?\n")
-
-
-def test_the_page_of_settings_is_current(capsys: pytest.CaptureFixture[str]) -> None:
-    """Made anew by: cleargs settings --markdown > docs/settings.md"""
-    assert invoke(["settings", "--markdown"]) == 0
-    page = Path(__file__).parents[2] / "docs" / "settings.md"
-    assert capsys.readouterr().out == page.read_text(encoding="utf-8")
 
 
 def test_run_json_is_json_and_nothing_else(shell: Shell) -> None:
@@ -468,8 +461,8 @@ def test_the_time_left_counts_from_the_first_step_on(
 ) -> None:
     """The first step waits for the kernels to be compiled, say: that is not the pace of the others."""
     clock = [0.0]
-    monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    with PlainTextReporter().task("G0", 1000) as task:
+    monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
+    with make_reporter().task("G0", 1000) as task:
         for now, done in ((100.0, 1), (101.0, 6), (120.0, 101)):
             clock[0] = now
             task.update(done=done)
@@ -482,8 +475,8 @@ def test_the_time_left_follows_the_work_where_steps_differ(
 ) -> None:
     """Half of the steps may be a quarter of the work: a training's last steps have the most Gaussians."""
     clock = [0.0]
-    monkeypatch.setattr("cleargs.cli.progress_bars.time.monotonic", lambda: clock[0])
-    with PlainTextReporter().task("G0", 1000) as task:
+    monkeypatch.setattr("cleargs.progress.time.monotonic", lambda: clock[0])
+    with make_reporter().task("G0", 1000) as task:
         for now, done, share in ((100.0, 1, 0.0), (110.0, 500, 0.25)):
             clock[0] = now
             task.update(done=done, share=share)
@@ -541,9 +534,9 @@ def test_threads_wait_asleep_unless_told_otherwise(own: dict[str, str], policy: 
 def test_cores_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("os.sched_getaffinity")
     monkeypatch.setattr("os.cpu_count", lambda: 6)
-    assert threads_or_all(None) == 6
+    assert usable_cores() == 6
     monkeypatch.setattr("os.cpu_count", lambda: None)
-    assert threads_or_all(None) == 1
+    assert usable_cores() == 1
 
 
 def test_a_run_is_no_capture(shell: Shell) -> None:

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from cleargs.cli.show import labelled
-from cleargs.cli.show_frame import frame_rows, reason, short_name, worst_cue
+from cleargs.cli.show import frame_rows, labelled, reason, short_name, worst_cue
 from cleargs.rva.tables import B_CUES, R_CUES
 from cleargs.stages.rva import RvaConfig
 

@@ -14,7 +14,7 @@ import pytest
 from toy import Bench
 
 from cleargs.cli.main import explanation, invoke
-from cleargs.cli.progress_bars import PlainTextReporter
+from cleargs.cli.progress_bars import make_reporter
 from cleargs.cli.terminal import EscapingStream
 from cleargs.errors import InputError
 from cleargs.safe_io import printable
@@ -56,7 +56,7 @@ def test_the_streams_escape_all_but_lines_and_colours() -> None:
 def test_errors_and_reports_are_one_line_each(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     _, cause, remedy = explanation(InputError(f"no {CLIPBOARD}{FORGED}", hint=FORGED))
     assert cause.isprintable() and remedy.isprintable()
-    reporter = PlainTextReporter()
+    reporter = make_reporter()
     reporter.warn(FORGED)
     reporter.info(CLEAR)
     with reporter.task(CLIPBOARD, 1) as task:

@@ -141,7 +141,7 @@ def compare(
     Pixels where an alpha lies within ``margin`` (relative) of 1/255, or a transmittance of 1e-4, are left
     out: there the image is discontinuous and float32 may decide the other way.
     """
-    from cleargs.splat.kernels import reference
+    from benchmarks.speed import reference
     from cleargs.splat.kernels.rasteriser import sh_count
 
     single, double = leaves(gaussians, torch.float32), leaves(gaussians, torch.float64)

@@ -63,7 +63,7 @@ def test_without_locks_the_rename_decides(bench: Bench) -> None:
     manifest = read_manifest(bench.folder / "total")
     with DigestMemo(bench.root / "memo.sqlite") as memo:
         first, second = Store(bench.root / "shared", memo), Store(bench.root / "shared", memo)
-        second._own = lambda: "@another-node-1"  # type: ignore[method-assign]
+        second._owner_suffix = lambda: "@another-node-1"  # type: ignore[method-assign]
         key, result = manifest.key, (bench.folder / "total" / "total.txt").read_bytes()
         with first.lock(key, bench.remarks, "total") as alone, second.lock(key, bench.remarks, "total"):
             assert not alone

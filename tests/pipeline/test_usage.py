@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 
-from cleargs.pipeline.usage import Usage
+from cleargs.pipeline.runner import Usage
 
 WORK = "import time\nwhile time.process_time() < 0.3: pass"
 
@@ -23,7 +23,7 @@ def test_processor_time_of_this_process_and_of_children() -> None:
 
 
 HELD = """
-from cleargs.pipeline.usage import Usage
+from cleargs.pipeline.runner import Usage
 usage = Usage()
 before = usage.peak_memory_gb
 block = bytearray(200_000_000)

@@ -37,9 +37,9 @@ from cleargs.rva.tables import R_CUES
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.ply import write_ply
+from cleargs.splat.render import Viewer
 from cleargs.splat.scene import Scene
 from cleargs.splat.tables import TRAIN
-from cleargs.splat.viewer import Viewer
 
 WIDTH, HEIGHT, FOCAL = 96, 54, 90.0
 COUNT = 7

@@ -17,7 +17,7 @@ from cleargs.pipeline.store import Store
 from cleargs.report.frames import camera_of
 from cleargs.report.page import write_report
 from cleargs.report.web_scene import level_camera
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 

@@ -18,7 +18,7 @@ from cleargs.cli.main import invoke
 from cleargs.report.frames import camera_of
 from cleargs.report.web_scene import level_camera, viewer_pose, write_viewer
 from cleargs.splat.camera import Camera
-from cleargs.splat.viewer import Viewer
+from cleargs.splat.render import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 

@@ -25,9 +25,8 @@ from cleargs.pipeline.config import load_config
 from cleargs.pipeline.dag import installed
 from cleargs.pipeline.runner import StageOutcome
 from cleargs.pipeline.store import Store
-from cleargs.report.charts import weight_colour
 from cleargs.report.frames import FrameRow
-from cleargs.report.page import changed_settings, command, json_in_html, write_report
+from cleargs.report.page import changed_settings, command, json_in_html, weight_colour, write_report
 from cleargs.report.report_json import LastRun, is_current, linked_manifests
 from cleargs.report.verdict import ReportVerdict
 from cleargs.report.web_scene import BYTES, shown_degree, write_scene

@@ -21,8 +21,8 @@ from watched import reported, serving, working
 from cleargs.errors import InputError
 from cleargs.progress import PREVIEW
 from cleargs.report.serve import Server
+from cleargs.splat.render import Viewer
 from cleargs.splat.train_log import write_preview
-from cleargs.splat.viewer import Viewer
 
 
 @dataclass

@@ -13,8 +13,8 @@ from watched import reported, serving, working
 
 from cleargs.pipeline import live
 from cleargs.progress import PREVIEW
+from cleargs.splat.render import Viewer
 from cleargs.splat.train_log import write_preview
-from cleargs.splat.viewer import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 

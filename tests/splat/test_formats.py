@@ -20,9 +20,9 @@ from cleargs.errors import InputError
 from cleargs.splat.camera import Camera, cameras_json
 from cleargs.splat.formats import FORMATS, format_of, padded, write_scene
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels.reference import sh_basis
 from cleargs.splat.scene import Scene
 from cleargs.splat.spz import spz
+from cleargs.splat.transforms import sh_basis
 
 ABOUT_X, ABOUT_Z = np.array([1.0, -1.0, -1.0]), np.array([-1.0, -1.0, 1.0])
 

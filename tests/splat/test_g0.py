@@ -23,7 +23,7 @@ from cleargs.errors import InputError
 from cleargs.formation.exposure import read_exposure
 from cleargs.parquet import read_table, write_table
 from cleargs.pipeline.stage import StageContext
-from cleargs.progress import SilentReporter, SilentTask, Task
+from cleargs.progress import CountedTask, SilentReporter, Task
 from cleargs.rva.tables import FRAMES as RVA_FRAMES
 from cleargs.splat.constants import SH_C0
 from cleargs.splat.ply import read_ply
@@ -227,7 +227,7 @@ class CompiledWithin(SilentReporter):
     @contextmanager
     def task(self, label: str, total: int | None = None) -> Iterator[Task]:
         self.before = compiled()
-        yield SilentTask()
+        yield CountedTask(total, lambda *shown: None)
         self.found |= compiled() - self.before
 
 

@@ -19,10 +19,10 @@ from helpers.splat_scenes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.speed import reference
 from cleargs.splat.backend import rasteriser_for
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
 from cleargs.splat.render import render
 
 

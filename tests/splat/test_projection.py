@@ -9,12 +9,12 @@ import pytest
 import torch
 from helpers.splat_scenes import BACKGROUND, leaves, make_camera, make_gaussians, make_needles
 
+from benchmarks.speed import reference
 from cleargs.capture.tables import Frame
 from cleargs.errors import InputError
 from cleargs.formation.frames import view_of
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
-from cleargs.splat.kernels import reference
 from cleargs.splat.kernels.cpu import binning, projection
 from cleargs.splat.kernels.rasteriser import view_numbers
 from cleargs.splat.kernels.splat_layout import SPLAT_COLUMNS, TILE
@@ -44,12 +44,12 @@ def test_gradient_equals_finite_differences(name, output, antialias):
     weights = torch.randn(24, 32, 3, generator=generator, dtype=torch.float64) * safe[..., None]
     weights = weights if output == "image" else weights[..., 0]
 
-    def functional(scene):
-        result = render(scene, camera, background=BACKGROUND, antialias=antialias)
+    def functional(draw, scene):
+        result = draw(scene, camera, background=BACKGROUND, antialias=antialias)
         return (getattr(result, output) * weights).sum()
 
     live = leaves(gaussians, torch.float32)
-    functional(live).backward()
+    functional(render, live).backward()
     gradient = getattr(live, name).grad.double()
     errors = []
     for _ in range(3):
@@ -57,7 +57,7 @@ def test_gradient_equals_finite_differences(name, output, antialias):
         values = []
         for sign in (1, -1):
             moved = Gaussians(**{**exact.tensors(), name: getattr(exact, name) + sign * 1e-6 * direction})
-            values.append(functional(moved).item())
+            values.append(functional(reference.render, moved).item())
         slope = (values[0] - values[1]) / 2e-6
         size = (gradient * direction).abs().sum().item()
         assert size > 0.1

@@ -1,1 +1,1 @@
-"""Back ends of the splatting core: ``reference`` (float64 oracle), ``cpu`` (Numba) and ``cuda`` (Triton)."""
+"""Back ends of the splatting core: ``cpu`` (Numba) and ``cuda`` (Triton)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -14,16 +15,12 @@ def available_memory(root: Path = Path("/")) -> int:
     leaves less; elsewhere all that the machine has; more than any scene needs where nothing tells.
     ``root`` is where ``proc`` and ``sys`` are looked for.
     """
-    fields = _fields(root / "proc/meminfo")  # kB
-    machine = fields["MemAvailable:"] * 1024 if "MemAvailable:" in fields else _physical_memory()
+    machine = 2**62
+    with suppress(AttributeError, OSError, ValueError):  # no sysconf (Windows), or none of these names
+        machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if "MemAvailable:" in (fields := _fields(root / "proc/meminfo")):  # kB
+        machine = fields["MemAvailable:"] * 1024
     return min([machine, *_left_in_groups(root)])
-
-
-def _physical_memory() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # no sysconf (Windows), or none of these names
-        return 2**62
 
 
 def _left_in_groups(root: Path) -> Iterator[int]:
@@ -41,14 +38,11 @@ def _left_in_groups(root: Path) -> Iterator[int]:
         for group in (own, *own.parents):
             allowed, used = (_read(mount / group / f"memory.{name}").strip() for name in (limit, usage))
             if allowed.isdigit() and used.isdigit():  # "max" where there is no limit
+                # Pages of files count as used but are given back on demand; those of tmpfs are not.
                 statistics = _fields(mount / group / "memory.stat")
-                yield int(allowed) - int(used) + _file_cache(statistics)
-
-
-def _file_cache(statistics: dict[str, int]) -> int:
-    """Pages of files, which count as used but are given back on demand; those of tmpfs are not."""
-    cache = statistics.get("file", statistics.get("total_cache", 0))  # version 2, version 1
-    return cache - statistics.get("total_shmem", statistics.get("shmem", 0))
+                cache = statistics.get("file", statistics.get("total_cache", 0))  # version 2, version 1
+                kept = statistics.get("total_shmem", statistics.get("shmem", 0))
+                yield int(allowed) - int(used) + cache - kept
 
 
 def _fields(file: Path) -> dict[str, int]:

@@ -147,7 +147,7 @@ class Rasteriser(ABC):
         if gaussians.means.dtype != torch.float32:
             raise InputError(
                 f"the kernels take float32 parameters, not {gaussians.means.dtype}",
-                hint="convert them, or call render(), which sends float64 to the reference",
+                hint="convert each of the five with .float()",
             )
         inputs = ForwardPass(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
         with self._launching():

@@ -36,9 +36,6 @@ from cleargs.splat.kernels.cpu.pixel import (
     load_pixel,
     offset_of,
     place_of,
-    plus_product,
-    plus_scaled,
-    scaled,
     shares,
     sum_of,
 )
@@ -74,8 +71,7 @@ def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> 
 @inlined
 def _seen_from(start: Any, along: Any, wide: Any, samples: Any, k: Any) -> Any:
     """The place that the ``k``-th sample of a pixel comes from."""
-    place = plus_scaled(start, along, samples[k, 0])
-    return plus_scaled(place, place_of(samples[k, 1], samples[k, 2]), wide)
+    return start + along * samples[k, 0] + place_of(samples[k, 1], samples[k, 2]) * wide
 
 
 @inlined
@@ -199,9 +195,8 @@ def expose(
                     a, b = fractions_of(place)
                     at = offset_of(place, columns)
                     above, under = load_pair(image, at), load_pair(image, at + below)
-                    mixed = plus_scaled(scaled(above, _ONE - b), under, b)
-                    sums = plus_product(sums, mixed, shares(a))
-                store(out, CHANNELS * (y * width + x), scaled(sum_of(sums), share))
+                    sums = sums + (above * (_ONE - b) + under * b) * shares(a)
+                store(out, CHANNELS * (y * width + x), sum_of(sums) * share)
                 continue
             total = black()
             for k in range(len(samples)):
@@ -213,14 +208,14 @@ def expose(
                     for m in range(4):
                         for n in range(4):
                             at = CHANNELS * (down[m] * columns + across[n])
-                            total = plus_scaled(total, load_pixel(image, at), parts[m] * weights[n])
+                            total = total + load_pixel(image, at) * (parts[m] * weights[n])
                     continue
                 at = CHANNELS * (np.int64(j) * columns + i)
-                total = plus_scaled(total, load_pixel(image, at), (_ONE - b) * (_ONE - a))
-                total = plus_scaled(total, load_pixel(image, at + beside), (_ONE - b) * a)
-                total = plus_scaled(total, load_pixel(image, at + below), b * (_ONE - a))
-                total = plus_scaled(total, load_pixel(image, at + below + beside), b * a)
-            store(out, CHANNELS * (y * width + x), scaled(total, share))
+                total = total + load_pixel(image, at) * ((_ONE - b) * (_ONE - a))
+                total = total + load_pixel(image, at + beside) * ((_ONE - b) * a)
+                total = total + load_pixel(image, at + below) * (b * (_ONE - a))
+                total = total + load_pixel(image, at + below + beside) * (b * a)
+            store(out, CHANNELS * (y * width + x), total * share)
 
 
 @kernel
@@ -251,7 +246,7 @@ def spread(
         first = band * BAND + margin - reach
         for y in range(band * BAND, min((band + 1) * BAND, height)):
             for x in range(width):
-                seen = scaled(load_pixel(light, CHANNELS * (y * width + x)), share)
+                seen = load_pixel(light, CHANNELS * (y * width + x)) * share
                 x0 = np.float32(x + margin) + offset[0, y, x]
                 y0 = np.float32(y + margin) + offset[1, y, x]
                 along_x, along_y, wide = sweep[0, y, x], sweep[1, y, x], radius[y, x]
@@ -263,8 +258,8 @@ def spread(
                         a, b = fractions_of(place)
                         at = offset_of(place, columns) - CHANNELS * first * columns
                         across = shares(a)
-                        _add_pair(part, at, twice, scaled(across, _ONE - b))
-                        _add_pair(part, at + below, twice, scaled(across, b))
+                        store(part, at, load_pair(part, at) + twice * (across * (_ONE - b)))
+                        store(part, at + below, load_pair(part, at + below) + twice * (across * b))
                     continue
                 for k in range(len(samples)):
                     i, a = _between(x0 + samples[k, 0] * along_x + samples[k, 1] * wide, right)
@@ -286,12 +281,7 @@ def spread(
 
 @inlined
 def _add(image: Any, offset: Any, light: Any, share: Any) -> None:
-    store(image, offset, plus_scaled(load_pixel(image, offset), light, share))
-
-
-@inlined
-def _add_pair(image: Any, offset: Any, light: Any, share: Any) -> None:
-    store(image, offset, plus_product(load_pair(image, offset), light, share))
+    store(image, offset, load_pixel(image, offset) + light * share)
 
 
 @kernel

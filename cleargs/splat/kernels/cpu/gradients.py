@@ -20,9 +20,12 @@ from cleargs.splat.kernels.cpu.projection import (
     ZERO,
     Parameters,
     ProjectionView,
+    Vector,
     camera_position,
     cross,
+    direction_to,
     dot,
+    mixed,
     projection_rows,
     residual,
     scaled_axes,
@@ -32,14 +35,14 @@ from cleargs.types import AnyArray, ArrayF32
 
 
 @device
+def plus(u: Vector, a: float, v: Vector) -> Vector:
+    """u + a v."""
+    return (u[0] + a * v[0], u[1] + a * v[1], u[2] + a * v[2])
+
+
+@device
 def quaternion_gradient(
-    w: float,
-    x: float,
-    y: float,
-    z: float,
-    c0: tuple[float, float, float],
-    c1: tuple[float, float, float],
-    c2: tuple[float, float, float],
+    w: float, x: float, y: float, z: float, c0: Vector, c1: Vector, c2: Vector
 ) -> tuple[float, float, float, float]:
     """dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
     return (
@@ -56,12 +59,12 @@ def colour_gradient(
     sh: ArrayF32,
     sh_count: int,
     splat: ArrayF32,
-    direction: tuple[float, float, float],
+    direction: Vector,
     sums: AnyArray,
     grad_sh: ArrayF32,
     basis: ArrayF32,
     weights: ArrayF32,
-) -> tuple[float, float, float]:
+) -> Vector:
     """Write dL/dSH of one Gaussian and return dL/d(direction). No gradient where the colour is clamped."""
     red = np.float32(sums[layout.SUM_RED]) if splat[layout.RED] > ZERO else ZERO
     green = np.float32(sums[layout.SUM_GREEN]) if splat[layout.GREEN] > ZERO else ZERO
@@ -130,45 +133,18 @@ def backpropagate_one(
         normal = cross(w, u1)
         by_area = sums[layout.SUM_V] / dot(normal, normal)
     side0, side1 = cross(u1, normal), cross(normal, u0)
-    v0 = (
-        by_w * w[0] + by_k * u1[0] + by_area * side0[0],
-        by_w * w[1] + by_k * u1[1] + by_area * side0[1],
-        by_w * w[2] + by_k * u1[2] + by_area * side0[2],
-    )
-    v1 = (
-        (by_k - k * by_w) * w[0] + (by_yy - k * by_k) * u1[0] + by_area * side1[0],
-        (by_k - k * by_w) * w[1] + (by_yy - k * by_k) * u1[1] + by_area * side1[1],
-        (by_k - k * by_w) * w[2] + (by_yy - k * by_k) * u1[2] + by_area * side1[2],
-    )
+    v0 = plus(mixed(by_w, w, by_k, u1), by_area, side0)
+    v1 = plus(mixed(by_k - k * by_w, w, by_yy - k * by_k, u1), by_area, side1)
     # u0[i] = row0 · axis_i, axis_i = s_i R[:, i]
-    m0 = (
-        v0[0] * row0[0] + v1[0] * row1[0],
-        v0[0] * row0[1] + v1[0] * row1[1],
-        v0[0] * row0[2] + v1[0] * row1[2],
-    )
-    m1 = (
-        v0[1] * row0[0] + v1[1] * row1[0],
-        v0[1] * row0[1] + v1[1] * row1[1],
-        v0[1] * row0[2] + v1[1] * row1[2],
-    )
-    m2 = (
-        v0[2] * row0[0] + v1[2] * row1[0],
-        v0[2] * row0[1] + v1[2] * row1[1],
-        v0[2] * row0[2] + v1[2] * row1[2],
-    )
+    m0, m1 = mixed(v0[0], row0, v1[0], row1), mixed(v0[1], row0, v1[1], row1)
+    m2 = mixed(v0[2], row0, v1[2], row1)
     grad_log_scales[g, 0] = dot(m0, axis0)
     grad_log_scales[g, 1] = dot(m1, axis1)
     grad_log_scales[g, 2] = dot(m2, axis2)
 
-    gw, gx, gy, gz = quaternion_gradient(
-        qw,
-        qx,
-        qy,
-        qz,
-        (sx * m0[0], sx * m0[1], sx * m0[2]),
-        (sy * m1[0], sy * m1[1], sy * m1[2]),
-        (sz * m2[0], sz * m2[1], sz * m2[2]),
-    )
+    c0, c1 = (sx * m0[0], sx * m0[1], sx * m0[2]), (sy * m1[0], sy * m1[1], sy * m1[2])
+    c2 = (sz * m2[0], sz * m2[1], sz * m2[2])
+    gw, gx, gy, gz = quaternion_gradient(qw, qx, qy, qz, c0, c1, c2)
     # Normalisation removes the component along the quaternion, unless the norm was bounded from below.
     along = gw * qw + gx * qx + gy * qy + gz * qz if norm > QUATERNION_EPSILON else 0.0
     grad_rotations[g, 0] = (gw - along * qw) / norm
@@ -177,16 +153,8 @@ def backpropagate_one(
     grad_rotations[g, 3] = (gz - along * qz) / norm
 
     # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 alike
-    r0 = (
-        v0[0] * axis0[0] + v0[1] * axis1[0] + v0[2] * axis2[0],
-        v0[0] * axis0[1] + v0[1] * axis1[1] + v0[2] * axis2[1],
-        v0[0] * axis0[2] + v0[1] * axis1[2] + v0[2] * axis2[2],
-    )
-    r1 = (
-        v1[0] * axis0[0] + v1[1] * axis1[0] + v1[2] * axis2[0],
-        v1[0] * axis0[1] + v1[1] * axis1[1] + v1[2] * axis2[1],
-        v1[0] * axis0[2] + v1[1] * axis1[2] + v1[2] * axis2[2],
-    )
+    r0 = plus(mixed(v0[0], axis0, v0[1], axis1), v0[2], axis2)
+    r1 = plus(mixed(v1[0], axis0, v1[1], axis1), v1[2], axis2)
     grad_jx = r0[0] * view.w00 + r0[1] * view.w01 + r0[2] * view.w02
     grad_jxz = r0[0] * view.w20 + r0[1] * view.w21 + r0[2] * view.w22
     grad_jy = r1[0] * view.w10 + r1[1] * view.w11 + r1[2] * view.w12
@@ -204,22 +172,13 @@ def backpropagate_one(
     )
     camera_gradient = (grad_tangent_x / z, grad_tangent_y / z, grad_z)
 
-    dx = np.float64(means[g, 0]) - view.centre_x
-    dy = np.float64(means[g, 1]) - view.centre_y
-    dz = np.float64(means[g, 2]) - view.centre_z
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-    direction = (dx / distance, dy / distance, dz / distance)
+    direction, distance = direction_to(means[g], view)
     towards = colour_gradient(g, sh, sh_count, splats[g], direction, sums, grad_sh, basis, weights)
     radial = dot(towards, direction)
-    grad_means[g, 0] = (
-        dot((view.w00, view.w10, view.w20), camera_gradient) + (towards[0] - radial * direction[0]) / distance
-    )
-    grad_means[g, 1] = (
-        dot((view.w01, view.w11, view.w21), camera_gradient) + (towards[1] - radial * direction[1]) / distance
-    )
-    grad_means[g, 2] = (
-        dot((view.w02, view.w12, view.w22), camera_gradient) + (towards[2] - radial * direction[2]) / distance
-    )
+    columns = (view.w00, view.w10, view.w20), (view.w01, view.w11, view.w21), (view.w02, view.w12, view.w22)
+    for axis in range(3):
+        turned = dot(columns[axis], camera_gradient)
+        grad_means[g, axis] = turned + (towards[axis] - radial * direction[axis]) / distance
 
 
 @device

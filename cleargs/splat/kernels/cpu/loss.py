@@ -155,15 +155,6 @@ def similarity_row(
         store(maps, (BY_PRODUCT * height + y) * length + i, TWO * a1 * scale)
 
 
-@device
-def differences_row(y: int, image: ArrayF32, target: ArrayF32, values: ArrayF32) -> None:
-    """|x - y| of each value of a row into ``values``."""
-    length = image.shape[1]
-    for i in range(PAD, length - PAD, LANES):
-        difference = load(image, y * length + i) - load(target, y * length + i)
-        store(values, i, magnitude(difference))
-
-
 @kernel
 def measure(
     image: ArrayF32,
@@ -181,7 +172,9 @@ def measure(
     for y in prange(height):
         rows = np.zeros((5, length), np.float32)
         values = np.empty(length, np.float32)
-        differences_row(y, image, target, values)
+        for i in range(PAD, length - PAD, LANES):
+            difference = load(image, y * length + i) - load(target, y * length + i)
+            store(values, i, magnitude(difference))
         row_sums[y, 0] = row_total(values, length)
         similarity_row(y, image, target, counted, window, rows, values, maps)
         row_sums[y, 1] = row_total(values, length)

@@ -1,8 +1,8 @@
 """A pixel's four float32 numbers (RGB and one of padding) as one SIMD value, and a pair of pixels.
 
 Where every pixel reads from another place, `simd`'s lanes would have to be gathered; the channels of a pixel
-lie side by side, and so do two pixels of a row, between which a place lies. Images are [H, W, 4]; offsets
-count elements of the whole array and are not checked.
+lie side by side, and so do two pixels of a row, between which a place lies. + - * / work as between lanes.
+Images are [H, W, 4]; offsets count elements of the whole array and are not checked.
 """
 
 from __future__ import annotations
@@ -12,7 +12,15 @@ from typing import Any
 from llvmlite import ir
 from numba.core import types
 
-from cleargs.splat.kernels.cpu.simd import _FLAGS, _broadcast_to, _intrinsic, _load, _register_type
+from cleargs.splat.kernels.cpu.simd import (
+    _FLAGS,
+    _broadcast_to,
+    _intrinsic,
+    _load,
+    _operation,
+    _register_arithmetic,
+    _register_type,
+)
 from cleargs.splat.kernels.warp_layout import CHANNELS
 
 _PIXEL = ir.VectorType(ir.FloatType(), CHANNELS)
@@ -33,30 +41,24 @@ pixel = _PixelType("pixel")
 pair = _PairType("pixel pair")
 _register_type(_PixelType, _PIXEL)
 _register_type(_PairType, _PAIR)
+_register_arithmetic(pixel)
+_register_arithmetic(pair)
 
 # Numba's constructor is not annotated.
 _new_tuple: Any = types.UniTuple
 _SHARES = _new_tuple(types.float32, 2)
 
 
-def _scaled(builder: Any, value: Any, factor: Any) -> Any:
-    return builder.fmul(value, _broadcast_to(builder, factor, value.type), flags=_FLAGS)
-
-
-def _plus(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fadd(x, y, flags=_FLAGS)
-
-
-@_intrinsic
-def black(typing_context: Any) -> Any:
+@_operation(pixel)
+def black(builder: Any) -> Any:
     """A pixel of zeros."""
-    return pixel(), lambda context, builder, sig, args: ir.Constant(_PIXEL, [0.0] * CHANNELS)
+    return ir.Constant(_PIXEL, [0.0] * CHANNELS)
 
 
-@_intrinsic
-def black_pair(typing_context: Any) -> Any:
+@_operation(pair)
+def black_pair(builder: Any) -> Any:
     """Two pixels of zeros."""
-    return pair(), lambda context, builder, sig, args: ir.Constant(_PAIR, [0.0] * 2 * CHANNELS)
+    return ir.Constant(_PAIR, [0.0] * 2 * CHANNELS)
 
 
 @_intrinsic
@@ -71,94 +73,53 @@ def load_pair(typing_context: Any, array: Any, offset: Any) -> Any:
     return pair(array, offset), _load(_PAIR)
 
 
-@_intrinsic
-def scaled(typing_context: Any, value: Any, factor: Any) -> Any:
-    """A pixel or a pair times a float32 ``factor``."""
-    return value(value, types.float32), lambda context, builder, sig, args: _scaled(builder, *args)
-
-
-@_intrinsic
-def plus_scaled(typing_context: Any, total: Any, value: Any, factor: Any) -> Any:
-    """``total + value * factor`` for pixels or pairs and a float32 ``factor``."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _plus(builder, args[0], _scaled(builder, *args[1:]))
-
-    return total(total, value, types.float32), generate
-
-
-@_intrinsic
-def plus_product(typing_context: Any, total: Any, x: Any, y: Any) -> Any:
-    """``total + x * y`` for pairs, number by number."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _plus(builder, args[0], builder.fmul(*args[1:], flags=_FLAGS))
-
-    return pair(pair, pair, pair), generate
-
-
-@_intrinsic
-def shares(typing_context: Any, second: Any) -> Any:
+@_operation(pair, types.float32)
+def shares(builder: Any, second: Any) -> Any:
     """How much each of a pair counts: 1 - ``second``, then ``second``, float32."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        base = ir.Constant(_PAIR, [1.0] * CHANNELS + [0.0] * CHANNELS)
-        rise = ir.Constant(_PAIR, [-1.0] * CHANNELS + [1.0] * CHANNELS)
-        return _plus(builder, base, _scaled(builder, rise, args[0]))
-
-    return pair(types.float32), generate
+    base = ir.Constant(_PAIR, [1.0] * CHANNELS + [0.0] * CHANNELS)
+    rise = ir.Constant(_PAIR, [-1.0] * CHANNELS + [1.0] * CHANNELS)
+    change = builder.fmul(rise, _broadcast_to(builder, second, _PAIR), flags=_FLAGS)
+    return builder.fadd(base, change, flags=_FLAGS)
 
 
-@_intrinsic
-def both(typing_context: Any, value: Any) -> Any:
+@_operation(pair, pixel)
+def both(builder: Any, value: Any) -> Any:
     """A pixel, twice."""
     places = ir.Constant(ir.VectorType(_I32, 2 * CHANNELS), [*range(CHANNELS)] * 2)
-    return pair(pixel), lambda context, builder, sig, args: builder.shuffle_vector(args[0], args[0], places)
+    return builder.shuffle_vector(value, value, places)
 
 
-@_intrinsic
-def sum_of(typing_context: Any, value: Any) -> Any:
+@_operation(pixel, pair)
+def sum_of(builder: Any, value: Any) -> Any:
     """The two pixels of a pair, added."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        left, right = (
-            builder.shuffle_vector(args[0], args[0], ir.Constant(_WHOLE, [*range(start, start + CHANNELS)]))
-            for start in (0, CHANNELS)
-        )
-        return _plus(builder, left, right)
-
-    return pixel(pair), generate
+    left, right = (
+        builder.shuffle_vector(value, value, ir.Constant(_WHOLE, [*range(start, start + CHANNELS)]))
+        for start in (0, CHANNELS)
+    )
+    return builder.fadd(left, right, flags=_FLAGS)
 
 
 # -- places in an image, x and y in the first two of a pixel's numbers ---------------------------------------
 
 
-@_intrinsic
-def place_of(typing_context: Any, x: Any, y: Any) -> Any:
+@_operation(pixel, types.float32, types.float32)
+def place_of(builder: Any, x: Any, y: Any) -> Any:
     """The place (x, y), float32, in pixels."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = ir.Constant(_PIXEL, [0.0] * CHANNELS)
-        for lane, number in enumerate(args):
-            value = builder.insert_element(value, number, ir.Constant(_I32, lane))
-        return value
-
-    return pixel(types.float32, types.float32), generate
+    place = ir.Constant(_PIXEL, [0.0] * CHANNELS)
+    for lane, number in enumerate((x, y)):
+        place = builder.insert_element(place, number, ir.Constant(_I32, lane))
+    return place
 
 
-@_intrinsic
-def offset_of(typing_context: Any, place: Any, columns: Any) -> Any:
+@_operation(types.int64, pixel, types.int64)
+def offset_of(builder: Any, place: Any, columns: Any) -> Any:
     """Where the pixel left of and above ``place`` begins in an image of so many ``columns``, int64.
 
     Places are not negative.
     """
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = builder.fptosi(args[0], _WHOLE)
-        x, y = (builder.sext(builder.extract_element(whole, ir.Constant(_I32, n)), _I64) for n in (0, 1))
-        return builder.mul(builder.add(builder.mul(y, args[1]), x), ir.Constant(_I64, CHANNELS))
-
-    return types.int64(pixel, types.int64), generate
+    whole = builder.fptosi(place, _WHOLE)
+    x, y = (builder.sext(builder.extract_element(whole, ir.Constant(_I32, n)), _I64) for n in (0, 1))
+    return builder.mul(builder.add(builder.mul(y, columns), x), ir.Constant(_I64, CHANNELS))
 
 
 @_intrinsic

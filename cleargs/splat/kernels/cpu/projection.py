@@ -52,6 +52,9 @@ Parameters = tuple[ArrayF32, ...]
 """Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
 
 
+Vector = tuple[float, float, float]
+
+
 class ProjectionView(NamedTuple):
     """A camera as the kernels read it: world-to-camera rotation rows, translation, intrinsics, bounds."""
 
@@ -81,19 +84,23 @@ class ProjectionView(NamedTuple):
 
 
 @device
-def dot(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @device
-def cross(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @device
-def residual(
-    u0: tuple[float, float, float], u1: tuple[float, float, float], skew: float
-) -> tuple[float, float, float]:
+def mixed(a: float, u: Vector, b: float, v: Vector) -> Vector:
+    """a u + b v."""
+    return (a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2])
+
+
+@device
+def residual(u0: Vector, u1: Vector, skew: float) -> Vector:
     """w = u0 - k u1: what is left of x's variation when y is known."""
     return (u0[0] - skew * u1[0], u0[1] - skew * u1[1], u0[2] - skew * u1[2])
 
@@ -106,7 +113,7 @@ def is_finite(x: Any) -> bool:
 
 
 @device
-def camera_position(mean: AnyArray, view: ProjectionView) -> tuple[float, float, float]:
+def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
     """The Gaussian's centre in camera coordinates."""
     x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -114,6 +121,15 @@ def camera_position(mean: AnyArray, view: ProjectionView) -> tuple[float, float,
         view.w10 * x + view.w11 * y + view.w12 * z + view.ty,
         view.w20 * x + view.w21 * y + view.w22 * z + view.tz,
     )
+
+
+@device
+def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
+    """The unit vector from the camera to the Gaussian's centre, in the world, and their distance."""
+    x, y = np.float64(mean[0]) - view.centre_x, np.float64(mean[1]) - view.centre_y
+    z = np.float64(mean[2]) - view.centre_z
+    distance = math.sqrt(x * x + y * y + z * z)
+    return (x / distance, y / distance, z / distance), distance
 
 
 @device
@@ -128,7 +144,7 @@ def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, flo
 @device
 def scaled_axes(
     w: float, x: float, y: float, z: float, sx: float, sy: float, sz: float
-) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
+) -> tuple[Vector, Vector, Vector]:
     """The columns of R diag(s): the Gaussian's axes in the world, one standard deviation long."""
     return (
         (sx * (1 - 2 * (y * y + z * z)), sx * 2 * (x * y + w * z), sx * 2 * (x * z - w * y)),
@@ -138,9 +154,7 @@ def scaled_axes(
 
 
 @device
-def projection_rows(
-    x: float, y: float, z: float, view: ProjectionView
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, Vector]:
     """The rows of J W. x/z and y/z are clamped, which keeps the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
     jxz = -jx * min(max(x / z, view.left), view.right)
@@ -187,11 +201,8 @@ def project_one(
     if not (is_finite(mean_x) and is_finite(mean_y)):
         return False
 
-    dx = np.float64(means[g, 0]) - view.centre_x
-    dy = np.float64(means[g, 1]) - view.centre_y
-    dz = np.float64(means[g, 2]) - view.centre_z
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-    sh_basis(sh_count, np.float32(dx / distance), np.float32(dy / distance), np.float32(dz / distance), basis)
+    direction, _ = direction_to(means[g], view)
+    sh_basis(sh_count, np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2]), basis)
     red = green = blue = ZERO
     for k in range(sh_count):
         red += basis[k] * sh[g, k, 0]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 from llvmlite import binding, ir
@@ -92,10 +93,6 @@ def _broadcast_to(builder: Any, scalar: Any, vector: Any) -> Any:
     return builder.shuffle_vector(first, undefined, zeros)
 
 
-def _broadcast(builder: Any, scalar: Any) -> Any:
-    return _broadcast_to(builder, scalar, _VECTOR)
-
-
 def _register_operator(
     function: Callable[..., Any], cases: list[Any], emit: Callable[[Any, Any, Any], Any]
 ) -> None:
@@ -103,30 +100,27 @@ def _register_operator(
     for case in cases:
 
         def lower(context: Any, builder: Any, case: Any, values: Any) -> Any:
-            wide = [
-                value if numba_type != types.float32 else _broadcast(builder, value)
-                for value, numba_type in zip(values, case.args, strict=True)
-            ]
+            vector = next(x.type for x in values if isinstance(x.type, ir.VectorType))
+            wide = (x if x.type == vector else _broadcast_to(builder, x, vector) for x in values)
             return emit(builder, *wide)
 
         _lower_builtin(function, *case.args)(lower)
 
 
-def _register_operators() -> None:
-    pairs = [(lanes, lanes), (lanes, types.float32), (types.float32, lanes)]
-    arithmetic = {
-        operator.add: "fadd",
-        operator.sub: "fsub",
-        operator.mul: "fmul",
-        operator.truediv: "fdiv",
-    }
-    for function, name in arithmetic.items():
+def _register_arithmetic(kind: Any) -> None:
+    """Let + - * / work between values of ``kind``, and with float32 scalars on either side."""
+    pairs = [(kind, kind), (kind, types.float32), (types.float32, kind)]
+    operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+    for function, name in operators.items():
 
         def calculate(builder: Any, x: Any, y: Any, name: str = name) -> Any:
             return getattr(builder, name)(x, y, flags=_FLAGS)
 
-        _register_operator(function, [_signature(lanes, *pair) for pair in pairs], calculate)
+        _register_operator(function, [_signature(kind, *pair) for pair in pairs], calculate)
 
+
+def _register_comparisons() -> None:
+    pairs = [(lanes, lanes), (lanes, types.float32), (types.float32, lanes)]
     comparisons = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}
     for function, symbol in comparisons.items():
 
@@ -136,12 +130,26 @@ def _register_operators() -> None:
         _register_operator(function, [_signature(mask, *pair) for pair in pairs], compare)
 
 
-_register_operators()
+_register_arithmetic(lanes)
+_register_comparisons()
 
 
 def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     compiled: Callable[..., Any] = numba_intrinsic(function)
     return compiled
+
+
+def _operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Make an intrinsic of a function that emits the code for values of these kinds."""
+
+    def decorate(emit: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(emit)  # with it, Numba sees the names of the arguments
+        def typed(typing_context: Any, *values: Any) -> Any:
+            return result(*kinds), lambda context, builder, sig, args: emit(builder, *args)
+
+        return _intrinsic(typed)
+
+    return decorate
 
 
 def _address(context: Any, builder: Any, sig: Any, args: Any, to: Any = _VECTOR) -> Any:
@@ -201,106 +209,82 @@ def prefetch_to_write(typing_context: Any, array: Any, offset: Any) -> Any:
     return types.void(array, offset), _prefetch(1)
 
 
-@_intrinsic
-def broadcast(typing_context: Any, scalar: Any) -> Any:
+@_operation(lanes, types.float32)
+def broadcast(builder: Any, scalar: Any) -> Any:
     """The same float32 in every lane."""
-    return lanes(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])
+    return _broadcast_to(builder, scalar, _VECTOR)
 
 
-@_intrinsic
-def lane_numbers(typing_context: Any) -> Any:
+@_operation(lanes)
+def lane_numbers(builder: Any) -> Any:
     """0.0, 1.0, ... LANES - 1."""
-    numbers = ir.Constant(_VECTOR, [float(lane) for lane in range(LANES)])
-    return lanes(), lambda context, builder, sig, args: numbers
+    return ir.Constant(_VECTOR, [float(lane) for lane in range(LANES)])
 
 
-@_intrinsic
-def select(typing_context: Any, where: Any, yes: Any, no: Any) -> Any:
+@_operation(lanes, mask, lanes, lanes)
+def select(builder: Any, where: Any, yes: Any, no: Any) -> Any:
     """Lane by lane ``yes`` where the mask is set, else ``no``."""
-    return lanes(mask, lanes, lanes), lambda context, builder, sig, args: builder.select(*args)
+    return builder.select(where, yes, no)
 
 
-def _call(name: str, n: int, flags: tuple[str, ...]) -> Callable[..., Any]:
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        function_type = ir.FunctionType(_VECTOR, [_VECTOR] * n)
-        function = _declare(builder.module, function_type, name)
-        return builder.call(function, args, fastmath=flags)
-
-    return generate
+def _call(builder: Any, name: str, *args: Any, flags: tuple[str, ...] = ()) -> Any:
+    function_type = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
+    function = _declare(builder.module, function_type, f"llvm.{name}.v{LANES}f32")
+    return builder.call(function, args, fastmath=flags)
 
 
 # min and max call LLVM's functions because select(x < y, load p, y) followed by a store to p turns into
 # a masked store (vmaskmov), which is microcoded on AMD: it nearly doubled the forward pass.
-@_intrinsic
-def minimum(typing_context: Any, x: Any, y: Any) -> Any:
+@_operation(lanes, lanes, lanes)
+def minimum(builder: Any, x: Any, y: Any) -> Any:
     """Lane-wise minimum; neither side may be NaN."""
-    return lanes(lanes, lanes), _call(f"llvm.minnum.v{LANES}f32", 2, _NO_NAN)
+    return _call(builder, "minnum", x, y, flags=_NO_NAN)
 
 
-@_intrinsic
-def maximum(typing_context: Any, x: Any, y: Any) -> Any:
+@_operation(lanes, lanes, lanes)
+def maximum(builder: Any, x: Any, y: Any) -> Any:
     """Lane-wise maximum; neither side may be NaN."""
-    return lanes(lanes, lanes), _call(f"llvm.maxnum.v{LANES}f32", 2, _NO_NAN)
+    return _call(builder, "maxnum", x, y, flags=_NO_NAN)
 
 
-@_intrinsic
-def magnitude(typing_context: Any, x: Any) -> Any:
+@_operation(lanes, lanes)
+def magnitude(builder: Any, x: Any) -> Any:
     """|x|."""
-    return lanes(lanes), _call(f"llvm.fabs.v{LANES}f32", 1, ())
+    return _call(builder, "fabs", x)
 
 
-@_intrinsic
-def negative_magnitude(typing_context: Any, x: Any) -> Any:
+@_operation(lanes, lanes)
+def negative_magnitude(builder: Any, x: Any) -> Any:
     """-|x| by setting the sign bit."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], _INT_VECTOR)
-        return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(2**31)] * LANES)), _VECTOR)
-
-    return lanes(lanes), generate
+    bits = builder.bitcast(x, _INT_VECTOR)
+    return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(2**31)] * LANES)), _VECTOR)
 
 
-@_intrinsic
-def any_lane(typing_context: Any, where: Any) -> Any:
+@_operation(types.boolean, mask)
+def any_lane(builder: Any, where: Any) -> Any:
     """True when a lane is set."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.icmp_unsigned("!=", builder.bitcast(args[0], _BITS), ir.Constant(_BITS, 0))
-
-    return types.boolean(mask), generate
+    return builder.icmp_unsigned("!=", builder.bitcast(where, _BITS), ir.Constant(_BITS, 0))
 
 
-@_intrinsic
-def mask_bits(typing_context: Any, where: Any) -> Any:
+@_operation(types.int64, mask)
+def mask_bits(builder: Any, where: Any) -> Any:
     """The mask as an int64, lane 0 in bit 0."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], _BITS), _I64)
-
-    return types.int64(mask), generate
+    return builder.zext(builder.bitcast(where, _BITS), _I64)
 
 
-@_intrinsic
-def lowest_bit(typing_context: Any, bits: Any) -> Any:
+@_operation(types.int64, types.int64)
+def lowest_bit(builder: Any, bits: Any) -> Any:
     """Position of the lowest set bit of a non-zero int64."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(_I1, 1))
-
-    return types.int64(types.int64), generate
+    return builder.cttz(bits, ir.Constant(_I1, 1))
 
 
-@_intrinsic
-def lane_sum(typing_context: Any, x: Any) -> Any:
+@_operation(types.float32, lanes)
+def lane_sum(builder: Any, x: Any) -> Any:
     """Sum of all lanes."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
-        function = _declare(builder.module, function_type, f"llvm.vector.reduce.fadd.v{LANES}f32")
-        # Without reassoc the lanes would be added one after the other; here no code around it can change it.
-        return builder.call(function, [ir.Constant(_F32, 0.0), args[0]], fastmath=(*_FLAGS, "reassoc"))
-
-    return types.float32(lanes), generate
+    function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
+    function = _declare(builder.module, function_type, f"llvm.vector.reduce.fadd.v{LANES}f32")
+    # Without reassoc the lanes would be added one after the other; here no code around it can change it.
+    return builder.call(function, [ir.Constant(_F32, 0.0), x], fastmath=(*_FLAGS, "reassoc"))
 
 
 def _add_picked(builder: Any, x: Any, y: Any, left: list[int], right: list[int]) -> Any:

@@ -18,7 +18,7 @@ from torch import Tensor
 from cleargs.splat import densification
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.kernels.cuda.projection import dot, rotation_columns
-from cleargs.splat.kernels.reference import rotation_matrices
+from cleargs.splat.transforms import rotation_matrices
 from cleargs.splat.types import Moments
 
 BLOCK = 256

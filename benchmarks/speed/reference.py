@@ -17,6 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
+from cleargs.splat.transforms import rotation_matrices, sh_basis
 
 CHUNK = 2_000_000
 """(pixel, Gaussian) products that are held at a time."""
@@ -39,44 +40,6 @@ class Splats(NamedTuple):
     colours: Tensor  # [M, 3]
     opacities: Tensor  # [M]
     depths: Tensor  # [M]
-
-
-def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] w x y z; normalises them, 0 is the identity."""
-    unit = torch.nn.functional.normalize(quaternions, dim=-1, eps=constants.QUATERNION_EPSILON)
-    w, x, y, z = unit.unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
-
-
-def sh_basis(directions: Tensor, count: int) -> Tensor:
-    """The first ``count`` real spherical harmonics [N, count] of unit directions [N, 3]."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    c1, c2, c3 = constants.SH_C1, constants.SH_C2, constants.SH_C3
-    basis = [
-        torch.full_like(x, constants.SH_C0),
-        -c1 * y,
-        c1 * z,
-        -c1 * x,
-        c2[0] * x * y,
-        c2[1] * y * z,
-        c2[2] * (2 * zz - xx - yy),
-        c2[3] * x * z,
-        c2[4] * (xx - yy),
-        c3[0] * y * (3 * xx - yy),
-        c3[1] * x * y * z,
-        c3[2] * y * (4 * zz - xx - yy),
-        c3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-        c3[4] * x * (4 * zz - xx - yy),
-        c3[5] * z * (xx - yy),
-        c3[6] * x * (xx - 3 * yy),
-    ]
-    return torch.stack(basis[:count], -1)
 
 
 def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool) -> Splats:
