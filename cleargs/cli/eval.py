@@ -31,6 +31,9 @@ _LABELS = {
     "musiq": "MUSIQ",
     "clip-iqa": "CLIP-\nIQA",
 }
+EXPOSURES_DIFFER = 0.5
+"""Gain of PSNR by aligned colours, dB, from which it is shown."""
+
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
@@ -181,12 +184,19 @@ def eval(
         if line := _seen_before(report):
             click.echo(line)
         _print(report, per_image, output)
-        g0 = None if run is None else linked_manifest(run, "g0")
-        if g0 is not None and g0.summary.get("exposure") and not align_colour:  # it was compensated
-            click.echo(
-                "the exposure of each reference counts in these figures: --align-colour leaves it out, as "
-                "the training did"
-            )
+        for line in filter(None, map(_with_colours_aligned, report.evaluations)):
+            click.echo(line)
+
+
+def _with_colours_aligned(evaluation: Evaluation) -> str:
+    """Return the line with the colour-aligned PSNR where exposures differ; "" where they do not."""
+    plain, aligned = evaluation.means.get("psnr"), evaluation.psnr_colour_aligned
+    if plain is None or aligned is None or aligned - plain < EXPOSURES_DIFFER:
+        return ""
+    return (
+        f"{evaluation.subject}: exposures differ: PSNR is {aligned:.2f} dB with the colours aligned to each "
+        f"reference (+{aligned - plain:.2f} dB); --align-colour gives all figures so"
+    )
 
 
 def _older(run: Path, path: Path) -> Report:

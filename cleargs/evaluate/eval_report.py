@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -75,8 +75,8 @@ class Refinement(Figures):
 
     rotation_deg: float = Field(ge=0, description="Angle turned, degrees.")
     shift: float = Field(ge=0, description="Distance that the camera centre moved, in the scene's units.")
-    loss_before: float = Field(ge=0, description="Mean squared difference at the reduced size, before.")
-    loss_after: float = Field(ge=0, description="The same after the last accepted step.")
+    loss_before: float = Field(ge=0, description="Mean squared difference at full size, before.")
+    loss_after: float = Field(ge=0, description="The same at the pose that was taken.")
 
 
 class ImageResult(Figures):
@@ -90,6 +90,9 @@ class ImageResult(Figures):
     reference: str = Field(description="SHA-256 of the reference's 8-bit pixels, and of its mask.")
     colour: tuple[tuple[float, ...], ...] | None = Field(
         None, description="The affine [3, 4] on sRGB that colour alignment applied."
+    )
+    psnr_colour_aligned: float | None = Field(
+        None, description="dB, after the colours were fitted to the reference by an affine on sRGB."
     )
     refinement: Refinement | None = Field(None, description="What pose refinement did.")
     far: Region | None = Field(
@@ -111,6 +114,9 @@ class Evaluation(Figures):
     alignment: Alignment
     options: EvalOptions
     means: dict[str, float | None] = Field(description="Metric -> mean over the images.")
+    psnr_colour_aligned: float | None = Field(
+        None, description="Mean of `psnr_colour_aligned` over the images; null where `align_colour` is set."
+    )
     far: Region | None = Field(None, description="`far` over all images; PSNR of its mean squared error.")
     clipped: Region | None = Field(None, description="`clipped` over all images, likewise.")
     unavailable: dict[str, str] = Field(description="Metric -> why it is null.")
@@ -148,12 +154,14 @@ class Report(Figures):
 
 
 def mean_values(images: Sequence[ImageResult], metrics: Sequence[str]) -> dict[str, float | None]:
-    """The mean of each metric over the images that have it; None where none has."""
-    means: dict[str, float | None] = {}
-    for metric in metrics:
-        values = [value for image in images if (value := image.values[metric]) is not None]
-        means[metric] = math.fsum(values) / len(values) if values else None
-    return means
+    """Return the mean of each metric over the images that have it; None where none has."""
+    return {metric: mean_of(image.values[metric] for image in images) for metric in metrics}
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are not None; None where all are."""
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None
 
 
 def split_hash(references: Mapping[str, str]) -> str:

@@ -17,7 +17,7 @@ from cleargs.capture.folders import image_files
 from cleargs.digest import file_digest
 from cleargs.errors import InputError, StoreError
 from cleargs.evaluate.config import EvalOptions
-from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_values, split_hash
+from cleargs.evaluate.eval_report import Evaluation, ImageResult, Refinement, mean_of, mean_values, split_hash
 from cleargs.evaluate.metrics import (
     apply_affine,
     clipped_pixels,
@@ -176,10 +176,14 @@ def _evaluate(
             save.mkdir(parents=True, exist_ok=True)
 
     def measured(name: str, prediction: _Prediction, target: ImageU8, mask: MaskBool | None) -> ImageResult:
-        image, affine = prediction.image, None
+        image, affine, aligned_psnr = prediction.image, None, None
+        fitted = fit_affine(image, target / 255.0, mask)
+        aligned = apply_affine(image, fitted)
         if options.align_colour:
-            affine = fit_affine(image, target / 255.0, mask)
-            image = apply_affine(image, affine)
+            image, affine = aligned, fitted
+        else:
+            everywhere = np.ones(target.shape[:2], bool)
+            aligned_psnr = region(to_uint8(aligned), target, everywhere, mask).psnr
         pixels = to_uint8(image)
         if save is not None:
             write_rgb(save / f"{name}.png", pixels)
@@ -191,6 +195,7 @@ def _evaluate(
             prediction=_digest(pixels),
             reference=_digest(target, mask),
             colour=None if affine is None else tuple(tuple(row) for row in affine.tolist()),
+            psnr_colour_aligned=aligned_psnr,
             refinement=prediction.refinement,
             far=None if prediction.far is None else region(pixels, target, prediction.far, mask),
             clipped=region(pixels, target, clipped_pixels(target), mask),
@@ -221,6 +226,7 @@ def _evaluate(
         alignment=reference.alignment,
         options=options,
         means=mean_values(images, options.metrics),
+        psnr_colour_aligned=mean_of(image.psnr_colour_aligned for image in images),
         far=pooled(image.far for image in images),
         clipped=pooled(image.clipped for image in images),
         unavailable=dict(metrics.unavailable),

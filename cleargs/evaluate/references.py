@@ -39,6 +39,9 @@ T = TypeVar("T")
 LARGE_RESIDUAL = 0.02
 """Above this share of the trajectory's extent the fit of two worlds deserves a warning."""
 
+MAX_RESIDUAL = 0.05
+"""Above this share each view would be rendered far beside its reference."""
+
 SAME_VIEW = 0.05
 """Two views are one when their centres are closer than this (the trajectory reaches 1 from its middle), and
 their axes than this in radians: pose noise is smaller, and the next view of a set mostly farther."""
@@ -170,11 +173,11 @@ def _report_fit(alignment: Alignment, folder: Path, reporter: Reporter) -> None:
         f"worlds aligned by {alignment.matched} cameras of {folder}: residual {alignment.residual:.2%} "
         f"of the trajectory's extent, orientations {alignment.rotation_deg:.2f} degrees apart"
     )
+    hint = "give --align DIR with the poses of the run's own frames: equal stems may be other frames here"
+    if alignment.residual > MAX_RESIDUAL:
+        raise InputError(f"{text}: too large for a comparison", hint=hint)
     if alignment.residual > LARGE_RESIDUAL:
-        reporter.warn(
-            f"{text}: large; if equal stems are not the same frames there, give --align DIR "
-            "with the poses of the run's own frames"
-        )
+        reporter.warn(f"{text}: large; {hint}")
     else:
         reporter.info(text)
 
