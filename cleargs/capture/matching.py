@@ -107,6 +107,8 @@ def match_pairs(
     seed: int,
     processes: int,
     done: Callable[[int], None],
+    *,
+    guided: bool = False,
 ) -> None:
     """Match and verify the pairs of frames (numbers in ``names``) that ``database`` has no matches of yet.
 
@@ -125,7 +127,7 @@ def match_pairs(
     lines = [f"{names[i]} {names[j]}\n" for i, j in todo]
     blocks = [lines[start : start + size] for start in range(0, len(lines), size)]
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        for count in pool.map(partial(_match_block, database, seed), blocks):
+        for count in pool.map(partial(_match_block, database, seed, guided), blocks):
             through += count
             done(through)
     for share in _shares(database):
@@ -133,14 +135,14 @@ def match_pairs(
         remove_database(share)
 
 
-def _match_block(database: Path, seed: int, block: Sequence[str]) -> int:
+def _match_block(database: Path, seed: int, guided: bool, block: Sequence[str]) -> int:
     """Match these pairs (lines of two names) in this process's copy of ``database``; their number."""
     share = database.with_name(f"{database.stem}-share{os.getpid()}.db")
     if not share.exists():
         with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(share)) as target:
             source.backup(target)
     pycolmap.set_random_seed(seed)
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False, guided_matching=guided)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     with NamedTemporaryFile("w", encoding="utf-8") as listed:

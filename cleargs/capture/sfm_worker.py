@@ -116,19 +116,32 @@ class SfmOutcome(FrozenModel):
 class _FeatureSettings:
     """How features are found and matched, and when a frame counts as placed by them."""
 
-    reduced: int
+    name: str
+    """How a frame was placed by them."""
+    reduced: int = 1
     """The images are reduced to one over this, if any is as large as the largest."""
-    contrast: float
-    inliers: int
+    contrast: float = 0.02 / 3
+    inliers: int = 30
     """Fewest points of the model that must fit the pose of a frame."""
-    again: str = ""
+    affine: bool = False
+    """True: features take the shape of their surroundings, which blur stretches."""
+    guided: bool = False
+    """True: features are matched again along the epipolar lines that a pair's first matches give."""
+
+    @property
+    def suffix(self) -> str:
+        """Return what follows the name of a step that is done again."""
+        return "" if self == _FIRST else " again"
 
 
-_FIRST = _FeatureSettings(reduced=1, contrast=0.02 / 3, inliers=30)
+_FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_SECOND = _FeatureSettings(reduced=2, contrast=0.002, inliers=15, again=" again")
-"""For frames with a blur of 24 px at 480: at half the size it is half as long, and what contrast it left is
-enough (docs/experiments/poses.md)."""
+_RETRIES = (
+    _FeatureSettings("sfm with affine features", affine=True, guided=True),
+    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
+)
+"""For frames that are left out, one after the other. Affine features find what blur stretches. A blur of 24 px
+at 480 is half as long at half the size, and what contrast it left is enough (docs/experiments/poses.md)."""
 
 
 def main() -> int:
@@ -312,10 +325,11 @@ class _Sfm:
         options.max_image_size = largest // settings.reduced
         options.sift.max_num_features = job.config.max_features
         options.sift.peak_threshold = settings.contrast
+        options.sift.estimate_affine_shape = settings.affine
         reader = pycolmap.ImageReaderOptions()
         if job.masks is not None:
             reader.mask_path = job.masks
-        self._report(phase=f"finding features{settings.again}", total=len(names))
+        self._report(phase=f"finding features{settings.suffix}", total=len(names))
         size = 4 * job.threads
         for start in range(0, len(names), size):
             block = list(names[start : start + size])
@@ -327,9 +341,15 @@ class _Sfm:
     def _match(self, database: Path, pairs: Sequence[tuple[int, int]], settings: _FeatureSettings) -> None:
         """Match and verify pairs of frames; pairs that were matched before are skipped."""
         job = self._job
-        self._report(phase=f"matching{settings.again}", total=len(pairs))
+        self._report(phase=f"matching{settings.suffix}", total=len(pairs))
         match_pairs(
-            database, job.names, pairs, job.seed, job.threads, lambda through: self._report(done=through)
+            database,
+            job.names,
+            pairs,
+            job.seed,
+            job.threads,
+            lambda through: self._report(done=through),
+            guided=settings.guided,
         )
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -375,38 +395,46 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Go on mapping with features by `_SECOND` of the frames without a pose.
+        """Go on mapping with features by `_RETRIES` of the frames without a pose.
 
-        Returns the model and how each frame was placed, or why it was not.
+        Works in copies of the database: a killed run finds the first as it was.
 
-        Works in a copy of the database: a killed run finds the first as it was.
+        Returns:
+            The model, and how each frame was placed, or why it was not.
         """
         names = self._job.names
-        self._matched = self._database
-        first = _names_in(model)
-        missing = [index for index, name in enumerate(names) if name not in first]
-        if not missing:
-            return model, dict.fromkeys(names, "sfm")
-        second = self._database.with_name("second.db")
-        copy_without_features(self._database, second, [index + 1 for index in missing])
-        self._extract(second, [names[index] for index in missing], _SECOND)
-        self._match(second, [pair for pair in pairs if not set(missing).isdisjoint(pair)], _SECOND)
+        self._matched = database = self._database
+        placed = dict.fromkeys(_names_in(model), _FIRST.name)
+        for number, settings in enumerate(_RETRIES):
+            missing = [index for index, name in enumerate(names) if name not in placed]
+            if not missing:
+                break
+            database = self._database.with_name(f"again{number}.db")
+            copy_without_features(self._matched, database, [index + 1 for index in missing])
+            self._extract(database, [names[index] for index in missing], settings)
+            self._match(database, [pair for pair in pairs if not set(missing).isdisjoint(pair)], settings)
+            further = self._continued(model, database, settings)
+            if further is not None and further.num_reg_images() > model.num_reg_images():
+                model, self._matched = further, database
+                placed = dict.fromkeys(_names_in(model), settings.name) | placed
+        reasons = why_missing(database, [index + 1 for index, name in enumerate(names) if name not in placed])
+        return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
+
+    def _continued(
+        self, model: pycolmap.Reconstruction, database: Path, settings: _FeatureSettings
+    ) -> pycolmap.Reconstruction | None:
+        """Return ``model`` with the frames that the matches in ``database`` place; None where that fails."""
         self._report(phase="placing frames again", total=None)
         options = copy.deepcopy(self._options)
         options.multiple_models = False
-        options.mapper.abs_pose_min_num_inliers = _SECOND.inliers
-        start = self._output / "first"
-        make_folder(start)
+        options.mapper.abs_pose_min_num_inliers = settings.inliers
+        start = self._output / "start"
+        make_folder(start, empty=True)
         model.write_binary(start)
         models = pycolmap.incremental_mapping(
-            second, self._job.images, self._output, options, input_path=start
+            database, self._job.images, self._output, options, input_path=start
         )
-        best = max([model, *models.values()], key=lambda model: model.num_reg_images())
-        if best is not model:
-            model, self._matched = best, second
-        placed = dict.fromkeys(_names_in(model), "sfm at half resolution") | dict.fromkeys(first, "sfm")
-        reasons = why_missing(second, [index + 1 for index, name in enumerate(names) if name not in placed])
-        return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
+        return max(models.values(), key=lambda found: found.num_reg_images(), default=None)
 
     def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
         """Return points at the given poses and cameras, which stay as they are here."""

@@ -42,6 +42,10 @@ class Protocol:
     """Deviation about each axis of the given poses' rotation error, degrees."""
     translation_noise: float = 0.0
     """Deviation along each axis of the given poses' centre error, as a share of the capture's mean depth."""
+    focal_error: float = 0.0
+    """Error of the given focal length, as a share of the true one."""
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1 and p2 of the lens (OpenCV's model), of which the input says nothing."""
     mixed: bool = False
     """Faults by frame instead: see `_mixed`."""
     jpeg: int | None = None
@@ -63,6 +67,13 @@ PROTOCOLS: dict[str, Protocol] = {
     "gsotm-rs": Protocol(skew=12),
     "gsotm-mb-rs": Protocol(blur=8, skew=12),
     "gsotm-pn": Protocol(rotation_noise=0.4, translation_noise=0.005),
+    # A depth sensor's camera and poses: 7-Scenes' focal length is 13 % off, its poses miss by 1.7 px.
+    "camera": Protocol(
+        rotation_noise=0.4,
+        translation_noise=0.005,
+        focal_error=0.06,
+        distortion=(0.08, -0.03, 0.001, -0.001),
+    ),
     # Every fifth frame of a video of 30 a second whose shutter is open for 5/6 of the time.
     "phone": Protocol(shutter=1 / 6, skew=4, stretched=True, phone=True),
 }

@@ -21,7 +21,7 @@ from cleargs.parquet import column, write_table
 from cleargs.progress import Reporter
 from cleargs.random_streams import Stream
 from cleargs.synth.image_motion import SimulatedMotion, follow
-from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, still
+from cleargs.synth.optics import PINHOLE, Aperture, Lens, disc, distorted, still
 from cleargs.synth.path import FPS, HandheldPath, SceneSetup, frame_times
 from cleargs.synth.phone import BITS_PER_PIXEL, PLAIN, Look, coded, metered, phone_look
 from cleargs.synth.protocols import REFERENCE_WIDTH, Fault, find_protocol, noisy_poses, plan
@@ -125,6 +125,8 @@ def make_capture(
         for number, (motion, fault, nearness) in enumerate(zip(motions, faults, nearnesses, strict=True)):
             rng = np.random.default_rng([seed, Stream.EXPOSURES, number])
             light, seen = _expose(setting, motion, fault, nearness, rng)
+            if any(rules.distortion):
+                light = distorted(light, setting.lens, rules.distortion)
             shots.append(develop(light, stops=fault.stops, noise=fault.noise, rng=rng, look=look))
             moving = {"moving_share": float((seen > 0).mean())}
             rows.append(_row(number, images[number], motion, fault) | formation | moving)
@@ -162,10 +164,14 @@ def make_capture(
         "rolling_shutter_px": _distribution([row["rolling_shutter_px"] for row in rows]),
         "px_at_640": REFERENCE_WIDTH / width,
         "mean_depth": mean_depth,
+        "focal_error": rules.focal_error,
+        "distortion": list(rules.distortion),
         "pose_noise": noise if any(noise.values()) else None,  # deviations about and along each axis
     }
     write_json(out / "truth" / "capture.json", summary)
-    _write_transforms(out, setting.lens, images, given)
+    wrong = 1 + rules.focal_error
+    lens = replace(setting.lens, fx=wrong * setting.lens.fx, fy=wrong * setting.lens.fy)
+    _write_transforms(out, lens, images, given)
     return summary
 
 
