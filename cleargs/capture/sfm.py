@@ -23,6 +23,7 @@ from cleargs.capture.prepare import WorkFrame
 from cleargs.capture.sfm_worker import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
+from cleargs.media.image import lens_name
 from cleargs.progress import Reporter
 from cleargs.safe_io import FAULTS, cause, read_json
 
@@ -171,16 +172,16 @@ def job_of(
     seed: int,
     threads: int,
 ) -> Job:
-    """What COLMAP is to do with the working images in ``folder``.
+    """Return what COLMAP is to do with the working images in ``folder``.
 
-    Without poses, frames of one size share a camera, or each frame has its own; an input image of each camera
-    may state its focal length.
+    Without poses, frames of one size and one lens share a camera, or each frame has its own. An input image of
+    each camera may state its focal length.
     """
     folder = folder.resolve()
     if poses is not None:
         owners: list[object] = [frame.camera for frame in frames]
     elif config.shared_camera:
-        owners = [(frame.width, frame.height) for frame in frames]
+        owners = [(frame.width, frame.height, _lens_of(frame)) for frame in frames]
     else:
         owners = [frame.image for frame in frames]
     numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
@@ -209,6 +210,11 @@ def job_of(
         seed=seed,
         threads=threads,
     )
+
+
+def _lens_of(frame: WorkFrame) -> object:
+    """Return what tells lenses apart: the video, or what EXIF says of camera and focal length."""
+    return frame.source.path if frame.source.pts is not None else lens_name(frame.source.path)
 
 
 def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:

@@ -136,12 +136,9 @@ class _FeatureSettings:
 
 _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_RETRIES = (
-    _FeatureSettings("sfm with affine features", affine=True, guided=True),
-    _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),
-)
-"""For frames that are left out, one after the other. Affine features find what blur stretches. A blur of 24 px
-at 480 is half as long at half the size, and what contrast it left is enough (docs/experiments/poses.md)."""
+_RETRIES = (_FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),)
+"""For frames that are left out, one after the other. A blur of 24 px at 480 is half as long at half the size,
+and what contrast it left is enough (docs/experiments/poses.md)."""
 
 
 def main() -> int:

@@ -85,6 +85,22 @@ def read_header(path: Path) -> Header:
     raise InputError(f"{path} {fault}", hint=_HINT)
 
 
+def lens_name(path: Path) -> tuple[str, ...]:
+    """Return what the EXIF of the image in ``path`` says of its lens: camera, lens, and focal lengths.
+
+    Phones have several lenses whose images are of one size.
+    """
+    from OpenImageIO import ImageInput, geterror
+
+    source = ImageInput.open(str(path))
+    if source is None:
+        geterror()
+        return ()
+    names = ("Model", "Exif:LensModel", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
+    values = (source.spec().getattribute(name) for name in names)
+    return tuple(f"{value:.1f}" if isinstance(value, float) else str(value) for value in values)
+
+
 def is_panorama(path: Path) -> bool:
     """Return True if the metadata of the image in ``path`` say that it is equirectangular (XMP's GPano)."""
     with open_regular(path) as file:
