@@ -141,14 +141,16 @@ def export(
         file = output.with_name(f"{stem}.offset.json")
         write_json(file, {"definition": "x_input = x_file + offset", "offset": offset})
         remarks.append(
-            f"single precision would round positions so far from the origin: the files are written without the "
-            f"offset {offset}, which is in {file}"
+            "single precision would round positions so far from the origin: the files are written without "
+            f"the offset {offset}, which is in {file}"
         )
     if similarity:
         scene = transform_scene(scene, **similarity)
     if region is not None:
         scene, remark = cropped(scene, region)
         remarks.append(remark)
+    if kind == "ply" and 0 < (degree := scene.gaussians.sh_degree) < 3:
+        remarks.append(f"spherical harmonics of degree {degree}: for viewers of degree 3 only, --sh-degree 3")
     if scene.gaussians.num == 0:
         raise InputError("no Gaussian is left", hint="prune or crop less")
     with disk_errors(output):
