@@ -48,7 +48,7 @@ class Adjuster:
             database: features and verified matches; it stays as it is.
             triangulate: gives a model new points, from the matches in a database.
 
-        ``floor`` is the `median_error` where each pair of frames may have a geometry of its own.
+        ``floor`` is the `median_error` if each pair of frames has a separate geometry.
         """
         self._cut = database.with_name(f"{database.stem}-cut.db")
         copy_without_features(database, self._cut, [])

@@ -85,7 +85,7 @@ def _sharpest_of(
 
 
 def _saved_choice(file: Path, nearest: NDArray[np.intp], count: int) -> list[int] | None:
-    """The choice of a killed run, or None where there is none that fits."""
+    """Return the choice of a killed run, or None if there is none that fits."""
     try:
         chosen = [int(number) for number in read_json(file)]
         return chosen if nearest[chosen].tolist() == list(range(count)) else None
@@ -111,13 +111,21 @@ def sharpness(image: ImageU8) -> float:  # [H, W, 3] RGB, or [H, W] grey
 def held_out(
     rule: str, names: Sequence[str], read: Callable[[int], ImageU8], registered: Sequence[bool]
 ) -> set[int]:
-    """Indices of the test frames by ``ingest.holdout``; ``read`` gives frame i as RGB (for sharpest:N only).
+    """Return the numbers of the test frames by ``ingest.holdout``.
 
-    every:N holds out frames 0, N, 2N, ... (as Mip-NeRF 360 and 3DGS do with N = 8); sharpest:N the sharpest
-    of every N registered frames in a row, also of the shorter rest (3dgs-deblur's
-    ``train_eval_split_by_blur_score.py`` with N = 8, which has its blur scores from the recording), so that
-    tests are both clean and spread over the capture; ties go to the earlier frame.
-    Raises InputError for unknown names, and when no registered frame is left for training.
+    every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
+    sharpest of every N registered frames in a row, also of the shorter rest, as 3dgs-deblur's
+    ``train_eval_split_by_blur_score.py`` does with N = 8 and blur scores of the recording. Tests are then sharp
+    and spread over the capture. Ties go to the earlier frame.
+
+    Args:
+        rule: the setting.
+        names: names of the frames.
+        read: returns frame i as RGB, for sharpest:N.
+        registered: true for each frame with a pose.
+
+    Raises:
+        InputError: unknown names, or no registered frame is left for training.
     """
     kind, _, number = rule.partition(":")
     if rule == "none":

@@ -17,8 +17,9 @@ T = TypeVar("T")
 
 
 def image_folders(root: Path) -> list[Path]:
-    """``images/`` and its reductions ``images_N/`` (N times smaller, as LLFF and nerfstudio name them),
-    largest images first; empty when ``root`` has none of them.
+    """Return ``images/`` and its reductions ``images_N/`` below ``root``, the largest images first.
+
+    LLFF and nerfstudio name images that are N times smaller so.
     """
     found = [(0, root / "images")] if (root / "images").is_dir() else []
     for folder in root.glob("images_*"):
@@ -29,8 +30,9 @@ def image_folders(root: Path) -> list[Path]:
 
 
 def image_files(folder: Path, *, below: bool = False) -> list[Path]:
-    """The images in ``folder``, with ``below`` also those in its folders, but none that is hidden; in any
-    order.
+    """Return the images in ``folder``, in any order, without hidden ones.
+
+    ``below`` includes those in its subfolders.
     """
     found = folder.rglob("*") if below else folder.iterdir()
     return [
@@ -45,7 +47,7 @@ def image_files(folder: Path, *, below: bool = False) -> list[Path]:
 def folder_of_images(root: Path) -> Path | None:
     """Return the first folder that holds any image of ``images/``, ``root`` itself, and the reductions.
 
-    The largest reduction comes first. None where no folder has images.
+    The largest reduction comes first. None if no folder has images.
     """
     folders = [root / "images", root, *image_folders(root)]
     return next((folder for folder in folders if folder.is_dir() and image_files(folder)), None)
@@ -66,8 +68,8 @@ def folders_to_search(root: Path) -> list[Path]:
 def find_images(root: Path, names: Sequence[str]) -> tuple[Path, dict[str, Path], bool]:
     """Return the folder of ``root`` with most images of these ``names``, the paths found, and how.
 
-    Images of the very names come first. Where no folder has any, those of the same stems are taken, whatever
-    their suffix and case; the last value is True then.
+    Images with exactly these names come first. If no folder has any, those with the same stems are taken,
+    with any suffix and case. The last value is True then.
     """
     best: tuple[Path, dict[str, Path], bool] = (root / "images", {}, False)
     for by_stem in (False, True):
@@ -88,10 +90,15 @@ def _spelling(name: str, by_stem: bool) -> str:
 
 
 def require_most(missing: Sequence[str], total: int, listing: str) -> tuple[str, ...]:
-    """Return the note that images are missing; none where all are there.
+    """Return a note on ``missing`` images, or nothing if all exist.
+
+    Args:
+        missing: names of the missing images.
+        total: number of images in the listing.
+        listing: name of the listing, for the note.
 
     Raises:
-        InputError: more than half of them are missing.
+        InputError: more than half of the images are missing.
     """
     if not missing:
         return ()
@@ -147,7 +154,7 @@ def is_inside(name: str) -> bool:
 
 
 def name_below_images(name: str) -> str:
-    """The name of a listed image by its place below ``images/``."""
+    """Return the name of a listed image relative to ``images/``."""
     return PurePosixPath(name).as_posix().removeprefix("images/")
 
 
@@ -160,14 +167,16 @@ def mask_folder(source: Path) -> Path | None:
 
 
 def mask_externals(source: Path) -> dict[str, External]:
-    """The folder of masks, where there is one, as part of a layout's ``externals``."""
+    """Return the folder of masks, if there is one, as part of a layout's ``externals``."""
     masks = mask_folder(source)
     return {} if masks is None else {"masks": masks}
 
 
 def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
-    """The masks in ``folder`` of the images of these ``names``: in the same place, by stem or full name (as
-    COLMAP has them); elsewhere where no other image has that stem.
+    """Return the masks in ``folder``, by the names of their images.
+
+    A mask has the same relative path as its image, with the stem or the full name (COLMAP's form). If only
+    one image has its stem, the mask may be in another subfolder.
     """
     if folder is None:
         return {}
@@ -189,8 +198,13 @@ def masks_of(folder: Path | None, names: Sequence[str]) -> dict[str, Path]:
 def chosen(
     frames: Sequence[SourceFrame], source: Path, at_most: int, names: Sequence[str] | None = None
 ) -> tuple[SourceFrame, ...]:
-    """At most so many of ``frames``, each with its mask in the input ``source``: the mask of its name, or of
-    the one in ``names``, where it brings none.
+    """Return at most ``at_most`` of ``frames``, evenly, with their masks.
+
+    Args:
+        frames: all frames. A mask that a frame has stays.
+        source: the input, which may contain a folder of masks.
+        at_most: largest number of frames.
+        names: names by which masks are found; None: those of the frames.
     """
     names = [frame.name for frame in frames] if names is None else names
     masks = masks_of(mask_folder(source), names)
@@ -201,7 +215,7 @@ def chosen(
 
 
 def spread(items: Sequence[T], at_most: int) -> list[T]:
-    """At most so many of ``items``, evenly by position, first and last included."""
+    """Return at most ``at_most`` of ``items``, evenly by position, with the first and the last."""
     if len(items) <= at_most:
         return list(items)
     step = (len(items) - 1) / max(1, at_most - 1)
@@ -209,15 +223,15 @@ def spread(items: Sequence[T], at_most: int) -> list[T]:
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:
-    """Sort key by which ``2.jpg`` comes before ``10.jpg``."""
+    """Return a sort key by which ``2.jpg`` comes before ``10.jpg``."""
     parts = re.split(r"(\d+)", text)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part.lower()) for part in parts]
 
 
 def frame_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key of frames: `natural_key`, but ``train_`` and ``eval_`` before the file's name do not count.
+    """Return `natural_key` without a prefix ``train_`` or ``eval_`` of the file name.
 
-    3dgs-deblur marks its split so (train_frame_00001.png, eval_frame_00002.png); sorted with these prefixes,
-    the test frames would all come before the others, out of the order in which they were taken.
+    3dgs-deblur marks its split by these prefixes (train_frame_00001.png, eval_frame_00002.png). Sorted with
+    them, all test frames would come first, out of the order in which they were taken.
     """
     return natural_key(re.sub(r"(?<![^/])(train|eval)_(?=[^/]*$)", "", name)), name

@@ -1,7 +1,7 @@
 """Matches that no adjustment sees, and how well poses and cameras explain them.
 
 Poses and lenses that were fitted to matches explain these matches better the more free numbers they have.
-Only matches that took no part tell which of two fits is nearer to the truth.
+Only matches that took no part show the better one of two fits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from cleargs.capture.colmap import pycolmap
 
 HELD_OUT = 10
-"""One track in so many is kept out."""
+"""Every tenth track is kept out."""
 
 CAPPED_PX = 4.0
 """Errors count up to this: COLMAP takes a match for right within 4 px of its epipolar line."""

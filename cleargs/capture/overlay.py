@@ -15,7 +15,7 @@ _SAMPLES = 32
 """Pictures that are compared, evenly over the capture."""
 
 _FEWEST = 6
-"""Of fewer pictures, a part that happens to be alike in all is not rare enough."""
+"""Fewest images. In fewer, equal pixels by chance are not rare enough."""
 
 _STILL = 4.0
 """Standard deviation over the pictures, levels, up to which a pixel is still. JPEG and H.264 leave 1 to 3."""

@@ -50,11 +50,19 @@ class WorkFrame:
 
 
 def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) -> list[WorkFrame]:
-    """Write ``folder/images/%06d.png`` and, where something is masked or transparent,
-    ``folder/masks/%06d.png.png`` (as COLMAP names them).
+    """Write the working images ``folder/images/%06d.png`` and their masks ``folder/masks/%06d.png.png``.
 
-    Reduced by area averaging in sRGB, never enlarged. Frames that a killed run left whole are not made again.
-    Raises InputError for unreadable images and for images that do not have their camera's proportions.
+    The names of masks are COLMAP's. Images are reduced by area averaging in sRGB, never enlarged. Intact
+    images of a killed run stay.
+
+    Args:
+        capture: the chosen frames.
+        folder: the folder of the working images.
+        long_side: largest long side, px.
+        reporter: shows progress and remarks.
+
+    Raises:
+        InputError: an unreadable image, an image without the proportions of its camera, or a panorama.
     """
     images, masks = folder / "images", folder / "masks"
     make_folder(images)
@@ -99,7 +107,7 @@ def prepare(capture: Capture, folder: Path, long_side: int, reporter: Reporter) 
 
 
 def _refuse_panoramas(capture: Capture, images: Sequence[Path]) -> None:
-    """Raise InputError where the first pictures are equirectangular, by their metadata or their edges."""
+    """Raise InputError if the first images are equirectangular by their metadata or their edges."""
     first = list(zip(capture.frames, images, strict=True))[:_PANORAMAS]
     if all(
         (frame.pts is None and is_panorama(frame.path)) or wraps_around(read_rgb(at)) for frame, at in first
@@ -111,20 +119,20 @@ def _refuse_panoramas(capture: Capture, images: Sequence[Path]) -> None:
 
 
 def resumable(image: Path, reporter: Reporter, read: Callable[[Path], object] = read_rgb) -> bool:
-    """Whether a killed run left ``image`` whole. What else lies there is thrown away, with a warning."""
+    """Return True if a killed run left ``image`` intact. A damaged file is removed with a warning."""
     if not image.is_symlink() and not image.exists():
         return False
     try:
         read(image)
         return True
     except InputError:
-        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is made again")
+        reporter.warn(f"the damaged working file {image.parent.name}/{image.name} is written again")
         remove(image)
         return False
 
 
 def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
-    """The image with a long side of at most ``long_side`` px, by area averaging."""
+    """Return the image with a long side of at most ``long_side`` px, by area averaging."""
     width, height = reduced_size(image.shape[1], image.shape[0], long_side)
     if (height, width) == image.shape[:2]:
         return image
@@ -133,13 +141,13 @@ def reduced(image: ImageU8, long_side: int) -> ImageU8:  # [H, W] or [H, W, 3]
 
 
 def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
-    """Width and height scaled alike to a long side of at most ``long_side`` px."""
+    """Return width and height, scaled to a long side of at most ``long_side`` px."""
     scale = min(1.0, long_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]:
-    """The names and pictures of these frames of videos, one video after the other."""
+    """Yield the names and images of these frames of videos, one video after the other."""
     for video in dict.fromkeys(frame.path for frame in frames.values()):
         names = {frame.pts: name for name, frame in frames.items() if frame.path == video}
         wanted = [pts for pts in names if pts is not None]
@@ -147,20 +155,21 @@ def _decoded(frames: Mapping[str, SourceFrame]) -> Iterator[tuple[str, ImageU8]]
 
 
 def read_image(frame: SourceFrame) -> ImageU8:  # [H, W, 3]
-    """The image turned as EXIF says, unless the frame's camera belongs to the image as it is stored."""
+    """Return the image, turned by its EXIF orientation unless the frame's camera fits the stored image."""
     return read_rgb(frame.path, upright=not _is_as_stored(frame))
 
 
 def _is_as_stored(frame: SourceFrame) -> bool:
-    """Whether the frame's camera fits the image as it is stored, which is what COLMAP works on. Half a turn
-    keeps the proportions: then it is taken to fit.
+    """Return True if the frame's camera fits the stored image, on which COLMAP works.
+
+    A half turn keeps the proportions. Then the camera counts as fitting.
     """
     camera = frame.camera
     return camera is not None and _alike(camera.width, camera.height, image_size(frame.path))
 
 
 def _alike(width: int, height: int, size: tuple[int, int]) -> bool:
-    """Whether an image of this width and height has these proportions, but for rounding to whole pixels."""
+    """Return True if width and height have the proportions of ``size``, up to rounding to whole pixels."""
     w, h = size
     return bool(abs(w * height - h * width) <= max(width, height) + max(w, h))
 
@@ -179,6 +188,7 @@ def _work_frame(
             )
         camera = camera.resized(width, height)
     stencil = read_stencil(frame)
+    still = still if still is not None and still.shape == (height, width) else None
     masked = stencil is not None or still is not None
     if masked and not resumable(mask, reporter, read_mask):
         write_mask(mask, _stencilled(frame, stencil, still, width, height))
@@ -193,7 +203,7 @@ def _stencilled(
     width: int,
     height: int,
 ) -> MaskU8:  # [height, width]
-    """The mask of a working image: 0 where its own one, or that of still parts, has 0."""
+    """Return the mask of a working image: 0 where its own mask or that of still parts is 0."""
     mask = np.full((height, width), 255, np.uint8) if still is None else still
     if stencil is None:
         return mask
@@ -210,7 +220,7 @@ def _stencilled(
 
 
 def read_stencil(frame: SourceFrame) -> MaskU8 | None:
-    """Where the frame counts: its mask, else the transparency of its image; None where all of it does."""
+    """Return the mask of the frame, else the transparency of its image; None if all of it counts."""
     if frame.mask is not None:
         return read_mask(frame.mask)
     return None if frame.pts is not None else read_alpha(frame.path, upright=not _is_as_stored(frame))

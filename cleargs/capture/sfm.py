@@ -1,7 +1,8 @@
-"""Poses and sparse points: SfM where the capture has no poses; where it has, triangulation, and adjustment of
-poses that the images contradict (those of depth cameras and headsets mostly; SfM's hardly ever).
+"""Poses, cameras and sparse points of a capture.
 
-COLMAP itself runs in `cleargs.capture.sfm_worker`, a child process.
+A capture without poses gets them by structure from motion. Given poses are triangulated. Poses and cameras
+that the images contradict are adjusted or found again: mostly those of depth cameras and headsets. COLMAP
+itself runs in `cleargs.capture.sfm_worker`, a child process.
 """
 
 from __future__ import annotations
@@ -57,11 +58,21 @@ def reconstruct(
     threads: int,
     reporter: Reporter,
 ) -> Reconstruction:
-    """Poses, cameras and points of the working images in ``folder``.
+    """Return poses, cameras and points of the working images in ``folder``.
 
-    Poses of the input are normalised in float64 before COLMAP sees them; ``given`` (the input's own sparse
-    model) saves the triangulation where its poses are good, and keeps its points unless they are adjusted.
-    Raises StageError when too few frames get a pose.
+    Poses of the input are normalised in float64 before COLMAP uses them.
+
+    Args:
+        frames: the working images.
+        given: the input's sparse model. If its poses fit the images, it replaces the triangulation.
+        folder: folder of the working images and of COLMAP's files.
+        config: settings.
+        seed: seed of all random choices.
+        threads: CPU threads; the result does not depend on it.
+        reporter: shows progress and remarks.
+
+    Raises:
+        StageError: too few frames get a pose.
     """
     posed = [frame for frame in frames if frame.source.pose is not None]
     if not posed:
@@ -137,8 +148,8 @@ def _report_outcome(outcome: SfmOutcome, found: float, config: SfmConfig, report
             what = "poses and cameras are found again and laid over the given ones"
         reporter.info(
             f"at the input's poses features missed their points by {missed:.1f} px (median): {what} "
-            f"({outcome.lens}), {found:.1f} px; matches that took no part are off by {after:.2f} px instead of "
-            f"{before:.2f}; ingest.refine_above keeps the input's"
+            f"({outcome.lens}), {found:.1f} px. Matches that took no part are off by {after:.2f} px, not "
+            f"{before:.2f}; a larger ingest.refine_above keeps the input's poses"
         )
     elif missed > config.refine_above:
         reporter.info(
@@ -172,10 +183,18 @@ def job_of(
     seed: int,
     threads: int,
 ) -> Job:
-    """Return what COLMAP is to do with the working images in ``folder``.
+    """Return the job of COLMAP's process for the working images in ``folder``.
 
-    Without poses, frames of one size and one lens share a camera, or each frame has its own. An input image of
-    each camera may state its focal length.
+    Without poses, frames of one size and one lens share a camera, or each frame has its own. An input image
+    of each camera may state its focal length.
+
+    Args:
+        frames: the working images.
+        poses: convention -> poses of all frames; None: they must be found.
+        folder: folder of the working images.
+        config: settings.
+        seed: seed of all random choices.
+        threads: CPU threads.
     """
     folder = folder.resolve()
     if poses is not None:
@@ -213,21 +232,21 @@ def job_of(
 
 
 def _lens_of(frame: WorkFrame) -> object:
-    """Return what tells lenses apart: the video, or what EXIF says of camera and focal length."""
+    """Return what frames of one lens share: the video, or camera and focal length by EXIF."""
     return frame.source.path if frame.source.pts is not None else lens_name(frame.source.path)
 
 
 def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome] | None:
-    """The model that a killed run left in ``folder``, or None.
+    """Return the model that a killed run left in ``folder``, or None.
 
-    What is damaged, COLMAP's database too, is thrown away with a warning.
+    A damaged model or database is removed with a warning.
     """
     model, database = folder / "model", folder / "database.db"
     if model.exists():
         try:
             return _read(model)
         except InputError as error:
-            reporter.warn(f"the damaged model of an interrupted run is made again: {error}")
+            reporter.warn(f"the damaged model of an interrupted run is computed again: {error}")
             remove(model)
     if database.exists() and not is_sound(database):
         reporter.warn("the damaged features of an interrupted run are found again")
@@ -236,7 +255,7 @@ def _resumed(folder: Path, reporter: Reporter) -> tuple[SparseModel, SfmOutcome]
 
 
 def _read(folder: Path) -> tuple[SparseModel, SfmOutcome]:
-    """The model and the outcome that COLMAP's process wrote. Raises InputError where one is damaged."""
+    """Return the model and the outcome of COLMAP's process. Raises InputError if one is damaged."""
     try:
         return read_model(folder), SfmOutcome.model_validate(read_json(folder / OUTCOME))
     except FAULTS as error:
@@ -254,13 +273,13 @@ def _transformed(model: SparseModel, similarity: Similarity) -> SparseModel:
 
 
 def _within_reach(model: SparseModel) -> SparseModel:
-    """The model without the points beyond `FARTHEST`, which single precision may not hold."""
+    """Return the model without the points beyond `FARTHEST`, which single precision may not hold."""
     near = np.asarray((np.abs(model.xyz) < FARTHEST).all(axis=1))  # infinite ones, and NaN, are not
     return replace(model.select(near), dropped=model.dropped + int((~near).sum()))
 
 
 def _adopted(given: SparseModel, frames: Sequence[WorkFrame]) -> SparseModel:
-    """The input's own model, restricted to ``frames``: working image names, cameras and pixels."""
+    """Return the input's model of ``frames``, with names, cameras and pixels of the working images."""
     by_name = {image.name: image for image in given.images.values()}
     cameras: dict[int, Intrinsics] = {}
     images: dict[int, ModelImage] = {}

@@ -1,12 +1,12 @@
 """The COLMAP side of ingest: ``python -m cleargs.capture.sfm_worker job.json``, run by `cleargs.capture.sfm`.
 
-Reads its job from JSON, works in ``job["folder"]`` and leaves a binary model in ``folder/model``. What a
-killed run left in the database (features, matches) is used again. Frames that mapping leaves out are tried a
-second time at half resolution.
+It reads its job from JSON, works in ``job["folder"]`` and writes a binary model to ``folder/model``. Features
+and matches of a killed run are used again. Frames that mapping leaves out are tried a second time at half
+resolution.
 
-Equal for any number of threads: ids are given in frame order before any thread starts, every random choice is
-seeded, frames are matched by processes, and mapping and triangulation (whose least squares sum in thread
-order) run on one thread.
+The result is the same for any number of threads: ids are given in frame order before any thread starts, every
+random choice is seeded, frames are matched by processes, and mapping and triangulation (whose least squares
+sum in thread order) run on one thread.
 """
 
 from __future__ import annotations
@@ -50,29 +50,30 @@ from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
 
 _MIN_MODEL = 10
-"""COLMAP's fewest frames of a model: a smaller one is thrown away and begun elsewhere. In a short capture, a
-third of its frames: eight of a dozen are a model."""
+"""COLMAP's fewest frames of a model: it discards a smaller one and starts elsewhere. In a
+short capture it is a third of the frames, because eight of twelve are a model."""
 _CONVINCING = 0.6
-"""Adjusted poses and cameras are taken where matches that were kept out are then off by at most this share of
-before (medians). What was left on measured captures: 0.16 with the poses of a depth camera and 0.45 with
-those of a headset, but 0.8 with a rolling shutter, which other poses do not explain."""
+"""Adjusted poses and cameras are taken if matches that were kept out are then off by at
+most this share of the error before (medians). Measured: 0.17 with the poses of a depth camera, 0.47 with
+those of a headset."""
 _EXPLAINED = 1.5
-"""Poses are found again where matches that were kept out are off by more than this, in units of what pairs of
-frames alone leave. It is 0.90 and 1.05 with the adjusted poses of a depth camera and of a headset, 3 where an
-adjustment from poses that were off by 4 degrees ended at wrong ones."""
+"""Poses are found again if matches that were kept out are off by more than this, in units of the error that
+separate geometries of the pairs leave. Measured: 0.94 and 1.06 with the adjusted poses of a depth camera and
+of a headset, 3 if an adjustment from poses that were off by 4 degrees ended at wrong ones."""
 _FITS_PX, _FITS = 2.0, 0.5
-"""Poses fit the images where at least this share of the matches is within so many px of its epipolar line. On
-a synthetic room it is 0.99 with true poses, 0.21 with the axes of another program, 0.13 inverted."""
+"""Poses fit the images where at least this share of the matches is within this
+many pixels of its epipolar line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes,
+0.13 with inverted matrices."""
 
 OWN = "own"
-"""Convention of an input's poses: as its layout has it."""
+"""Convention of an input's poses: the one of its layout."""
 
 OUTCOME = "outcome.json"
 """In the folder of the model: its `SfmOutcome`."""
 
 
 class Job(FrozenModel):
-    """What COLMAP gets: working images, their cameras, the poses if they are known, and settings."""
+    """Input of COLMAP: working images, their cameras, the poses if they are known, and settings."""
 
     folder: Path
     images: Path
@@ -80,11 +81,11 @@ class Job(FrozenModel):
     names: list[str]
     cameras: list[Intrinsics]
     camera_of: list[int]
-    """For each image the number of its camera."""
+    """Number of the camera of each image."""
     poses: dict[str, list[list[list[float]]]] | None
-    """World to camera, 3x4 for each image, by each of the conventions that the input may mean."""
+    """Convention that the input may mean -> matrices 3x4, world to camera, of all images."""
     exif_images: list[Path | None]
-    """For each camera an input image that may state its focal length."""
+    """Input image of each camera that may state its focal length."""
     config: SfmConfig
     seed: int
     threads: int
@@ -94,17 +95,17 @@ class SfmOutcome(FrozenModel):
     """Origin of a model."""
 
     placed: Mapping[str, str] = Field(default_factory=dict)
-    """Working image -> how its pose was found, or why there is none; COLMAP's process knows it of SfM."""
+    """Working image -> method by which its pose was found, or reason why there is none."""
     missed_px: float | None = None
-    """Median reprojection error at the input's poses, px of the working images; None: it brought no poses."""
+    """Median reprojection error at the input's poses, px of the working images; None: it has no poses."""
     convention: str = OWN
     """The convention by which the input's poses fit the images."""
     method: Literal["given", "adjusted", "sfm"] = "given"
     """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
     errors_px: Mapping[str, float] = Field(default_factory=dict)
-    """Method -> median distance of the matches that were kept out from their epipolar lines, px."""
+    """Method -> median distance from their epipolar lines of matches that were kept out, px."""
     lens: str = ""
-    """COLMAP model of the cameras that were adjusted; empty: none was."""
+    """COLMAP model of the cameras that were adjusted; empty: no camera was."""
 
     @property
     def refined(self) -> bool:
@@ -114,35 +115,29 @@ class SfmOutcome(FrozenModel):
 
 @dataclass(frozen=True)
 class _FeatureSettings:
-    """How features are found and matched, and when a frame counts as placed by them."""
+    """Settings of features, and of the frames that they place."""
 
     name: str
-    """How a frame was placed by them."""
+    """Value of ``placed`` of these frames."""
     reduced: int = 1
     """The images are reduced to one over this, if any is as large as the largest."""
     contrast: float = 0.02 / 3
     inliers: int = 30
     """Fewest points of the model that must fit the pose of a frame."""
-    affine: bool = False
-    """True: features take the shape of their surroundings, which blur stretches."""
-    guided: bool = False
-    """True: features are matched again along the epipolar lines that a pair's first matches give."""
-
-    @property
-    def suffix(self) -> str:
-        """Return what follows the name of a step that is done again."""
-        return "" if self == _FIRST else " again"
+    suffix: str = ""
+    """Added to the name of a step that is repeated."""
 
 
 _FIRST = _FeatureSettings("sfm")
 """COLMAP's defaults."""
-_RETRIES = (_FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15),)
-"""For frames that are left out, one after the other. A blur of 24 px at 480 is half as long at half the size,
-and what contrast it left is enough (docs/experiments/poses.md)."""
+_SECOND = _FeatureSettings("sfm at half resolution", reduced=2, contrast=0.002, inliers=15, suffix=" again")
+"""For frames that are left out. A blur of 24 px at 480 is half as long at half the size, and the contrast
+that it leaves is enough (docs/experiments/poses.md). Affine-shape features and guided matching of these
+frames place no more of them (blurball, office)."""
 
 
 def main() -> int:
-    """Do the job; the exit code is 3 when it failed with a reason that was reported."""
+    """Do the job; the exit code is 3 if it failed for a reason that was reported."""
     report = reports_to_parent()
     job = Job.model_validate(read_json(Path(sys.argv[1])))
     try:
@@ -322,7 +317,6 @@ class _Sfm:
         options.max_image_size = largest // settings.reduced
         options.sift.max_num_features = job.config.max_features
         options.sift.peak_threshold = settings.contrast
-        options.sift.estimate_affine_shape = settings.affine
         reader = pycolmap.ImageReaderOptions()
         if job.masks is not None:
             reader.mask_path = job.masks
@@ -346,7 +340,6 @@ class _Sfm:
             job.seed,
             job.threads,
             lambda through: self._report(done=through),
-            guided=settings.guided,
         )
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -392,46 +385,39 @@ class _Sfm:
     def _place_the_rest(
         self, model: pycolmap.Reconstruction, pairs: Sequence[tuple[int, int]]
     ) -> tuple[pycolmap.Reconstruction, dict[str, str]]:
-        """Go on mapping with features by `_RETRIES` of the frames without a pose.
+        """Continue mapping with features by `_SECOND` of the frames without a pose.
 
-        Works in copies of the database: a killed run finds the first as it was.
+        It works in a copy of the database, so that a killed run finds the first one unchanged.
 
         Returns:
-            The model, and how each frame was placed, or why it was not.
+            The model, and for each image how it was placed or why it was not.
         """
         names = self._job.names
-        self._matched = database = self._database
-        placed = dict.fromkeys(_names_in(model), _FIRST.name)
-        for number, settings in enumerate(_RETRIES):
-            missing = [index for index, name in enumerate(names) if name not in placed]
-            if not missing:
-                break
-            database = self._database.with_name(f"again{number}.db")
-            copy_without_features(self._matched, database, [index + 1 for index in missing])
-            self._extract(database, [names[index] for index in missing], settings)
-            self._match(database, [pair for pair in pairs if not set(missing).isdisjoint(pair)], settings)
-            further = self._continued(model, database, settings)
-            if further is not None and further.num_reg_images() > model.num_reg_images():
-                model, self._matched = further, database
-                placed = dict.fromkeys(_names_in(model), settings.name) | placed
-        reasons = why_missing(database, [index + 1 for index, name in enumerate(names) if name not in placed])
-        return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
-
-    def _continued(
-        self, model: pycolmap.Reconstruction, database: Path, settings: _FeatureSettings
-    ) -> pycolmap.Reconstruction | None:
-        """Return ``model`` with the frames that the matches in ``database`` place; None where that fails."""
+        self._matched = self._database
+        first = _names_in(model)
+        missing = [index for index, name in enumerate(names) if name not in first]
+        if not missing:
+            return model, dict.fromkeys(names, _FIRST.name)
+        second = self._database.with_name("second.db")
+        copy_without_features(self._database, second, [index + 1 for index in missing])
+        self._extract(second, [names[index] for index in missing], _SECOND)
+        self._match(second, [pair for pair in pairs if not set(missing).isdisjoint(pair)], _SECOND)
         self._report(phase="placing frames again", total=None)
         options = copy.deepcopy(self._options)
         options.multiple_models = False
-        options.mapper.abs_pose_min_num_inliers = settings.inliers
-        start = self._output / "start"
+        options.mapper.abs_pose_min_num_inliers = _SECOND.inliers
+        start = self._output / "first"
         make_folder(start, empty=True)
         model.write_binary(start)
         models = pycolmap.incremental_mapping(
-            database, self._job.images, self._output, options, input_path=start
+            second, self._job.images, self._output, options, input_path=start
         )
-        return max(models.values(), key=lambda found: found.num_reg_images(), default=None)
+        best = max([model, *models.values()], key=lambda model: model.num_reg_images())
+        if best is not model:
+            model, self._matched = best, second
+        placed = dict.fromkeys(_names_in(model), _SECOND.name) | dict.fromkeys(first, _FIRST.name)
+        reasons = why_missing(second, [index + 1 for index, name in enumerate(names) if name not in placed])
+        return model, placed | {names[image_id - 1]: reason for image_id, reason in reasons.items()}
 
     def _triangulate(self, poses: Sequence[list[list[float]]]) -> pycolmap.Reconstruction:
         """Return points at the given poses and cameras, which stay as they are here."""

@@ -34,14 +34,14 @@ class _Entry(NamedTuple):
 
     values: Mapping[str, Any]
     image: Path | None
-    """None where there is none."""
+    """None if the file does not exist."""
     mask: Path | None
-    """None where it names none, or there is none."""
+    """None if the entry names no mask, or the file does not exist."""
 
 
 _LISTING = "transforms.json"
 _SPLIT = tuple(f"transforms_{part}.json" for part in ("train", "test", "val"))
-"""Blender's form: a file for each part. Those of test, or without them those of val, are held out."""
+"""Blender's form: a file per part. The frames of test, or without that file those of val, are held out."""
 
 
 def detect(source: Path, *, poses: bool) -> bool:
@@ -50,7 +50,11 @@ def detect(source: Path, *, poses: bool) -> bool:
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """See `Layout.externals`. Raises InputError where the file cannot be read."""
+    """See `Layout.externals`.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     files = _listings(source)
     found: dict[str, Path] = {}
     for file in files:
@@ -96,7 +100,9 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
     as 3dgs-deblur's velocities and exposure times or nerfstudio's ``ply_file_path``, are passed over.
 
     Args:
-        notes: takes a note on images that do not exist, and these are left out. None: they are an error.
+        path: transforms.json, or a file of the same form.
+        poses: also read cameras and poses.
+        notes: list that receives a note on missing images, which are left out. None: they are an error.
 
     Raises:
         InputError: damaged JSON, most images missing, missing or NaN poses, unknown cameras.
@@ -128,7 +134,7 @@ def read_transforms(path: Path, *, poses: bool, notes: list[str] | None = None) 
 
 
 def _camera(values: Mapping[str, Any], image: Path) -> Intrinsics:
-    """The camera of a frame: its own entries over those of the whole file."""
+    """Return the camera of a frame from its own values, else from those of the whole file."""
     from cleargs.capture.cameras import Intrinsics
 
     try:
@@ -178,7 +184,7 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
 
     from cleargs.capture.cameras import rigid_pose
 
-    hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find the poses anew"
+    hint = "remove the frame or correct its transform_matrix, or set ingest.poses=sfm to find other poses"
     if "transform_matrix" not in entry:
         raise InputError(f"{name} has no pose (transform_matrix)", hint=hint)
     try:
@@ -191,9 +197,10 @@ def _pose(entry: Mapping[str, Any], name: str) -> Pose:
 
 
 def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
-    """All that stands next to ``frames`` in transforms.json, and the entries of ``frames``.
+    """Return the values next to ``frames`` in transforms.json, and the entries of ``frames``.
 
-    Raises InputError where it is damaged or an entry names no image.
+    Raises:
+        InputError: the file is damaged, or an entry names no image.
     """
     try:
         data = read_json(path)
@@ -208,7 +215,7 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
             if not isinstance(values.get("file_path"), str):
                 raise ValueError(f"frames[{number}] has no file_path")
             if not isinstance(values.get("mask_path", ""), str):
-                raise ValueError(f"frames[{number}] has a mask_path that is no text")
+                raise ValueError(f"frames[{number}] has a mask_path that is not text")
             mask = files.find(values["mask_path"]) if "mask_path" in values else None
             entries.append(_Entry(values, files.find(values["file_path"]), mask))
         return data, entries
@@ -220,7 +227,7 @@ def _read_listing(path: Path) -> tuple[Mapping[str, Any], list[_Entry]]:
 
 
 class _Files:
-    """Finds the files that a listing names, whatever their endings, their case and their folder are."""
+    """Finds the files that a listing names, also with another ending, case or folder."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -244,5 +251,5 @@ class _Files:
             files = sorted(image_files(folder)) if folder.is_dir() else []
             self._by_stem[folder] = {file.stem.lower(): file for file in reversed(files)}
         stems = self._by_stem[folder]
-        # Without an ending, as many write it; with another one; with a second one behind its own.
+        # A listed name may have no ending, another ending, or lack a second one.
         return stems.get(name.lower()) or stems.get(Path(name).stem.lower())
