@@ -115,8 +115,8 @@ def held_out(
 
     every:N holds out frames 0, N, 2N, ..., as Mip-NeRF 360 and 3DGS do with N = 8. sharpest:N holds out the
     sharpest of every N registered frames in a row, also of the shorter rest, as 3dgs-deblur's
-    ``train_eval_split_by_blur_score.py`` does with N = 8 and blur scores of the recording. Tests are then sharp
-    and spread over the capture. Ties go to the earlier frame.
+    ``train_eval_split_by_blur_score.py`` does with N = 8 and blur scores of the recording. Tests are then
+    sharp and spread over the capture. Ties go to the earlier frame.
 
     Args:
         rule: the setting.

@@ -43,19 +43,19 @@ _MIRRORED = {
 
 
 class Header(NamedTuple):
-    """What the first bytes of an image file state: what decoding takes is known before."""
+    """Values in the header of an image file, from which the cost of decoding is known before."""
 
     width: int
     height: int
     orientation: int
-    """EXIF's, 1 to 8, and 1 where there is none."""
+    """EXIF's orientation, 1 to 8; 1 if there is none."""
     format: str
     profile: bytes = b""
-    """The embedded ICC profile; empty where there is none."""
+    """The embedded ICC profile; empty if there is none."""
 
 
 def read_header(path: Path) -> Header:
-    """The header of the image in ``path``. Raises InputError when there is no image."""
+    """Return the header of the image in ``path``. Raises InputError if there is no image."""
     from OpenImageIO import ImageInput, geterror
 
     try:
@@ -86,7 +86,7 @@ def read_header(path: Path) -> Header:
 
 
 def lens_name(path: Path) -> tuple[str, ...]:
-    """Return what the EXIF of the image in ``path`` says of its lens: camera, lens, and focal lengths.
+    """Return camera, lens and focal lengths by the EXIF of the image in ``path``.
 
     Phones have several lenses whose images are of one size.
     """
@@ -108,24 +108,31 @@ def is_panorama(path: Path) -> bool:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the image in ``path``, as it is stored. Raises InputError like `read_header`."""
+    """Return width and height of the stored image in ``path``. Raises InputError like `read_header`."""
     header = read_header(path)
     return header.width, header.height
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> ImageU8:  # [H, W, 3]
-    """The image in ``path`` as 8-bit sRGB; alpha is dropped, 16 bits are reduced to 8.
+    """Return the image in ``path`` as 8-bit sRGB [H, W, 3].
 
-    ``upright`` turns it as its EXIF orientation says. Raises InputError when there is no readable image.
+    Alpha is dropped, 16 bits are reduced to 8, and an ICC profile is converted to sRGB.
+
+    Args:
+        path: the image file.
+        upright: turn it by its EXIF orientation.
+
+    Raises:
+        InputError: there is no readable image.
     """
     bgr = _decode(path, cv2.IMREAD_COLOR, upright=upright)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_mask(path: Path) -> MaskU8:  # [H, W]
-    """A mask: 0 where the pixel is to be ignored, else 255. Raises InputError like `read_rgb`.
+    """Return a mask [H, W]: 0 if the pixel is ignored, else 255. Raises InputError like `read_rgb`.
 
-    The border lies in the middle, of masks of 0 and 1 alone, as some programs write them, above 0.
+    The threshold is 127, or 0 for masks of 0 and 1, which some programs write.
     """
     grey = _decode(path, cv2.IMREAD_GRAYSCALE)
     border = 127 if grey.max() > 1 else 0
@@ -133,9 +140,9 @@ def read_mask(path: Path) -> MaskU8:  # [H, W]
 
 
 def read_alpha(path: Path, *, upright: bool = True) -> MaskU8 | None:  # [H, W]
-    """The transparency of an image as a mask: 0 where it is more transparent than not, else 255.
+    """Return the transparency of an image as a mask: 0 if it is more than half transparent, else 255.
 
-    None where it is opaque all over. ``upright`` turns it as `read_rgb` does. Raises InputError like it.
+    None if it is opaque everywhere. ``upright`` turns it, and errors are raised, as `read_rgb` does.
     """
     if path.suffix.lower() in _OPAQUE:
         return None
@@ -168,16 +175,16 @@ def write_mask(path: Path, mask: MaskU8) -> None:  # [H, W]
 
 
 def to_uint8(image: AnyImage) -> ImageU8:
-    """Floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays as it is."""
+    """Return floats in [0, 1] (clipped) rounded to 0..255; an image of bytes stays unchanged."""
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
 def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
-    """The image [H, W, ...] as it is to be seen (``upright``) or as it is stored.
+    """Return the image [H, W, ...], turned by its EXIF orientation (``upright``) or as it is stored.
 
-    It is decoded from memory: OpenCV's own file reader tells a missing file from a broken one only on stderr.
+    It is decoded from memory, because OpenCV's file reader explains a failure only on stderr.
     """
     header = read_header(path)
     if header.width * header.height > MAX_PIXELS:
@@ -189,7 +196,7 @@ def _decode(path: Path, flags: int, *, upright: bool = True) -> AnyImage:
     if header.profile and flags == cv2.IMREAD_COLOR:
         rgb = np.ascontiguousarray(image[..., ::-1])
         image = srgb_from_profile(rgb, header.profile)[..., ::-1]
-    # It is as stored, unless it is a TIFF: OpenCV turns these whatever the flags are.
+    # The image is as it is stored, except a TIFF, which OpenCV always turns.
     turn = header.orientation
     if header.format == "tiff":
         turn = 1 if upright else {6: 8, 8: 6}.get(turn, turn)  # the others undo themselves
@@ -219,7 +226,7 @@ def _stored(path: Path, header: Header, flags: int) -> AnyImage:
         if pixels is not None and pixels.ndim == 3:
             image = _as_flags_ask(pixels if pixels.shape[2] > 2 else pixels[..., [0, 0, 0]], flags)
         geterror()  # else OpenImageIO prints it on stderr at the end
-    # libpng would tell of a file that breaks off on stderr.
+    # libpng would report a truncated file on stderr.
     elif header.format != "png" or b"IEND" in content:
         with suppress(cv2.error):
             image = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

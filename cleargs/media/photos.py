@@ -19,7 +19,7 @@ from cleargs.errors import InputError
 from cleargs.safe_io import FAULTS, cause
 
 _FAULTS: tuple[type[Exception], ...] = (*FAULTS, SyntaxError, Image.DecompressionBombError)
-"""What Pillow raises for a file of the wrong form."""
+"""Errors that Pillow raises for a file of the wrong form."""
 
 _HEIC = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 _AVIF = frozenset({b"avif", b"avis"})
@@ -49,7 +49,7 @@ def open_photo(path: Path, kind: str) -> Image.Image:
             ) from error
         pillow_heif.register_heif_opener()
     try:
-        with warnings.catch_warnings(action="ignore"):  # of its size, which is checked against ours
+        with warnings.catch_warnings(action="ignore"):  # about its size, which is checked elsewhere
             return Image.open(path)
     except _FAULTS as error:
         raise InputError(
