@@ -60,13 +60,13 @@ OUTPUTS = ("frames.parquet", "points.parquet", "observations.parquet", "images",
 LEFTOVERS = ("images/*.png",)
 LIBRARIES = ("pycolmap", "opencv-contrib-python-headless", "av", "pillow", "numpy", "scipy")
 
-# Wall seconds on two cores: features per frame, fixed and per megapixel; matches per pair, fixed and per square
-# megapixel, because each feature is compared with each other; most features per megapixel.
+# Wall seconds on two cores: features per frame, fixed and per megapixel; matches per pair, fixed and per
+# square megapixel, because each feature is compared with each other; most features per megapixel.
 _FEATURES_S, _FEATURES_S_PER_MEGAPIXEL = 0.015, 0.7
 _PAIR_S, _PAIR_S_PER_SQUARE_MEGAPIXEL = 0.0025, 0.15
 _FEATURES_PER_MEGAPIXEL = 7000
-# Seconds of one core: start of COLMAP's process; per megapixel of a frame, to read and undistort it, and to map it
-# without and with a pose.
+# Seconds of one core: start of COLMAP's process; per megapixel of a frame, to read and undistort it, and to
+# map it without and with a pose.
 _START_S = 1.0
 _FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 0.85, 0.2
 

@@ -1,7 +1,7 @@
 """Refinement of the pose at which a scene is rendered: the one that explains a reference image best.
 
-Levenberg-Marquardt on the photometric difference, first at a reduced size, then at full size. The kernels give
-no gradient of the camera, so the six columns of the Jacobian are central differences.
+Levenberg-Marquardt on the photometric difference, first at a reduced size, then at full size. The kernels
+give no gradient of the camera, so the six columns of the Jacobian are central differences.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class _Comparison:
         self._blur = blur
         self._target = np.asarray(cv2.resize(reference / 255.0, size, interpolation=cv2.INTER_AREA))
         self._counts = np.ones(self._target.shape[:2])
-        if mask is not None:  # where every pixel under a reduced one counts
+        if mask is not None:  # a reduced pixel counts if every pixel under it does
             covered = cv2.resize(mask.astype(np.float64), size, interpolation=cv2.INTER_AREA)
             self._counts = (np.asarray(covered) > 0.999).astype(np.float64)
 
@@ -97,7 +97,7 @@ class _Comparison:
 
 def _descend(comparison: _Comparison, pose: Camera, distance: float, steps: int) -> Camera:
     """Return ``pose`` after ``steps`` steps. A step that does not lower the difference is not taken."""
-    # Of turning (rad) and of moving (scene units).
+    # Turn (rad) and movement (scene units) that shift the image by a pixel.
     pixel = np.repeat([1.0 / pose.fx, distance / pose.fx], 3)
     residual = comparison.difference(pose)
     lowest = comparison.mean_square(residual)

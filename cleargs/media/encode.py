@@ -51,9 +51,11 @@ def write_video(
     """Write ``frames`` as an MP4: 4:2:0, BT.709, limited range.
 
     Args:
-        path: the video. frames: sRGB images, at least one, read one by one. fps: frames per second.
-            bits_per_pixel: bits per pixel, kept over each second, in H.264 by one thread, so that equal
-                frames give equal bytes. None: no visible loss.
+        path: the video.
+        frames: sRGB images, at least one, read one by one.
+        fps: frames per second.
+        bits_per_pixel: bits per pixel, kept over each second, in H.264 by one thread, so that equal frames
+            give equal bytes. None: no visible loss.
         codec: the codec.
 
     Raises:
@@ -99,8 +101,10 @@ def _require_encoder(codec: Codec) -> None:
 
 
 def _planar(rgb: ImageU8) -> VideoFrame:
-    """Return RGB as 4:4:4 Y'CbCr. swscale only reduces the chroma, because its matrix is several levels
-    off."""
+    """Return RGB as 4:4:4 Y'CbCr.
+
+    swscale only reduces the chroma, because its matrix is several levels off.
+    """
     kr, kb = LUMA["bt709"]
     red, green, blue = np.moveaxis(rgb / 255, -1, 0)
     luma = kr * red + (1 - kr - kb) * green + kb * blue

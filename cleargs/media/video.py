@@ -123,10 +123,9 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
 
 
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
-    """Yield frames like `decode_frames`, but grey [H, W] and as they are stored, which is several times as
-    fast.
+    """Yield frames like `decode_frames`, but grey [H, W] and as they are stored.
 
-    Frames that cannot be decoded, for example at the start of a clip that was cut out of another, are left
+    It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was cut out of another, are left
     out.
     """
     for number, frame, _ in _decoded(path, pts):
