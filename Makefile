@@ -1,26 +1,26 @@
-# make demo   a synthetic capture through all five stages
-# make env    the program alone, in .venv
-# make test   every test that is not slow
-# make test-all   the whole test suite
-# make test-package   wheel and sdist, built and installed apart; the smoke demo run from the wheel
-# make drill  every stage and gc killed 50 times: same results
-# make fuzz   every reader under 2,000 mutations a file; SEED=N for others
-# make lint   ruff, codespell, mypy and the check of the prose (tools/prose.py)
-# make docs   the documentation as a site, in site/; a broken link is an error
-# make dist   wheel and sdist, in dist/
-# make test-gpu-kernels   the GPU kernels, without a GPU: in Triton's interpreter, and compiled ahead of time
-# make convert-env   .venv-convert, in which tools/convert_models converts PyTorch checkpoints
-# make test-convert  the tests of those conversions
-# make browser       what the tests of the report in a browser need beside Debian's chromium
-# make oracles       .oracles, npm's programs that read exported scenes in the tests
-# make cluster       .venv-cluster, the Snakemake that runs a sheet on a cluster
-# TORCH_INDEX=URL passes pip another index for torch (a CPU-only build, say).
+# make demo              run all stages on a synthetic capture
+# make env               install the program alone, in .venv
+# make test              run all tests that are not slow
+# make test-all          run all tests
+# make test-package      build wheel and sdist, install them separately, and run the smoke demo from the wheel
+# make drill             kill every stage and gc 50 times and compare the results
+# make fuzz              read 2,000 mutations of each kind of file; SEED=N selects others
+# make lint              ruff, codespell, mypy and the check of the prose (tools/prose.py)
+# make docs              build the documentation site in site/; a broken link is an error
+# make dist              build wheel and sdist in dist/
+# make test-gpu-kernels  test the GPU kernels without a GPU: in Triton's interpreter, and compiled ahead of time
+# make convert-env       install .venv-convert, in which tools/convert_models converts PyTorch checkpoints
+# make test-convert      run the tests of these conversions
+# make browser           install what the browser tests of the report need in addition to Debian's chromium
+# make oracles           install .oracles, npm packages that read exported scenes in the tests
+# make cluster           install .venv-cluster, the Snakemake that runs a sheet on a cluster
+# TORCH_INDEX=URL gives pip another index for torch, for example one with CPU-only builds.
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-# $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,WHAT OF OURS,MORE OF PYTORCH'S): every file is checked against
-# its digest, but for torch's, whose builds differ by machine.
+# $(call install,ENVIRONMENT,SECTIONS OF requirements.lock,OUR PACKAGE,PACKAGES OF PYTORCH): pip checks the digest of every
+# file, except those of torch, whose builds differ by machine.
 PIP_INSTALL := python -m pip install --quiet --disable-pip-version-check
 define install
 	awk -v wanted=" $(2) " '/^## /{take = index(wanted, " " $$2 " ")} take' requirements.lock > $(1)/requirements.txt
@@ -37,14 +37,14 @@ env: .venv/demo.stamp
 demo: env demo/capture/transforms.json
 	$(BIN)/cleargs run demo/capture -o demo/run --workflow smoke --set ingest.poses=sfm
 
-# A file's tests stay in one process, so that what they share is made once.
+# The tests of a file run in one process, so that they make shared fixtures once.
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -m 'not slow' --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest
 
-# In an environment of its own below dist/: what is tested there is the wheel, never the checkout.
+# A separate environment in dist/, so that the tests use the wheel and not the checkout.
 test-package: dist
 	rm -rf dist/env dist/try
 	$(PYTHON) -m venv dist/env
@@ -94,7 +94,7 @@ oracles: .oracles/stamp
 		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
 	touch $@
 
-# An environment of its own: the engine wants numpy and pandas of its own choosing.
+# A separate environment, because Snakemake needs other versions of numpy and pandas.
 cluster: .venv-cluster/stamp
 
 .venv-cluster/stamp: requirements.lock

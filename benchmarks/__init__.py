@@ -1,1 +1,1 @@
-"""Programs that measure ClearGS, for its own pages. They run from a checkout and are not installed."""
+"""Programs that measure ClearGS for its documentation. They run from a checkout and are not installed."""

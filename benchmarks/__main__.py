@@ -7,7 +7,7 @@ import os
 
 def main() -> None:
     """Run the command line and exit."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as `cleargs` does, before PyTorch is loaded
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # set before PyTorch loads, as in `cleargs`
     from benchmarks.commands import main as run
 
     run()

@@ -17,12 +17,12 @@ from cleargs.pipeline.dag import Dag
 @click.group("python -m benchmarks", context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 def benchmarks(debug: bool) -> None:
-    """Measure ClearGS: its speed and error, its variants against each other, its judgement of frames."""
+    """Measure the speed and error of ClearGS, compare its variants and check its evaluators of frames."""
 
 
 @benchmarks.group()
 def rva() -> None:
-    """Compare evaluators of frames, and check them against known truth."""
+    """Compare evaluators of frames and check them against ground truth."""
 
 
 for command in (splat, train, formation, quality, compare, evidence, world):
@@ -37,5 +37,5 @@ def main() -> None:
 
 
 def invoke(arguments: list[str], dag: Dag | None = None) -> int:
-    """Run one command; return its exit code. ``dag`` replaces the installed stages (tests)."""
+    """Run one command and return its exit code. Tests give ``dag`` to replace the installed stages."""
     return program.invoke(arguments, dag, benchmarks)

@@ -1,4 +1,7 @@
-"""A frame without what its camera's motion did to it: python deblur_a_frame.py RUN FRAME OUT.png"""
+"""Remove the motion blur of a frame with a finished run.
+
+python deblur_a_frame.py RUN FRAME OUT.png
+"""
 
 import sys
 
@@ -9,7 +12,7 @@ import cleargs as cg
 folder, frame_id, output = sys.argv[1:]
 found = cg.deblur(cg.open_run(folder), int(frame_id))
 if found is None:
-    print(f"nothing explains frame {frame_id} better than the render as it is")
+    print(f"no motion explains frame {frame_id} better than the sharp render")
 else:
-    print(f"undone: blur {found.formation.blur_px:.1f} px, skew {found.formation.skew_px:.1f} px")
+    print(f"removed: blur {found.formation.blur_px:.1f} px, skew {found.formation.skew_px:.1f} px")
     cv2.imwrite(output, cv2.cvtColor((255 * found.image).round().astype("uint8"), cv2.COLOR_RGB2BGR))

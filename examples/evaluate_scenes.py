@@ -1,4 +1,7 @@
-"""The scenes of a run against sharp images, stage by stage: python evaluate_scenes.py RUN REFERENCE"""
+"""Measure the scenes of a run against sharp images.
+
+python evaluate_scenes.py RUN REFERENCE
+"""
 
 import sys
 

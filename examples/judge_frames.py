@@ -1,4 +1,7 @@
-"""Which frames of a video are good, and the worst of them restored: python judge_frames.py FOLDER OUT.png"""
+"""Score the frames in a folder and restore the worst one.
+
+python judge_frames.py FOLDER OUT.png
+"""
 
 import sys
 from pathlib import Path

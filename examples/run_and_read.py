@@ -1,4 +1,7 @@
-"""A capture through all stages, and what came of it: python run_and_read.py CAPTURE RUN [WORKFLOW]"""
+"""Run all stages on a capture and print the results.
+
+python run_and_read.py CAPTURE RUN [WORKFLOW]
+"""
 
 import sys
 

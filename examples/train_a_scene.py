@@ -1,4 +1,7 @@
-"""A training of one's own on a prepared capture: python train_a_scene.py RUN SCENE.ply [STEPS]"""
+"""Train a scene on the prepared capture of a run.
+
+python train_a_scene.py RUN SCENE.ply [STEPS]
+"""
 
 import sys
 
@@ -15,6 +18,4 @@ result = cg.train(start, views, config, seed=1, progress=print)
 cg.save(result.scene, output)
 
 image = cg.render_view(result.scene, views[0].camera).image  # [H, W, 3], torch
-print(
-    f"{result.scene.gaussians.num} Gaussians; frame {views[0].frame_id} is {float(image.mean()):.2f} bright"
-)
+print(f"{result.scene.gaussians.num} Gaussians; mean of frame {views[0].frame_id}: {float(image.mean()):.2f}")

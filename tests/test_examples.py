@@ -1,4 +1,4 @@
-"""The examples run, as they are, on a tiny capture."""
+"""All examples run unchanged on a tiny capture."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ distil.steps = 5
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight frames and a recipe; `run_and_read.py` makes the run beside them."""
+    """Make a folder with a capture of eight frames, a recipe and a run."""
     folder = tmp_path_factory.mktemp("examples")
     make_capture(folder / "room", "mixed", frames=8, width=96, height=54, seed=0, reporter=SilentReporter())
     (folder / "tiny.toml").write_text(TINY)
@@ -88,7 +88,7 @@ def test_evaluate_scenes(
 
 
 def test_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its cells, one after the other, without Jupyter."""
+    """Runs the cells one after the other, without Jupyter."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
     notebook = json.loads((EXAMPLES / "walkthrough.ipynb").read_text())
     code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]

@@ -1,4 +1,4 @@
-"""The page docs/api.md, from the docstrings: ``python -m tools.api_page > docs/api.md``."""
+"""Write the page docs/api.md from the docstrings: ``python -m tools.api_page > docs/api.md``."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ import cleargs
 INTRODUCTION = """\
 # The library
 
-`import cleargs as cg` brings what the command line does to programs, {count} names in all. They are loaded
-when they are first asked for: the import itself takes a moment, and training needs neither pycolmap nor
-OpenImageIO. `examples/` has scripts to start from.
+`import cleargs as cg` gives programs the functions of the command line, {count} names in all. The import is
+fast: modules load on first use, and training loads neither pycolmap nor OpenImageIO. Start from the scripts
+in `examples/`.
 
 This page is made from the source: `python -m tools.api_page > docs/api.md`.
 """
 
 
 def page() -> str:
-    """The page, in the order of ``cleargs.__all__``."""
+    """Return the page, with names in the order of ``cleargs.__all__``."""
     sections = (section(name) for name in cleargs.__all__)
     return "\n".join([INTRODUCTION.format(count=len(cleargs.__all__)), *sections])
 
 
 def section(name: str) -> str:
-    """Heading, signature and docstring of one name; of a class, its fields and methods as well."""
+    """Return heading, signature and docstring of one name; for a class, also its fields and methods."""
     found = getattr(cleargs, name)
     source = inspect.getsource(found).splitlines()
     node = ast.parse("\n".join(source)).body[0]
@@ -56,7 +56,7 @@ def _public(node: ast.ClassDef) -> Iterator[ast.FunctionDef]:
 
 
 def _signature(node: ast.FunctionDef, source: list[str]) -> str:
-    """The call as it stands in ``source``, without ``self``."""
+    """Return the signature as written in ``source``, without ``self``."""
     lines = source[node.lineno - 1 : node.body[0].lineno - 1]
     text = "\n".join(line.removeprefix(" " * node.col_offset) for line in lines)
     text = re.sub(r"\((\n?\s*)(self|cls)(, |,\s*\n\s*)?", r"(\1", text, count=1)

@@ -1,4 +1,4 @@
-"""The page docs/settings.md, from the models of the settings: ``python -m tools.settings_page``."""
+"""Write the page docs/settings.md from the models of the settings: ``python -m tools.settings_page``."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from cleargs.pipeline.settings import settings_of
 INTRODUCTION = """\
 # Settings
 
-Every setting of the five stages, as `cleargs settings` lists them. Set one with
-`cleargs run INPUT -o RUN --set g0.steps=4000`, or several in a TOML file for `--workflow FILE.toml`; those
-of a run are in `RUN/run.toml`, and stay until `cleargs run` is told others. `seed` (0) belongs to no stage.
+All settings of the five stages, as in `cleargs settings`. Change one with
+`cleargs run INPUT -o RUN --set g0.steps=4000`, or several in a TOML file with `--workflow FILE.toml`. The
+settings of a run are stored in `RUN/run.toml` and apply until you change them. `seed` (default 0) is global.
 
 This page is made from the source: `python -m tools.settings_page > docs/settings.md`.
 """
 
 
 def page() -> str:
-    """The page: a table for each stage."""
+    """Return the page, with a table for each stage."""
     dag = installed()
     lines = [INTRODUCTION]
     for stage in dag.names:

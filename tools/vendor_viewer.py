@@ -1,7 +1,7 @@
-"""Fetches the 3D viewer that reports carry: ``python -m tools.vendor_viewer`` in a checkout, with npm.
+"""Download the 3D viewer of the reports: ``python -m tools.vendor_viewer`` in a checkout, with npm.
 
-SuperSplat Viewer (PlayCanvas, MIT) is one JavaScript module. It is kept compressed, as the reports hold it,
-with its licence and its version beside it. What npm hands out must have the digest below.
+SuperSplat Viewer (PlayCanvas, MIT) is one JavaScript module. It is stored compressed, as in the reports, with
+its licence and version. The package from npm must have the digest below.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pathlib import Path
 
 PACKAGE, VERSION = "@playcanvas/supersplat-viewer", "1.36.2"
 SHA512 = "L7w0BlagAonRHQg5qhaDyBB8zrRtiU9QgglNU3kUgsqHpokCAtuf9j4P0kxsUaQn61FZ1qJGkRKsOCbrLCDR0w=="
-"""Of the package, base64, as npm states it."""
+"""Digest of the package in base64, from npm."""
 
 VIEWER = Path(__file__).parents[1] / "cleargs" / "report" / "static" / "viewer"
 _SOURCE_MAP = b"\n//# sourceMappingURL="
 
 
 def main() -> None:
-    """Replace the viewer in this checkout by ``VERSION``. Raises ValueError for an unexpected package."""
+    """Replace the viewer in this checkout; raise ValueError if the package has another digest."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["npm", "pack", f"{PACKAGE}@{VERSION}", "--ignore-scripts", "--silent"]
         subprocess.run(command, cwd=folder, check=True)
@@ -34,7 +34,7 @@ def main() -> None:
         with tarfile.open(archive) as package:
             module, licence = (_member(package, name) for name in ("public/index.js", "LICENSE"))
     VIEWER.mkdir(parents=True, exist_ok=True)
-    code = module.partition(_SOURCE_MAP)[0]  # its source map is not shipped
+    code = module.partition(_SOURCE_MAP)[0]  # leaves out the source map
     (VIEWER / "index.js.gz").write_bytes(gzip.compress(code, 9, mtime=0))
     (VIEWER / "LICENSE").write_bytes(licence)
     (VIEWER / "VERSION").write_text(f"{PACKAGE} {VERSION}\n")

@@ -1,11 +1,11 @@
-"""Whether a stage's source changed without its VERSION: the lock file ``stages/versions.lock.json``.
+"""Check that a stage whose source changed has a new VERSION, by the lock file ``stages/versions.lock.json``.
 
-The source of a stage is its module and every ClearGS module that it imports, also inside functions,
-transitively, as syntax trees without docstrings, comments and layout. ::
+The source of a stage is its module and all ClearGS modules that it imports, directly or indirectly, also
+inside functions. It is compared as syntax trees without docstrings, comments and layout. ::
 
-    python -m tools.versions                                what changed
-    python -m tools.versions --update                       after VERSION was raised
-    python -m tools.versions --update --no-change REASON    the results stay the same bytes
+    python -m tools.versions                                list changes
+    python -m tools.versions --update                       after an increase of VERSION
+    python -m tools.versions --update --no-change REASON    if the results stay the same byte for byte
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from cleargs.pipeline.dag import Dag, installed
 
 LOCK_NAME = "versions.lock.json"
 
-PLAIN_COMMANDS = "cleargs.cli"
-"""A package that stages do not compute with; never part of a source."""
+CLI_PACKAGE = "cleargs.cli"
+"""Package of the command line; it does not affect results, so it is not part of any source."""
 
 Lock = dict[str, dict[str, Any]]
 """Stage -> {"version", "digest", "modules": {module: digest}, "unchanged_because": reason or absent}."""
@@ -36,12 +36,12 @@ Lock = dict[str, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Sources:
-    """Where modules lie: dotted prefix -> folder of that package."""
+    """Folders of packages: dotted prefix -> folder."""
 
     roots: Mapping[str, Path]
 
     def file(self, module: str) -> Path | None:
-        """The source file of ``module``, or None when it is none of ours."""
+        """Return the source file of ``module``, or None if no package in ``roots`` contains it."""
         for prefix in sorted(self.roots, key=len, reverse=True):
             if module == prefix or module.startswith(prefix + "."):
                 rest = module.removeprefix(prefix).strip(".").split(".")
@@ -53,29 +53,29 @@ class Sources:
         return None
 
     def closure(self, module: str) -> dict[str, str]:
-        """Module -> digest of its tree, for ``module`` and all of ours that it imports, transitively."""
+        """Return the digests of the syntax trees of ``module`` and all its imports, transitively."""
         digests: dict[str, str] = {}
         waiting = [module]
         while waiting:
             name = waiting.pop()
             file = self.file(name)
-            if file is None or name in digests or f"{name}.".startswith(f"{PLAIN_COMMANDS}."):
+            if file is None or name in digests or f"{name}.".startswith(f"{CLI_PACKAGE}."):
                 continue
             tree = ast.parse(file.read_bytes())
             digests[name] = hashlib.sha256("\n".join(_tokens(tree)).encode()).hexdigest()
             package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-            waiting += _mentioned(tree, package)
+            waiting += _named_modules(tree, package)
         return dict(sorted(digests.items()))
 
 
 def installed_sources() -> Sources:
-    """The ClearGS packages as they are installed here."""
+    """Return the folders of the installed ClearGS packages."""
     stages = sys.modules.get("cleargs.stages") or __import__("cleargs.stages", fromlist=["stages"])
     return Sources({"cleargs": Path(cleargs.__path__[0]), "cleargs.stages": Path(stages.__path__[0])})
 
 
 def current_lock(dag: Dag, sources: Sources, package: str = "cleargs.stages") -> Lock:
-    """The lock that the sources as they are would give."""
+    """Return the lock for the current sources."""
     lock: Lock = {}
     for name in dag.names:
         modules = sources.closure(f"{package}.{name}")
@@ -85,20 +85,20 @@ def current_lock(dag: Dag, sources: Sources, package: str = "cleargs.stages") ->
 
 
 def changed_modules(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Modules whose tree differs between two entries of a lock, or that are in one of them only."""
+    """Return the modules that differ between two entries of a lock or are in only one of them."""
     old, new = before["modules"], now["modules"]
     return sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
 
 
-def complaints(before: Lock, now: Lock) -> list[str]:
-    """What keeps ``now`` from being locked: sources that changed while VERSION stayed, versions that fell."""
+def violations(before: Lock, now: Lock) -> list[str]:
+    """Return a line for each stage whose source changed without its VERSION, or whose VERSION decreased."""
     lines = []
     for stage, entry in now.items():
         locked = before.get(stage)
         if locked is None:
             continue
         if entry["version"] < locked["version"]:
-            lines.append(f"{stage}: VERSION fell from {locked['version']} to {entry['version']}")
+            lines.append(f"{stage}: VERSION decreased from {locked['version']} to {entry['version']}")
         elif entry["version"] == locked["version"] and entry["digest"] != locked["digest"]:
             modules = ", ".join(changed_modules(locked, entry))
             lines.append(f"{stage}: VERSION is still {entry['version']}, but these changed: {modules}")
@@ -106,9 +106,18 @@ def complaints(before: Lock, now: Lock) -> list[str]:
 
 
 def updated_lock(before: Lock, now: Lock, reason: str | None) -> Lock:
-    """``now`` as it is to be written. Raises ValueError where it may not be: one line for each cause."""
-    problems = complaints(before, now)
-    if problems and (reason is None or any("fell" in line for line in problems)):
+    """Return the lock to write.
+
+    Args:
+        before: The committed lock.
+        now: The lock for the current sources.
+        reason: The reason why results stay the same if a source changed without its VERSION.
+
+    Raises:
+        ValueError: A change needs a reason, or a VERSION decreased; one line per stage.
+    """
+    problems = violations(before, now)
+    if problems and (reason is None or any("decreased" in line for line in problems)):
         raise ValueError("\n".join(problems))
     lock: Lock = {}
     for stage, entry in now.items():
@@ -124,7 +133,7 @@ def updated_lock(before: Lock, now: Lock, reason: str | None) -> Lock:
 
 
 def read_lock(path: Path) -> Lock:
-    """The committed lock; empty when there is none."""
+    """Read the committed lock; return an empty one if it does not exist."""
     if not path.exists():
         return {}
     lock: Lock = json.loads(path.read_text(encoding="utf-8"))
@@ -132,28 +141,30 @@ def read_lock(path: Path) -> Lock:
 
 
 def lock_path(sources: Sources) -> Path:
-    """Where the lock file is committed."""
+    """Return the path of the lock file."""
     return sources.roots["cleargs.stages"] / LOCK_NAME
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare with the lock file, or refresh it; returns the exit code."""
+    """Compare the sources with the lock file, or update it; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.versions", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--update", action="store_true", help="write the lock file anew")
-    parser.add_argument("--no-change", metavar="REASON", help="why the results stay the same bytes")
+    parser.add_argument("--update", action="store_true", help="update the lock file")
+    parser.add_argument(
+        "--no-change", metavar="REASON", help="the reason why results stay the same byte for byte"
+    )
     options = parser.parse_args(arguments)
     sources = installed_sources()
     before, now = read_lock(lock_path(sources)), current_lock(installed(), sources)
     if not options.update:
-        lines = complaints(before, now)
-        print("\n".join(lines) or "nothing changed without its VERSION")
+        lines = violations(before, now)
+        print("\n".join(lines) or "no source changed without its VERSION")
         return 1 if lines else 0
     try:
         lock = updated_lock(before, now, options.no_change)
     except ValueError as error:
         print(error, file=sys.stderr)
-        print("raise VERSION in the stage, or give --no-change REASON", file=sys.stderr)
+        print("increase VERSION in the stage, or give --no-change REASON", file=sys.stderr)
         return 1
     write_json(lock_path(sources), lock)
     print(f"wrote {lock_path(sources)}")
@@ -165,10 +176,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 MODULE_NAME = re.compile(r"cleargs(\.\w+)+")
 
 
-def _mentioned(tree: ast.AST, package: str) -> Iterator[str]:
-    """Modules that ``tree`` imports, with the packages around them, and those it names in a string.
+def _named_modules(tree: ast.AST, package: str) -> Iterator[str]:
+    """Yield the modules and their packages that ``tree`` imports or names in a string.
 
-    A name in a string is how a child process (``python -m NAME``) or a late import is spelt.
+    Child processes (``python -m NAME``) and late imports name their modules in strings.
     """
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -197,9 +208,10 @@ def _with_packages(module: str) -> Iterator[str]:
 
 
 def _tokens(node: ast.AST) -> Iterator[str]:
-    """The tree as text without positions and docstrings, equal for every Python version that reads it.
+    """Yield the tree as text without positions and docstrings.
 
-    ``ast.dump`` is not: newer versions have fields that are empty in code of ours.
+    The text is the same for all supported Python versions. That of ``ast.dump`` is not: newer versions add
+    fields, which are empty for our code.
     """
     yield type(node).__name__
     for name, value in ast.iter_fields(node):
@@ -217,7 +229,7 @@ def _tokens(node: ast.AST) -> Iterator[str]:
 
 
 def _is_docstring(node: ast.AST) -> bool:
-    """Whether ``node`` is a string that stands alone: documentation of whatever is above or around it."""
+    """Return True if ``node`` is a statement with only a string: it documents a module, class or name."""
     return (
         isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)

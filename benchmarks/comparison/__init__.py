@@ -1,1 +1,1 @@
-"""Variants, captures or runs side by side: tables, pictures and the page of results."""
+"""Compare variants, captures or runs: tables, pictures and the page of results."""

@@ -1,4 +1,4 @@
-"""Cells of a comparison and what is read off them: means, spreads, paired differences."""
+"""Cells of a comparison, and their means, spreads and paired differences."""
 
 from __future__ import annotations
 
@@ -11,43 +11,49 @@ from typing import Literal
 from cleargs.evaluate.eval_report import LOWER_IS_BETTER, Figures
 
 ViewSet = Literal["observed", "given", "novel", "held-out", "reference"]
-"""Where a scene is judged: sharp truth at the input's true poses, the same at the poses as given (where the
-capture's are noisy), sharp truth off the path, test frames, or the user's own reference."""
+"""Views on which a scene is evaluated.
+
+* ``observed``: sharp truth at the true poses of the frames.
+* ``given``: sharp truth of the same frames, rendered at the noisy poses of the capture.
+* ``novel``: sharp truth at poses off the camera path.
+* ``held-out``: test frames.
+* ``reference``: images that the user gave.
+"""
 
 
 class Cell(Figures):
-    """One scene judged on one set of views."""
+    """One scene, evaluated on one set of views."""
 
     column: str
-    """What is compared across: the protocol of a synthetic capture, else the capture's name."""
+    """Column of the tables: the protocol of a synthetic capture, or the name of a real one."""
     sample: str
-    """Which capture and seed of the column; differences are taken within one sample."""
+    """Capture and seed. Differences between variants are taken within one sample."""
     variant: str
     views: ViewSet
     means: dict[str, float | None]
-    """Metric -> mean over the images; None where it could not be measured."""
+    """Metric -> mean over the images; None if it could not be measured."""
     images: int
     trained_on: int | None = None
-    """How many of them show frames that the scene was trained on; None where that is not known."""
+    """Number of images that show frames of the training; None if unknown."""
     seconds: float
-    """Wall time of the stages that no earlier variant of the sample had made."""
+    """Wall time of the stages that ran first for this variant."""
     shared_seconds: float
-    """Wall time of the stages that it shares with earlier variants."""
+    """Wall time of the stages that an earlier variant of the sample had finished."""
     gaussians: int
     steps: int
-    """Training steps of all stages behind the scene, as logged."""
+    """Training steps of all stages that lead to the scene, from their logs."""
     sh_degree: int
     cpu_seconds: float | None
-    """Processor time of all stages behind the scene, shared ones included; None where it was not noted."""
+    """Processor time of all stages that lead to the scene, shared ones included; None if unknown."""
     peak_memory_gb: float | None
-    """Largest resident memory of any of them, GB (1e9 bytes)."""
+    """Largest resident memory of these stages, GB (1e9 bytes)."""
     evaluation: str
-    """Folder below that of the comparison: ``eval.json`` and the evaluated images."""
+    """Folder with ``eval.json`` and the rendered images, relative to the folder of the comparison."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and sample standard deviation; the deviation is None for a single value."""
+    """Mean and sample standard deviation of some values; the deviation is None for a single value."""
 
     mean: float
     deviation: float | None
@@ -61,26 +67,26 @@ class Spread:
         return student_t(self.count - 1) * self.deviation / math.sqrt(self.count)
 
     @property
-    def is_none(self) -> bool:
-        """Whether the 95 % interval of a mean difference holds 0."""
+    def includes_zero(self) -> bool:
+        """True if the 95 % interval of a mean difference includes 0."""
         return self.half_width is not None and abs(self.mean) <= self.half_width
 
     @property
-    def is_sure(self) -> bool:
-        """Whether there is an interval and it does not hold 0."""
-        return self.half_width is not None and not self.is_none
+    def excludes_zero(self) -> bool:
+        """True if there is an interval and it excludes 0: the difference is significant."""
+        return self.half_width is not None and not self.includes_zero
 
 
 @cache
 def student_t(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t with so many degrees of freedom."""
+    """Return the 97.5 % quantile of Student's t with ``freedom`` degrees of freedom."""
     from scipy.stats import t
 
     return float(t.ppf(0.975, freedom))
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """The spread of one or more values; infinite ones (PSNR of equal images) make it infinite."""
+    """Return the spread of at least one value; it is infinite if a value is (PSNR of equal images)."""
     mean = math.fsum(values) / len(values)
     if len(values) < 2:
         return Spread(mean, None, len(values))
@@ -89,7 +95,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 class Cells:
-    """Look-ups over a set of cells, in their order."""
+    """Queries on a list of cells; results keep the order of the cells."""
 
     def __init__(self, cells: Iterable[Cell]) -> None:
         self.cells = tuple(cells)
@@ -104,7 +110,7 @@ class Cells:
         return list(dict.fromkeys(cell.column for cell in self.cells if cell.views == views))
 
     def metrics(self) -> list[str]:
-        """Metrics that at least one cell has a value for."""
+        """Return the metrics for which at least one cell has a value."""
         return list(
             dict.fromkeys(
                 name for cell in self.cells for name, value in cell.means.items() if value is not None
@@ -112,7 +118,7 @@ class Cells:
         )
 
     def values(self, views: ViewSet, column: str, variant: str, metric: str) -> dict[str, float]:
-        """Sample -> value."""
+        """Return a value for each sample that has one."""
         return {
             cell.sample: value
             for cell in self.of(views, column, variant)
@@ -120,27 +126,29 @@ class Cells:
         }
 
     def of(self, views: ViewSet, column: str, variant: str) -> list[Cell]:
-        """The cells of all samples."""
+        """Return the cells of all samples."""
         wanted = (views, column, variant)
         return [cell for cell in self.cells if (cell.views, cell.column, cell.variant) == wanted]
 
     def spread(self, views: ViewSet, column: str, variant: str, metric: str) -> Spread | None:
-        """Over the samples; None where there is no value."""
+        """Return the spread over the samples; None without a value."""
         values = list(self.values(views, column, variant, metric).values())
         return spread(values) if values else None
 
     def difference(
         self, views: ViewSet, column: str, variant: str, baseline: str, metric: str
     ) -> Spread | None:
-        """``variant`` minus ``baseline``, paired within the samples that have both; None without one."""
+        """Return the spread of ``variant`` minus ``baseline`` over their common samples; None without one."""
         ours = self.values(views, column, variant, metric)
         theirs = self.values(views, column, baseline, metric)
         pairs = [ours[sample] - theirs[sample] for sample in ours if sample in theirs]
         return spread(pairs) if pairs else None
 
     def best(self, views: ViewSet, column: str, metric: str) -> str | None:
-        """The variant with the best mean, of those that were measured on the most samples: means over
-        other samples say nothing of each other.
+        """Return the variant with the best mean; None without a value.
+
+        Only variants with the largest number of samples count: means over different samples are not
+        comparable.
         """
         spreads = {
             variant: found

@@ -1,4 +1,4 @@
-"""Whether RIVR chose well: its candidates measured against the sharp truth."""
+"""Quality of RIVR's choice between repair candidates, measured against the sharp truth."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from cleargs.types import ImageF32
 Distance = Callable[[ImageF32, ImageF32], float]
 
 RAW = "observed"
-"""The layer of the raw frame, which a method that keeps frames may choose too."""
+"""Layer of the raw frame. RIVR may choose it too, which keeps the frame unrepaired."""
 
 _MIN_ERROR = 1e-10
-"""Equal images have a PSNR of 100 dB, not an infinite one."""
+"""Minimum mean squared error: it limits the PSNR of equal images to 100 dB."""
 
 
 class ChoiceRow(FrozenModel):
-    """The candidates of one row of ``rivr/selection.parquet`` against the truth."""
+    """Candidates of one row of ``rivr/selection.parquet``, compared with the truth."""
 
     round: int
     frame_id: int
     chosen: str
     psnr: dict[str, float]
-    """Candidate -> dB; the raw frame is among them."""
+    """Candidate -> PSNR in dB; includes the raw frame."""
     lpips: dict[str, float]
-    """Candidate -> LPIPS; empty without its weights."""
+    """Candidate -> LPIPS; empty if its weights are not installed."""
 
     @property
     def best_by_psnr(self) -> bool:
@@ -48,12 +48,12 @@ class ChoiceRow(FrozenModel):
 
     @property
     def lost_psnr(self) -> float:
-        """dB by which the best candidate would have been better."""
+        """PSNR of the best candidate minus that of the chosen one, dB."""
         return max(self.psnr.values()) - self.psnr[self.chosen]
 
 
 class Choices(FrozenModel):
-    """All rows of one scene."""
+    """All choices of one scene."""
 
     column: str
     sample: str
@@ -62,26 +62,27 @@ class Choices(FrozenModel):
 
 
 class ChoiceAgreement(FrozenModel):
-    """How well choices agree with the truth.
+    """Agreement of choices with the truth.
 
-    Frames that were kept as they were filmed are counted apart: with image formation such a frame is kept
-    because its motion is known, not because it would be sharp.
+    Frames that were kept as filmed are counted separately: with image formation such a frame is kept because
+    its motion is known, not because it is sharp.
     """
 
     kept: int
-    """Rows whose frame was kept as it was filmed; they count in none of the figures below."""
+    """Rows whose frame was kept as filmed; the other figures exclude them."""
     repaired: int
     by_psnr: float | None
-    """Share of the repaired rows whose chosen candidate is the best by PSNR; None where there is none."""
+    """Share of the repaired rows whose chosen candidate has the best PSNR; None without such rows."""
     by_lpips: float | None
+    """The same by LPIPS; None if it is missing for a row."""
     by_chance: float | None
-    """What choosing blindly would reach."""
+    """Expected share for a random choice."""
     lost_psnr: float | None
-    """Mean over the repaired rows, dB."""
+    """Mean PSNR loss compared with the best candidate over the repaired rows, dB."""
 
 
 def agreement(rows: Sequence[ChoiceRow]) -> ChoiceAgreement:
-    """The figures of some rows."""
+    """Summarise the choices of ``rows``."""
     repaired = [row for row in rows if row.chosen != RAW]
 
     def mean(values: Iterable[float]) -> float | None:
@@ -97,12 +98,23 @@ def agreement(rows: Sequence[ChoiceRow]) -> ChoiceAgreement:
     )
 
 
-def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[ChoiceRow]:
-    """Every row of a finished RIVR against ``capture/truth/observed``; none where ``capture`` has no truth.
+def measure_choices(run: Path, capture: Path, lpips: Distance | None) -> list[ChoiceRow]:
+    """Measure each candidate of a finished RIVR against ``capture/truth/observed``.
 
-    A candidate has the exposure of its frame, so the truth is given the frame's true exposure error first:
-    what is compared is detail, not brightness. Frames that have no truth, or one of another size, are left
-    out. Raises StoreError when a table or an EXR is damaged.
+    A candidate has the exposure of its frame. So the frame's true exposure error is applied to the truth
+    first: the comparison is about detail, not brightness. Frames without truth, or with truth of another
+    size, are left out.
+
+    Args:
+        run: Folder of the run.
+        capture: Folder of its synthetic capture.
+        lpips: LPIPS of two sRGB images; None to measure PSNR only.
+
+    Returns:
+        One row per row of ``selection.parquet``; an empty list if the capture has no truth.
+
+    Raises:
+        StoreError: A table or an EXR file is damaged.
     """
     folder, table = capture / "truth" / "observed" / "images", capture / "truth" / "frames.parquet"
     if not folder.is_dir() or not table.is_file():
@@ -115,7 +127,7 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
         sharp = folder / f"{stem}.png"
         if stem not in stops or not sharp.is_file():
             continue
-        truth = exposed(read_rgb_float(sharp), stops[stem])
+        truth = apply_exposure(read_rgb_float(sharp), stops[stem])
         candidates = _candidates(run / "rivr" / row.exr, row.chosen)
         if any(image.shape != truth.shape for image in candidates.values()):
             continue
@@ -131,20 +143,20 @@ def judge_choices(run: Path, capture: Path, lpips: Distance | None) -> list[Choi
     return found
 
 
-def exposed(image: ImageF32, stops: float) -> ImageF32:
-    """An sRGB image as a camera would give it that is off by so many stops."""
+def apply_exposure(image: ImageF32, stops: float) -> ImageF32:
+    """Change the exposure of an sRGB image [H, W, 3] by ``stops``, in linear light."""
     light = linear_from_srgb(image) * np.float32(2.0**stops)
     return np.asarray(srgb_from_linear(np.clip(light, 0.0, 1.0)), np.float32)
 
 
 def _psnr(image: ImageF32, truth: ImageF32) -> float:
-    """PSNR of unrounded images, dB: candidates that look equal in 8 bits still differ."""
+    """Return the PSNR of float images in dB: candidates that are equal in 8 bits may still differ."""
     error = float(np.square(image - truth).mean(dtype=np.float64))
     return -10.0 * math.log10(max(error, _MIN_ERROR))
 
 
 def _candidates(exr: Path, chosen: str) -> Mapping[str, ImageF32]:
-    """What could have been chosen, and the raw frame."""
+    """Return the candidates and the raw frame, sRGB."""
     layers = read_exr(exr).layers
     names = [name for name in ("render", "restored", "fused", RAW) if name in layers]
     return {name: from_layer(layers[name]) for name in dict.fromkeys((*names, chosen))}

@@ -1,4 +1,4 @@
-"""``compare``: variants, captures or runs side by side."""
+"""``compare``: tables and pictures of variants, captures or runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from cleargs.pipeline.session import DeviceChoice, opened_store, resolve_device
 from cleargs.pipeline.store import STORE_FOLDER
 
 if TYPE_CHECKING:
-    from benchmarks.comparison.scenes import Made, SceneRecipe
+    from benchmarks.comparison.scenes import FinishedScene, SceneRecipe
     from benchmarks.comparison.variants import Variant
 
 
@@ -41,7 +41,7 @@ TRAINING_OPTIONS = {
     "overrides": "--set",
     "quality": "--quality",
 }
-"""What has no use for runs that are finished."""
+"""Options that only apply to training: parameter -> name on the command line."""
 
 
 def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, ...]:
@@ -50,7 +50,7 @@ def _seeds(context: click.Context, parameter: click.Parameter, value: str) -> tu
     except ValueError:
         seeds = ()
     if not seeds or min(seeds) < 0:
-        raise click.BadParameter("write whole numbers from 0, separated by commas: 0,1,2 say")
+        raise click.BadParameter("give whole numbers from 0, separated by commas, e.g. 0,1,2")
     return seeds
 
 
@@ -81,19 +81,19 @@ Examples:
     "--variants",
     default="",
     metavar="NAME,...",
-    help=f"Which variants: {', '.join(variant.name for variant in VARIANTS)}.  [default: all]",
+    help=f"Variants to train: {', '.join(variant.name for variant in VARIANTS)}.  [default: all]",
 )
 @click.option(
     "--seeds",
     default="0",
     show_default=True,
     callback=_seeds,
-    help="Seeds of the trainings of each capture.",
+    help="Training seeds for each capture.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
-    help="Training steps of every variant in all, in the recipe's proportions.  [default: the recipe's]",
+    help="Total training steps of each variant, in the recipe's proportions.  [default: those of the recipe]",
 )
 @click.option(
     "--reference",
@@ -106,7 +106,7 @@ Examples:
 )
 @click.option("--set", "overrides", multiple=True, metavar="STAGE.FIELD=VALUE", help="Change one setting.")
 @quality_option
-@report_option("Write OUT/report/index.html, the tables and pictures as a page.")
+@report_option("Write OUT/report/index.html, a page with the tables and pictures.")
 @work_options
 @json_option
 @quiet_option
@@ -129,31 +129,29 @@ def compare(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Train variants of the method on captures, or take finished runs, and print the paper's tables.
+    """Train variants of the method on captures, or compare finished runs, and print the paper's tables.
 
     All variants of a capture train for the same number of steps, with the same budget of Gaussians and the
-    same SH degree. Captures of one protocol are samples of one column; with several, or several seeds, a
-    difference whose 95 % interval holds 0 is called none. Stages that variants share are made once, and the
-    same command resumes where it stopped.
+    same SH degree. Captures of one protocol are samples of one column. With several samples, a difference
+    whose 95 % interval includes 0 is shown as "none". Variants share the results of equal stages. Repeat the
+    command to resume it.
     """
     from benchmarks.comparison.findings import compare_scenes
     from benchmarks.comparison.pictures import comparison_sheet, plot_comparison
-    from benchmarks.comparison.scenes import Sample, SceneRecipe, existing, make_scenes
+    from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes, scene_of_run
     from benchmarks.comparison.tables import markdown, training_lines
     from cleargs.files import write_bytes, write_json
 
     runs = [source for source in sources if (source / RUN_FILE).is_file()]
     if runs and len(runs) != len(sources):
-        raise InputError(
-            "some of these are runs and some captures", hint="give either runs or captures, not both"
-        )
+        raise InputError("some of these are runs and some captures", hint="give only runs or only captures")
     for source in sources:
         if not source.exists():
-            raise InputError(f"there is no {source}", hint="give captures or run folders")
-    if runs and (idle := _named(TRAINING_OPTIONS)):
+            raise InputError(f"{source} does not exist", hint="give captures or run folders")
+    if runs and (idle := _given(TRAINING_OPTIONS)):
         raise InputError(
-            f"{', '.join(idle)}: finished runs are compared as they are",
-            hint="leave it out, or give captures, whose variants are trained",
+            f"{', '.join(idle)} cannot change finished runs",
+            hint="leave it out, or give captures to train on",
         )
     chosen = find_variants([name.strip() for name in variants.split(",") if name.strip()])
     out = out.absolute()
@@ -164,11 +162,11 @@ def compare(
     with opened_store(out / STORE_FOLDER) as store:
         if runs:
             _check_names([run.resolve().name for run in runs], "runs")
-            finished = [existing(run, dag, reference) for run in runs]
-            # Samples go by the capture's name: those of two captures of one name would be paired.
+            finished = [scene_of_run(run, dag, reference) for run in runs]
+            # A sample is named after its capture, so two captures with one name would be paired.
             sources_of_runs = {scene.sample.capture.resolve() for scene in finished}
             _check_names([source.name for source in sources_of_runs], "captures of these runs")
-            made: Iterator[Made | str] = iter(finished)
+            made: Iterator[FinishedScene | str] = iter(finished)
         else:
             samples = [Sample(source.absolute(), seed, reference) for source in sources for seed in seeds]
             _check_names([source.resolve().name for source in sources], "captures")
@@ -194,7 +192,7 @@ def compare(
         try:
             page = write_comparison(out, compared, baselines, made_with, warnings)
         except CleargsError as error:  # the comparison itself has succeeded
-            reporter.warn(f"there is no report: {error}; {error.hint}")
+            reporter.warn(f"the report could not be written: {error}; {error.hint}")
     if as_json:
         print_json(document)
     else:
@@ -206,7 +204,7 @@ def compare(
 
 
 def _made_with(variants: Sequence[Variant], seeds: Sequence[int], recipe: SceneRecipe) -> list[str]:
-    """What the tables were made with, in lines."""
+    """Return lines that describe the settings and versions behind the tables."""
     from cleargs.manifest import versions
 
     lines = [f"LPIPS v0.1 with {', '.join(recipe.options.lpips) or 'no network'}; device {recipe.device}"]
@@ -225,14 +223,16 @@ def _settings(variant: Variant) -> str:
     return f"{', '.join((recipe, *variant.overrides))}; the scene of {variant.stage}"
 
 
-def _named(options: Mapping[str, str]) -> list[str]:
-    """Those of ``options`` (parameter -> as it is written) that stand on the command line."""
+def _given(options: Mapping[str, str]) -> list[str]:
+    """Return the names of those ``options`` (parameter -> name) that were given on the command line."""
     source = click.get_current_context().get_parameter_source
     return [text for name, text in options.items() if source(name) is ParameterSource.COMMANDLINE]
 
 
 def _check_names(names: Sequence[str], what: str) -> None:
-    """Two captures of one name would share a run folder, two runs a row of the tables."""
+    """Raise InputError for equal names: such captures would share a run folder, such runs a table row."""
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"two {what} are called {twice[0]}", hint=f"give the {what} distinct folder names")
+        raise InputError(
+            f"two {what} have the name {twice[0]}", hint=f"give the {what} distinct folder names"
+        )

@@ -1,8 +1,8 @@
-"""Equal work: every variant of a comparison trains for as many steps, with one budget and one SH degree.
+"""Equal work: all variants of a comparison get the same training steps, budget and SH degree.
 
-The numbers are those of the whole method under the comparison's recipe, every frame active. A variant that
-ends with G0 trains its G0 for all of the steps, one that ends with RIVR gives the consolidation's to its
-rounds; one with a recipe of its own keeps that recipe's proportions.
+The numbers are those of the whole method with the comparison's recipe and every frame active. A variant that
+ends with G0 uses all steps for G0. A variant that ends with RIVR adds the steps of consolidation to the
+rounds. A variant with its own recipe keeps the proportions of that recipe.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from cleargs.pipeline.dag import Dag
 
 @dataclass(frozen=True)
 class EqualWork:
-    """What every variant of a sample gets."""
+    """Work that each variant of a sample gets."""
 
     steps: int
     frames: int
-    """On which the proportions of the trainings rest, where the settings leave their steps open."""
+    """Number of frames from which steps are derived that the settings leave open."""
     budget: int
-    """Most Gaussians."""
+    """Maximum number of Gaussians."""
     sh_degree: int
 
 
 @dataclass(frozen=True)
 class Steps:
-    """How the steps of a scene are spent."""
+    """Training steps of a scene by stage."""
 
     g0: int
     round: int
+    """Steps of one round of RIVR."""
     rounds: int
-    """Distillations of RIVR."""
     consolidate: int
 
     @property
@@ -46,8 +46,9 @@ class Steps:
 
 
 def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
-    """The steps that a run on so many frames makes up to ``stage``, provided that some repair is accepted in
-    each round.
+    """Return the steps of a run on ``frames`` frames up to ``stage``.
+
+    A round without an accepted repair trains less than this.
     """
     whole: Any = config.sections
     rivr, consolidate = stage != "g0", stage == "consolidate"
@@ -60,10 +61,15 @@ def steps_of(config: Config, frames: int, stage: str = "consolidate") -> Steps:
 
 
 def decide_work(config: Config, ingest: Path, steps: int | None) -> EqualWork:
-    """The work of all variants of a capture, from the finished folder of its ingest.
+    """Choose the work of all variants of a capture.
 
-    ``config`` is that of the comparison's recipe, ``steps`` what the user asked for. Settings that the recipe
-    leaves open are decided as they would be with every registered training frame active.
+    Settings that the recipe leaves open get the values for a run with every registered training frame
+    active.
+
+    Args:
+        config: Configuration of the comparison's recipe.
+        ingest: Finished ingest folder of the capture.
+        steps: Total steps that the user asked for; None for those of the recipe.
     """
     from cleargs.capture.tables import load_frames
     from cleargs.splat.config import budget_from_pixels
@@ -80,11 +86,13 @@ def decide_work(config: Config, ingest: Path, steps: int | None) -> EqualWork:
     )
 
 
-def split(own: Steps, stage: str, total: int) -> Steps:
-    """``total`` steps in the proportions of ``own``; what a variant lacks goes to the stages that it has.
+def split_steps(own: Steps, stage: str, total: int) -> Steps:
+    """Split ``total`` steps between the stages up to ``stage`` in the proportions of ``own``.
 
-    Rounding goes to G0. Every training that is there keeps at least one step: raises ConfigError where there
-    are not enough.
+    Steps of later stages go to the stages that run, and rounding errors to G0.
+
+    Raises:
+        ConfigError: A training would get no step.
     """
     if stage == "g0":
         return Steps(total, 0, 0, 0)
@@ -94,7 +102,7 @@ def split(own: Steps, stage: str, total: int) -> Steps:
     left = total - own.rounds * round_ - consolidate
     if left < 1:
         raise ConfigError(
-            f"{total} steps are too few for {own.rounds} rounds", hint="give more --steps, or fewer rounds"
+            f"{total} steps are too few for {own.rounds} rounds", hint="increase --steps or reduce the rounds"
         )
     return Steps(left, round_, own.rounds, consolidate)
 
@@ -107,10 +115,21 @@ def variant_config(
     seed: int,
     work: EqualWork | None = None,
 ) -> Config:
-    """The configuration of a variant; with ``work`` equal to that of all others.
+    """Return the configuration of a variant.
 
-    A recipe of the variant's own decides all stages but the ingest, so that all variants see the same images
-    at the same poses. Raises ConfigError.
+    A variant with its own recipe still uses the ingest settings of ``recipe``, so that all variants see the
+    same images at the same poses.
+
+    Args:
+        dag: The stages.
+        variant: The variant.
+        recipe: Name or file of the comparison's recipe.
+        overrides: Settings for all variants, in the form of ``--set``.
+        seed: Seed of the run.
+        work: Work that all variants share; None to keep the settings of the recipe.
+
+    Raises:
+        ConfigError: A recipe or setting is invalid.
     """
     document = read_recipe(recipe if variant.workflow is None else variant.workflow)
     if variant.workflow is not None:
@@ -128,9 +147,9 @@ def variant_config(
 
 
 def _settings(plain: Config, variant: Variant, work: EqualWork) -> list[str]:
-    """What equal work changes; schedules run by share of the steps."""
+    """Return the settings that give ``variant`` equal work; schedules depend on shares of the steps."""
     own = steps_of(plain, work.frames)
-    spent = split(own, variant.stage, work.steps)
+    spent = split_steps(own, variant.stage, work.steps)
     lines = [f"g0.sh_degree={work.sh_degree}", f"g0.budget={work.budget}"]
     done = 0
     for name, steps, trainings in (

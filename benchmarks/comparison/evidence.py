@@ -1,7 +1,7 @@
-"""The evidence for the method: what is compared on which captures, and how all of it is made.
+"""Make the captures, scenes and comparisons that support the page of results.
 
-``evidence.toml`` lists the frozen test set and the sections of the page. Every section is a comparison like
-those of ``compare``, in one folder with one store, so that a killed call resumes where it stopped.
+``evidence.toml`` lists the fixed test set and the sections of the page. Every section is a comparison like
+those of ``compare``. All sections share one folder and one store, so that an interrupted call can be resumed.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from benchmarks.comparison.equal_work import steps_of, variant_config
-from benchmarks.comparison.findings import Compared, compare_scenes
+from benchmarks.comparison.findings import Comparison, compare_scenes
 from benchmarks.comparison.scenes import Sample, SceneRecipe, make_scenes
-from benchmarks.comparison.splat_world import scene_setting
+from benchmarks.comparison.splat_world import scene_setup
 from benchmarks.comparison.variants import find_variants
 from cleargs.base_model import FrozenModel
 from cleargs.errors import CleargsError, ConfigError, InputError
@@ -41,15 +41,15 @@ WORLD_SETTINGS = (
     "g0.budget=100000",
     "ingest.max_frames=60",
 )
-"""How a scene is trained that becomes a world: on every frame, and to the end."""
+"""Settings of a scene that serves as a world: it trains on every frame and runs the full schedule."""
 
 Seed = Annotated[int, Field(ge=0)]
 
 
 class TestSet(FrozenModel):
-    """What no default may be chosen on."""
+    """Captures on which no default may be chosen."""
 
-    __test__ = False  # no test of pytest's
+    __test__ = False  # pytest must not collect it
 
     rooms: tuple[Seed, ...]
     protocols: tuple[str, ...]
@@ -58,32 +58,33 @@ class TestSet(FrozenModel):
 
 
 class TuningSet(FrozenModel):
-    """What defaults may be chosen on."""
+    """Captures on which defaults may be chosen."""
 
     rooms_below: int = Field(ge=1)
+    """Rooms with a smaller seed belong to the tuning set."""
 
 
 class Section(FrozenModel):
-    """One comparison of the page."""
+    """A section of the page: one comparison."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*$")
     title: str
     kind: Literal["rooms", "world", "video"]
     captures: tuple[str, ...] = ()
-    """Real captures below the folder of captures: the worlds, or the videos."""
+    """Names of real captures in the folder of captures: the worlds or the videos."""
     protocols: tuple[str, ...] = ()
     seeds: tuple[Seed, ...] = Field(min_length=1)
     frames: int = Field(ge=2)
     size: tuple[int, int]
-    """Width and height; of a video the larger is the limit of its long side."""
+    """Width and height in px; for a video, the larger one limits the longer side."""
     steps: int = Field(ge=1)
     factors: tuple[int, ...] = (1,)
-    """Multiples of ``steps``: a column each, where there are several."""
+    """Multiples of ``steps``; with several, each gets its own columns."""
     variants: tuple[str, ...]
     settings: tuple[str, ...] = ()
     align_colour: bool = False
-    """Judge each image after the affine on sRGB that fits it to its reference best: of what other sections
-    judge as it is, so none of it counts again in the page's summary."""
+    """Fit the colours of each image to its reference (affine in sRGB) before measuring it. Such a section
+    evaluates scenes of other sections again, so the summary of the page excludes it."""
 
 
 class Evidence(FrozenModel):
@@ -95,9 +96,9 @@ class Evidence(FrozenModel):
     full: tuple[Section, ...]
 
     @model_validator(mode="after")
-    def _sections_take_the_test_set(self) -> Evidence:
+    def _sections_use_the_test_set(self) -> Evidence:
         if min(self.test.rooms) < self.tuning.rooms_below:
-            raise ValueError("a room of the test set belongs to the tuning set")
+            raise ValueError("a room of the test set is in the tuning set")
         for section in (*self.quick, *self.full):
             known = set(self.test.worlds if section.kind == "world" else self.test.videos)
             foreign = [
@@ -112,28 +113,28 @@ class Evidence(FrozenModel):
 
 @dataclass(frozen=True)
 class CaptureEntry:
-    """A capture of a section, or why it cannot be made."""
+    """A capture of a section, or the reason why it is missing."""
 
     name: str
-    """As the page calls it."""
+    """Name on the page."""
     samples: tuple[Sample, ...] = ()
     missing: str = ""
 
 
 @dataclass(frozen=True)
 class SectionOutcome:
-    """What became of a section."""
+    """Result of a section."""
 
     section: Section
-    compared: Compared | None
-    """None where nothing of it could be made."""
+    compared: Comparison | None
+    """None if no scene could be made."""
     missing: tuple[str, ...]
-    """What could not be made, and why, a line each."""
+    """Names of missing captures and scenes with the reason, one per line."""
 
 
 @dataclass(frozen=True)
 class EvidenceContext:
-    """Where evidence is made, and with what."""
+    """Folders and tools for making evidence."""
 
     out: Path
     captures: Path | None
@@ -144,7 +145,7 @@ class EvidenceContext:
 
 
 def read_evidence(path: Path | None = None) -> Evidence:
-    """Return the lists of ``path``; for None those next to this module. Raises ConfigError where unusable."""
+    """Read a list of evidence, by default ``evidence.toml``; raise ConfigError if it is invalid."""
     hint = "compare it with benchmarks/comparison/evidence.toml"
     try:
         text = read_text(path or Path(__file__).with_name("evidence.toml"))
@@ -158,7 +159,7 @@ def read_evidence(path: Path | None = None) -> Evidence:
 
 
 def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
-    """Make the captures of a section, all of its scenes, and judge them."""
+    """Make the captures and scenes of a section and evaluate the scenes."""
     missing: list[str] = []
     samples: list[Sample] = []
     for capture in _captures(section, context):
@@ -166,7 +167,7 @@ def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
             context.reporter.warn(f"{section.title}, {capture.name}: {capture.missing}")
             missing.append(f"{capture.name}: {capture.missing}")
         samples += capture.samples
-    found = Compared()
+    found = Comparison()
     for factor in section.factors if samples else ():
         recipe = replace(
             context.recipe,
@@ -186,25 +187,26 @@ def make_section(section: Section, context: EvidenceContext) -> SectionOutcome:
     return SectionOutcome(section, found if found.cells else None, (*missing, *found.failures))
 
 
-def minutes(sections: Iterable[Section], context: EvidenceContext) -> list[float]:
-    """Rough time of each section on two quiet cores, everything still to be made; what a section before it
-    has made takes no time.
-    """
-    made: set[object] = set()
+def estimate_minutes(sections: Iterable[Section], context: EvidenceContext) -> list[float]:
+    """Estimate the minutes of each section on two idle cores, from an empty folder.
 
-    def first(*what: object) -> bool:
-        known = what in made
-        made.add(what)
+    Work that an earlier section has done is not counted again.
+    """
+    done: set[object] = set()
+
+    def is_new(*work: object) -> bool:
+        known = work in done
+        done.add(work)
         return not known
 
-    return [_seconds(section, context, first) / 60 for section in sections]
+    return [_seconds(section, context, is_new) / 60 for section in sections]
 
 
-def _seconds(section: Section, context: EvidenceContext, first: Callable[..., bool]) -> float:
+def _seconds(section: Section, context: EvidenceContext, is_new: Callable[..., bool]) -> float:
     megapixels = section.size[0] * section.size[1] / 1e6
     variants = []
     for variant in find_variants(section.variants):
-        with suppress(ConfigError):  # its recipe is not there: it takes no time
+        with suppress(ConfigError):  # a variant without its recipe takes no time
             config = variant_config(context.recipe.dag, variant, context.recipe.workflow, section.settings, 0)
             g0: Any = config.sections["g0"]
             variants.append((variant, steps_of(config, section.frames), g0))
@@ -212,45 +214,45 @@ def _seconds(section: Section, context: EvidenceContext, first: Callable[..., bo
     columns = product(section.protocols or [""], section.captures or [""], section.seeds)
     for protocol, capture, seed in columns:
         sample = (protocol, capture, seed, section.frames, section.size, section.settings)
-        seconds += _SAMPLE_S if first(sample) else 0.0
+        seconds += _SAMPLE_S if is_new(sample) else 0.0
         for factor, (variant, own, g0) in product(section.factors, variants):
             total = section.steps * factor
-            if not first(sample, total, variant.name):
+            if not is_new(sample, total, variant.name):
                 continue
             whole = g0.model_copy(update={"steps": total})
             training, _ = training_cost(whole, section.frames, megapixels, g0.min_points)
             if variant.stage != "g0":
-                # Those that differ in RIVR alone share the first scene.
+                # Variants that differ only in RIVR share the first scene.
                 scene = (
                     variant.workflow,
                     tuple(line for line in variant.overrides if line.startswith(("rva", "g0"))),
                 )
-                training *= 1.0 if first(sample, total, scene) else 1.0 - own.g0 / own.total
+                training *= 1.0 if is_new(sample, total, scene) else 1.0 - own.g0 / own.total
                 seconds += section.frames * own.rounds * (_REPAIR_S + _REPAIR_S_PER_MP * megapixels)
-            seconds += training + section.frames * (_JUDGE_S + _JUDGE_S_PER_MP * megapixels)
+            seconds += training + section.frames * (_EVALUATION_S + _EVALUATION_S_PER_MP * megapixels)
     return seconds
 
 
-# Wall seconds on two quiet cores: a part a unit and a part a megapixel. A judged frame, views off the path
-# included: nearly all of it LPIPS with VGG. A repair: as RIVR estimates. A sample: its capture, poses and
-# cues.
-_JUDGE_S, _JUDGE_S_PER_MP = 0.05, 10.0
+# Measured wall seconds on two idle cores. An evaluated frame includes its share of novel views; LPIPS with
+# VGG takes most of that time. The repair times are those of RIVR's estimate. A sample includes its capture,
+# poses and cues.
+_EVALUATION_S, _EVALUATION_S_PER_MP = 0.05, 10.0
 _REPAIR_S, _REPAIR_S_PER_MP = 0.3, 5.0
 _SAMPLE_S = 8.0
 
 
 def _settings(section: Section) -> tuple[str, ...]:
-    """What holds for all variants of a section."""
+    """Return the settings that all variants of a section share."""
     limits = (f"ingest.max_frames={section.frames}", f"ingest.max_size={max(section.size)}")
     return (*(limits if section.kind == "video" else ()), *section.settings)
 
 
 def _captures(section: Section, context: EvidenceContext) -> Iterator[CaptureEntry]:
-    """The captures of a section as soon as they are there."""
+    """Yield each capture of a section as soon as it is ready."""
     if section.kind == "video":
         for name in section.captures:
             try:
-                place = _real(name, context)
+                place = _real_capture(name, context)
             except CleargsError as error:
                 yield CaptureEntry(name, missing=str(error))
             else:
@@ -262,7 +264,8 @@ def _captures(section: Section, context: EvidenceContext) -> Iterator[CaptureEnt
             try:
                 scene = None if world is None else _world(world, context)
                 places = [
-                    _synthetic(section, protocol, seed, world, scene, context) for seed in section.seeds
+                    _synthetic_capture(section, protocol, seed, world, scene, context)
+                    for seed in section.seeds
                 ]
             except CleargsError as error:
                 yield CaptureEntry(label, missing=str(error))
@@ -271,15 +274,15 @@ def _captures(section: Section, context: EvidenceContext) -> Iterator[CaptureEnt
                 yield CaptureEntry(label, tuple(Sample(place, seed, None) for place, seed in pairs))
 
 
-def _real(name: str, context: EvidenceContext) -> Path:
+def _real_capture(name: str, context: EvidenceContext) -> Path:
     if context.captures is None:
-        raise InputError("it is a real capture, and --captures was not given", hint="give --captures DIR")
+        raise InputError("this real capture needs --captures", hint="give --captures DIR")
     if not (context.captures / name).exists():
-        raise InputError(f"the folder of --captures holds no {name}", hint="put it there")
+        raise InputError(f"the folder of --captures has no {name}", hint="copy the capture into that folder")
     return context.captures / name
 
 
-def _synthetic(
+def _synthetic_capture(
     section: Section,
     protocol: str,
     seed: int,
@@ -287,43 +290,42 @@ def _synthetic(
     scene: Path | None,
     context: EvidenceContext,
 ) -> Path:
-    """The folder of a synthetic capture, made where it is not there yet."""
+    """Return the folder of a synthetic capture; make the capture if it does not exist."""
     width, height = section.size
     parts = [protocol, *([] if world is None else [world]), f"{section.frames}x{width}x{height}", str(seed)]
     place = context.out / "captures" / "-".join(parts)
     if not place.is_dir():
-        beside = place.with_name(
-            f".{os.getpid()}-{place.name}"
-        )  # a killed maker leaves nothing that looks done
-        shutil.rmtree(beside, ignore_errors=True)
+        # An interrupted call must not leave a folder that looks complete.
+        partial = place.with_name(f".{os.getpid()}-{place.name}")
+        shutil.rmtree(partial, ignore_errors=True)
         make_capture(
-            beside,
+            partial,
             protocol,
             frames=section.frames,
             width=width,
             height=height,
             seed=seed,
             reporter=context.reporter,
-            setting=None if scene is None else scene_setting(scene, None, section.frames, width, height),
+            setting=None if scene is None else scene_setup(scene, None, section.frames, width, height),
         )
-        beside.rename(place)
+        partial.rename(place)
     return place
 
 
 def _world(name: str, context: EvidenceContext) -> Path:
-    """The scene of a real capture, trained on every frame where it is not there yet."""
+    """Return the scene of a real capture; train it on every frame if it does not exist."""
     recipe, folder = context.recipe, context.out / "worlds" / name
     config = load_config(recipe.dag, recipe.workflow, WORLD_SETTINGS)
-    run = RunSpec(folder, _real(name, context).absolute(), config, context.store.root, recipe.device)
+    run = RunSpec(folder, _real_capture(name, context).absolute(), config, context.store.root, recipe.device)
     Runner(recipe.dag, run, context.store, recipe.threads, context.reporter).run_until("g0")
     return folder / "g0" / "scene.ply"
 
 
 def chosen_sections(evidence: Evidence, *, quick: bool, names: Sequence[str]) -> tuple[Section, ...]:
-    """The sections to make. Raises InputError for an unknown name."""
+    """Return the sections with these names, or all without names; raise InputError for an unknown name."""
     sections = evidence.quick if quick else evidence.full
     known = [section.name for section in sections]
     for name in names:
         if name not in known:
-            raise InputError(f"there is no section {name!r}", hint=f"choose among {', '.join(known)}")
+            raise InputError(f"no section is called {name!r}", hint=f"choose among {', '.join(known)}")
     return tuple(section for section in sections if not names or section.name in names)

@@ -1,4 +1,4 @@
-"""``evidence``: the page of results, from one command."""
+"""``evidence``: make the page of results."""
 
 from __future__ import annotations
 
@@ -24,31 +24,33 @@ RECIPE = "default"
 @click.command(
     epilog="""\b
 Examples:
-  python -m benchmarks evidence -o evidence --quick                          a rough page, evidence/results.md
+  python -m benchmarks evidence -o evidence --quick                          a quick page, evidence/results.md
   python -m benchmarks evidence -o evidence --captures data --page docs/results.md
-  python -m benchmarks evidence -o evidence --quick --section mixed          one section alone
+  python -m benchmarks evidence -o evidence --quick --section mixed          only one section
 """
 )
-@output_option("Folder of captures, runs and tables; resumes if it exists.", "out")
-@click.option("--quick", is_flag=True, help="A rough page: fewer, smaller captures and short trainings.")
+@output_option("Folder for captures, runs and tables; resumes if it exists.", "out")
+@click.option("--quick", is_flag=True, help="Make a quick page: fewer and smaller captures, short trainings.")
 @click.option(
     "--captures",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Folder of the real captures, by their names in the list; without it the page calls them missing.",
+    help="Folder with the real captures, named as in the list. Without it, the page lists them as missing.",
 )
 @click.option(
     "--page",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Where the page goes; pictures lie in results/ beside it.  [default: OUT/results.md]",
+    help="File of the page; pictures go to results/ next to it.  [default: OUT/results.md]",
 )
-@click.option("--section", "sections", multiple=True, metavar="NAME", help="Only this section (repeatable).")
+@click.option(
+    "--section", "sections", multiple=True, metavar="NAME", help="Make only this section; may be repeated."
+)
 @click.option(
     "--list",
     "listed",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Another list of evidence (TOML) than the one that is frozen.",
+    help="List of evidence (TOML) to use instead of the fixed one.",
 )
-@click.option("--dry-run", is_flag=True, help="Print the plan and make nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the plan and stop.")
 @work_options
 @quiet_option
 @click.pass_obj
@@ -67,15 +69,14 @@ def evidence(
 ) -> int:
     """Make the captures, scenes, tables and pictures of the page of results.
 
-    What is compared is listed in one frozen file, on whose captures no default is chosen. The same command
-    resumes where it stopped. What cannot be made (a missing capture, say) is named on the page with
-    the reason.
+    A fixed file lists the captures and variants. No default was chosen on these captures. Repeat the command
+    to resume it. The page names missing results with the reason, for example a missing capture.
     """
     from benchmarks.comparison.evidence import (
         EvidenceContext,
         chosen_sections,
+        estimate_minutes,
         make_section,
-        minutes,
         read_evidence,
     )
     from benchmarks.comparison.origin import version_of_source
@@ -88,37 +89,37 @@ def evidence(
     chosen = chosen_sections(lists, quick=quick, names=sections)
     out = out.absolute()
     page = (page or out / "results.md").absolute()
-    beside = page.parent / "results"
+    results = page.parent / "results"
     reporter = make_reporter(quiet)
     options = EvalOptions(lpips=LPIPS_NETS, scorers=INSTALLABLE)
     recipe = SceneRecipe(dag, RECIPE, (), resolve_device(device, reporter.info), threads, options)
     command = _command(quick=quick, captures=captures is not None, listed=listed is not None)
     origin = Origin(command, recipe.workflow, quick, chosen_sections(lists, quick=quick, names=()))
     version, machine = version_of_source(), f"{recipe.device}, threads: {recipe.threads}"
-    whole = True
+    complete = True
     with opened_store(out / STORE_FOLDER) as store:
         context = EvidenceContext(out, captures.absolute() if captures else None, recipe, store, reporter)
-        plan = list(zip(chosen, minutes(chosen, context), strict=True))
+        plan = list(zip(chosen, estimate_minutes(chosen, context), strict=True))
         for section, cost in plan:
             click.echo(f"{section.name:12} {cost:6.1f} min  {section.title}")
-        click.echo(f"{'in all':12} {sum(cost for _, cost in plan):6.1f} min  on two quiet cores")
+        click.echo(f"{'total':12} {sum(cost for _, cost in plan):6.1f} min  on two idle cores")
         if dry_run:
             return 0
         for section, _ in plan:
             started = time.monotonic()
             found = make_section(section, context)
             reporter.info(f"section {section.name}: {(time.monotonic() - started) / 60:.1f} min")
-            _write_pictures(found, context, beside)
-            save_section(beside, found, version, machine)
-            kept = read_sections(beside, origin.sections, reporter)
+            _write_pictures(found, context, results)
+            save_section(results, found, version, machine)
+            kept = read_sections(results, origin.sections, reporter)
             write_bytes(page, results_page(kept, origin).encode())
-            whole = whole and not found.missing
+            complete = complete and not found.missing
     click.echo(f"written: {page}")
-    return 0 if whole else DONE_IN_PART
+    return 0 if complete else DONE_IN_PART
 
 
 def _command(*, quick: bool, captures: bool, listed: bool) -> str:
-    """The command as a reader would type it: with words for the folders."""
+    """Return the command with placeholders for folders and files."""
     words = [
         "python -m benchmarks evidence -o OUT",
         "--quick" * quick,

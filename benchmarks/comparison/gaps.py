@@ -1,4 +1,4 @@
-"""Where one variant of a comparison is behind another."""
+"""Find the cells in which one variant of a comparison is worse than another."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from benchmarks.comparison.cells import Cells, Spread, ViewSet
 from benchmarks.comparison.tables import COMPARED, NAMES, Bold, Table, difference_text
 from cleargs.evaluate.eval_report import LOWER_IS_BETTER
 
-VERDICTS = ("sure", "one sample", "none")
-"""Whether a difference is one: its 95 % interval does not hold 0, there is no interval, or it holds 0."""
+VERDICTS = ("significant", "one sample", "none")
+"""Significance of a difference: its 95 % interval excludes 0, there is no interval, or it includes 0."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """How far a variant is from another in one cell: ``difference`` is its value minus the other's."""
+    """Difference between two variants in one cell: value of the variant minus that of ``against``."""
 
     views: ViewSet
     column: str
@@ -28,11 +28,11 @@ class Gap:
         """One of `VERDICTS`."""
         if self.difference.half_width is None:
             return "one sample"
-        return "sure" if self.difference.is_sure else "none"
+        return "significant" if self.difference.excludes_zero else "none"
 
 
 def compared_with(cells: Cells, variant: str) -> Iterator[Gap]:
-    """``variant`` against every other, in every column and each of `COMPARED`."""
+    """Compare ``variant`` with every other one, in every column and metric of `COMPARED`."""
     for views in cells.view_sets():
         for column in cells.columns(views):
             for other in cells.variants():
@@ -43,23 +43,28 @@ def compared_with(cells: Cells, variant: str) -> Iterator[Gap]:
 
 
 def losses_of(cells: Cells, variant: str) -> list[Gap]:
-    """The cells in which ``variant`` is behind, those that are sure first."""
-    found = [loss for loss in compared_with(cells, variant) if is_behind(loss.difference, loss.metric)]
+    """Return the cells in which ``variant`` is worse, significant differences first."""
+    found = [loss for loss in compared_with(cells, variant) if is_worse(loss.difference, loss.metric)]
     return sorted(found, key=lambda loss: VERDICTS.index(loss.verdict))
 
 
-def is_behind(difference: Spread, metric: str) -> bool:
-    """Whether a difference is for the worse."""
+def is_worse(difference: Spread, metric: str) -> bool:
+    """Return True if the mean difference means a worse metric."""
     return difference.mean > 0 if metric in LOWER_IS_BETTER else difference.mean < 0
 
 
 def losses_table(places: Sequence[str], found: Iterable[tuple[tuple[str, ...], Gap]]) -> Table:
-    """A row a place, a column a metric; sure losses in bold. ``places``: head of the columns of a place."""
+    """Return a table of losses with one column per metric; significant losses are bold.
+
+    Args:
+        places: Headings of the columns that name the place of a loss.
+        found: Losses with the texts of these columns. Losses of one place share a row.
+    """
     rows: dict[tuple[str, ...], list[str]] = {}
     for place, loss in found:
         text = difference_text(loss.difference, None, loss.metric)
         row = rows.setdefault(place, [""] * len(COMPARED))
-        row[COMPARED.index(loss.metric)] = Bold(text) if loss.verdict == "sure" else text
+        row[COMPARED.index(loss.metric)] = Bold(text) if loss.verdict == "significant" else text
     return Table(
         [*places, *(NAMES[metric] for metric in COMPARED)], [[*place, *row] for place, row in rows.items()]
     )

@@ -1,4 +1,4 @@
-"""Which version of the source made a page."""
+"""Version of the source that made a page."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _DIGITS = 12
 
 
 def version_of_source() -> str:
-    """The package's version, what git says of its checkout where it is one, and a digest of the source."""
-    described = _described(Path(str(files("cleargs"))).parent)
+    """Return the package's version, the description by git in a checkout, and a digest of the source."""
+    described = _git_describe(Path(str(files("cleargs"))).parent)
     parts = [cleargs.__version__, *([described] if described else []), f"source {_digest()}"]
     return ", ".join(parts)
 
 
-def _described(checkout: Path) -> str | None:
-    """``git describe`` of a checkout; None where there is none, or no git."""
-    if not (checkout / ".git").exists():  # an installed package must not speak for a repository around it
+def _git_describe(checkout: Path) -> str | None:
+    """Return ``git describe`` of a checkout; None without a checkout or without git."""
+    if not (checkout / ".git").exists():  # an installed package may be inside another repository
         return None
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--tags"]
     try:
@@ -32,7 +32,7 @@ def _described(checkout: Path) -> str | None:
 
 
 def _digest() -> str:
-    """Over the paths and contents of all source files and lists of the package, its stages and recipes."""
+    """Return a digest of the paths and contents of all source and TOML files: package, stages and recipes."""
     digest = hashlib.sha256()
     for package in ("cleargs", "cleargs.stages", "cleargs.workflows"):
         folder = Path(str(files(package)))

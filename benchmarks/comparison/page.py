@@ -1,4 +1,4 @@
-"""``OUT/report/index.html``: a comparison as a page, what is behind first, then the variants side by side."""
+"""Write ``OUT/report/index.html``: losses of the whole method, then pictures and tables of all variants."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet
-from benchmarks.comparison.findings import Compared
+from benchmarks.comparison.findings import Comparison
 from benchmarks.comparison.gaps import compared_with, losses_of, losses_table
-from benchmarks.comparison.scenes import Made, view_sets
+from benchmarks.comparison.scenes import FinishedScene, view_sets
 from benchmarks.comparison.tables import (
     NAMES,
     TITLES,
@@ -21,9 +21,9 @@ from benchmarks.comparison.tables import (
     Table,
     choices_table,
     difference_table,
+    format_value,
     metric_title,
     note_on,
-    number,
     roles_table,
     value_text,
     work_table,
@@ -39,12 +39,12 @@ from cleargs.report.frames import ImageFile, side_of, write_jpeg
 from cleargs.report.page import page_environment, write_page
 from cleargs.report.report_json import page_of
 
-POSES = 3
-"""Poses shown of a capture and set of views, evenly along their order."""
-PICTURES = 1500
-"""Of more, fewer poses are shown, but one of each set of views."""
-BYTES = 20_000_000
-"""About how much all pictures together may take."""
+MAX_POSES = 3
+"""Maximum number of poses per capture and set of views; they are spaced evenly."""
+MAX_PICTURES = 1500
+"""Maximum number of pictures: above it, fewer poses are shown, but at least one per set of views."""
+MAX_BYTES = 20_000_000
+"""Approximate limit for the size of all pictures together."""
 
 REFERENCE, FILMED = "reference", "filmed"
 _FOLDER = "poses"
@@ -53,36 +53,52 @@ _SHOWN_METRICS = ("psnr", "lpips_vgg", "lpips_alex")
 
 @dataclass(frozen=True)
 class PageView:
-    """One place from which a capture's scenes are shown."""
+    """A pose from which the scenes of a capture are shown."""
 
     number: int
     views: ViewSet
     name: str
     size: tuple[int, int]
     pictures: Mapping[str, ImageFile]
-    """Layer -> picture: `REFERENCE`, `FILMED` where a frame was filmed there, then the variants' renders."""
+    """Layer -> picture: `REFERENCE`, `FILMED` if a frame was filmed there, then the variants' renders."""
     notes: Mapping[str, str]
-    """Layer of a render -> its figures in short."""
+    """Layer of a render -> its main figures."""
     figures: Sequence[tuple[str, Sequence[tuple[str, str]]]]
-    """Title of a metric, and the value of every variant by its label."""
+    """Title of each metric, with (label, value) of each variant."""
 
 
 @dataclass
 class CaptureResults:
-    """One column of the tables: what its scenes are worth on each set of views, and what they look like."""
+    """Tables and pictures of the scenes in one column."""
 
     name: str
     tables: list[tuple[ViewSet, str, str, Table]] = field(default_factory=list)
-    """Set of views, its title, what to know of it, values by variant and metric."""
+    """Set of views, its title, a note on it, and values by variant and metric."""
     poses: list[PageView] = field(default_factory=list)
 
 
 def write_comparison(
-    out: Path, compared: Compared, baselines: Sequence[str], made_with: Sequence[str], warnings: Sequence[str]
+    out: Path,
+    compared: Comparison,
+    baselines: Sequence[str],
+    made_with: Sequence[str],
+    warnings: Sequence[str],
 ) -> Path:
-    """Write the report of the comparison in ``out``, in place of an older one; returns its page.
+    """Write the report of a comparison; it replaces an older one.
 
-    Raises StoreError when it cannot be written, InputError or StoreError when a result cannot be read.
+    Args:
+        out: Folder of the comparison.
+        compared: Its results.
+        baselines: Variants that are subtracted from the others in tables of differences.
+        made_with: Lines on settings and versions.
+        warnings: Lines that are shown first.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        StoreError: The report cannot be written, or a result cannot be read.
+        InputError: A reference or capture cannot be read.
     """
     cells, labels = compared.results.cells, compared.labels
     layers = {name: f"v{place}" for place, name in enumerate(cells.variants())}
@@ -100,7 +116,7 @@ def write_comparison(
             layer_names=_layer_names(layers, labels),
             warnings=[*warnings, *compared.failures],
             samples=max(Counter(column for column, _ in samples).values()),
-            **_against(cells, labels, subject),
+            **_subject_facts(cells, labels, subject),
             differences=[
                 (TITLES[views], labels[baseline], difference_table(cells, labels, views, baseline))
                 for views in cells.view_sets()
@@ -118,7 +134,7 @@ def write_comparison(
 
 
 def _environment() -> Environment:
-    """Return the templates of the report, and the one of this page."""
+    """Return the templates of the report and of this page."""
     environment = page_environment()
     assert environment.loader is not None
     environment.loader = ChoiceLoader([FileSystemLoader(Path(__file__).parent), environment.loader])
@@ -126,8 +142,8 @@ def _environment() -> Environment:
     return environment
 
 
-def _against(cells: Cells, labels: Mapping[str, str], subject: str) -> dict[str, Any]:
-    """The subject beside the others, in figures and words."""
+def _subject_facts(cells: Cells, labels: Mapping[str, str], subject: str) -> dict[str, Any]:
+    """Return template values on the subject's losses against the other variants."""
     found = losses_of(cells, subject)
     places = [((loss.column, TITLES[loss.views].split(",")[0], labels[loss.against]), loss) for loss in found]
     return {
@@ -135,12 +151,12 @@ def _against(cells: Cells, labels: Mapping[str, str], subject: str) -> dict[str,
         "pairs": sum(1 for _ in compared_with(cells, subject)),
         "behind": len(found),
         "verdicts": Counter(loss.verdict for loss in found),
-        "losses": losses_table(("capture", "views", "behind"), places),
+        "losses": losses_table(("capture", "views", "worse than"), places),
     }
 
 
 def _equal_work(cells: Cells) -> bool:
-    """Whether all variants of a sample had as many steps and the same SH degree."""
+    """Return True if all variants of a sample have equal steps and SH degree."""
     given = {(cell.sample, cell.steps, cell.sh_degree) for cell in cells.cells}
     return len(given) == len({sample for sample, _, _ in given})
 
@@ -149,33 +165,35 @@ def _equal_work(cells: Cells) -> bool:
 
 
 @dataclass(frozen=True)
-class _Shot:
-    """A pose before its pictures are written."""
+class _PoseInput:
+    """A pose and the images to show there."""
 
     views: ViewSet
     view: ReferenceView
     filmed: Path | None
     renders: Sequence[tuple[str, Cell, Evaluation]]
-    """Layer, cell and figures of every variant."""
+    """Layer, cell and evaluation of each variant."""
 
 
-def _captures(out: Path, folder: Path, compared: Compared, layers: Mapping[str, str]) -> list[CaptureResults]:
+def _captures(
+    out: Path, folder: Path, compared: Comparison, layers: Mapping[str, str]
+) -> list[CaptureResults]:
     cells, labels = compared.results.cells, compared.labels
     columns = list(dict.fromkeys(cell.column for cell in cells.cells))
     sets = len({(cell.column, cell.views) for cell in cells.cells})
-    poses = max(1, min(POSES, PICTURES // (sets * (len(layers) + 2))))
-    shots = {column: list(_shots(out, compared, column, layers, poses)) for column in columns}
-    pictures = sum(2 + len(shot.renders) for found in shots.values() for shot in found)
+    poses = max(1, min(MAX_POSES, MAX_PICTURES // (sets * (len(layers) + 2))))
+    inputs = {column: list(_pose_inputs(out, compared, column, layers, poses)) for column in columns}
+    pictures = sum(2 + len(pose.renders) for found in inputs.values() for pose in found)
     (folder / _FOLDER).mkdir()
     captures, numbers = [], 0
-    for column, found in shots.items():
+    for column, found in inputs.items():
         capture = CaptureResults(column)
         for views in cells.view_sets():
             if column in cells.columns(views):
                 values = _values(cells, labels, views, column)
                 capture.tables.append((views, TITLES[views], note_on(cells, views), values))
-        for shot in found:
-            capture.poses.append(_pose(shot, numbers, pictures, out, folder, labels))
+        for pose in found:
+            capture.poses.append(_write_pose(pose, numbers, pictures, out, folder, labels))
             numbers += 1
         captures.append(capture)
     return captures
@@ -191,15 +209,15 @@ def _values(cells: Cells, labels: Mapping[str, str], views: ViewSet, column: str
     return Table(["", *map(metric_title, metrics)], rows)
 
 
-def _shots(
-    out: Path, compared: Compared, column: str, layers: Mapping[str, str], poses: int
-) -> Iterator[_Shot]:
-    """Some poses of the first capture of a column."""
+def _pose_inputs(
+    out: Path, compared: Comparison, column: str, layers: Mapping[str, str], poses: int
+) -> Iterator[_PoseInput]:
+    """Yield poses of the first capture of a column."""
     scenes = [scene for scene in compared.scenes if scene.sample.column == column]
     first = scenes[0]
     samples = {scene.sample.name for scene in scenes if scene.sample.capture == first.sample.capture}
     for found in view_sets(first):
-        if found.views == "given":  # nearly the pictures of the true poses
+        if found.views == "given":  # its pictures almost equal those of the true poses
             continue
         own: dict[str, Cell] = {}
         for cell in compared.cells:
@@ -210,50 +228,50 @@ def _shots(
             first.run, found.directory, poses=found.poses, align=found.align, reporter=SilentReporter()
         )
         filmed = _filmed(first) if found.views == "observed" else {}
-        for view in _evenly(reference.views, poses):
-            yield _Shot(found.views, view, filmed.get(view.name), renders)
+        for view in _evenly_spaced(reference.views, poses):
+            yield _PoseInput(found.views, view, filmed.get(view.name), renders)
 
 
 def _evaluation(out: Path, cell: Cell) -> Evaluation:
     return Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
 
 
-def _filmed(scene: Made) -> dict[str, Path]:
-    """Stem -> image of the frames that were filmed."""
+def _filmed(scene: FinishedScene) -> dict[str, Path]:
+    """Return the image of each filmed frame by its stem."""
     ingest = scene.run / "ingest"
     return {stem_of(frame.name): ingest / frame.image for frame in load_frames(ingest)}
 
 
-def _evenly(views: Sequence[ReferenceView], wanted: int) -> list[ReferenceView]:
+def _evenly_spaced(views: Sequence[ReferenceView], wanted: int) -> list[ReferenceView]:
     wanted = min(wanted, len(views))
     return [views[(2 * place + 1) * len(views) // (2 * wanted)] for place in range(wanted)]
 
 
-def _pose(
-    shot: _Shot, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]
+def _write_pose(
+    pose: _PoseInput, place: int, pictures: int, out: Path, folder: Path, labels: Mapping[str, str]
 ) -> PageView:
-    """Write the pictures of a pose."""
-    reference = shot.view.load()[0]
+    """Write the pictures of a pose; the page has at most ``pictures`` pictures."""
+    reference = pose.view.load()[0]
     height, width = reference.shape[:2]
-    side = side_of(pictures, height / width, BYTES)
+    side = side_of(pictures, height / width, MAX_BYTES)
     images = {REFERENCE: reference}
-    if shot.filmed is not None:
-        images[FILMED] = read_rgb(shot.filmed)
+    if pose.filmed is not None:
+        images[FILMED] = read_rgb(pose.filmed)
     notes: dict[str, str] = {}
     figures: dict[str, list[tuple[str, str]]] = {}
-    for layer, cell, evaluation in shot.renders:
-        image = next((image for image in evaluation.images if image.name == shot.view.name), None)
+    for layer, cell, evaluation in pose.renders:
+        image = next((image for image in evaluation.images if image.name == pose.view.name), None)
         if image is None:  # runs whose references differ
             continue
-        images[layer] = read_rgb(out / cell.evaluation / f"{shot.view.name}.png")
+        images[layer] = read_rgb(out / cell.evaluation / f"{pose.view.name}.png")
         notes[layer] = _note(image.values)
         for metric, value in image.values.items():
             if value is not None:
-                figures.setdefault(metric, []).append((labels[cell.variant], number(value, metric)))
+                figures.setdefault(metric, []).append((labels[cell.variant], format_value(value, metric)))
     return PageView(
         place,
-        shot.views,
-        shot.view.name,
+        pose.views,
+        pose.view.name,
         (width, height),
         {
             layer: write_jpeg(folder, f"{_FOLDER}/{place:03d}-{layer}.jpg", image, side)
@@ -265,9 +283,9 @@ def _pose(
 
 
 def _note(values: Mapping[str, float | None]) -> str:
-    """PSNR and one LPIPS, as far as they were measured."""
+    """Return PSNR and one LPIPS as text, if they were measured."""
     shown = [metric for metric in _SHOWN_METRICS if values.get(metric) is not None][:2]
-    texts = {metric: number(values[metric] or 0.0, metric) for metric in shown}
+    texts = {metric: format_value(values[metric] or 0.0, metric) for metric in shown}
     return " · ".join(
         f"{text} dB" if metric == "psnr" else f"{NAMES[metric]} {text}" for metric, text in texts.items()
     )
@@ -281,7 +299,7 @@ def _layer_names(layers: Mapping[str, str], labels: Mapping[str, str]) -> dict[s
 def _data(
     captures: Sequence[CaptureResults], layers: Mapping[str, str], labels: Mapping[str, str], subject: str
 ) -> dict[str, Any]:
-    """What the script of the page knows."""
+    """Return the data for the script of the page."""
     return {
         "layers": _layer_names(layers, labels),
         "opening": {"left": REFERENCE, "right": layers[subject]},

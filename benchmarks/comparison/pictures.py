@@ -1,4 +1,4 @@
-"""A comparison as pictures: values of all variants by column, and what the scenes look like."""
+"""Pictures of a comparison: a plot of the values and a contact sheet of the scenes."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
 
 PLOTTED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 _COLOURS = 10
-"""Of matplotlib's cycle. Variants beyond them get their colours again, with another marker."""
+"""Length of matplotlib's colour cycle. Further variants repeat the colours with another marker."""
 _MARKERS = "osD"
 _NAME_INCHES = 2.6
-"""What the longest name of a variant takes in the legend."""
+"""Width of the longest variant name in the legend."""
 
 
 def plot_comparison(path: Path, cells: Cells, labels: Mapping[str, str]) -> None:
-    """Write a PNG of the differences to the first variant: a row a metric, a panel a set of views; a point a
-    variant and column, with the 95 % interval of the paired difference where there are several samples. Of a
-    single variant the values themselves are shown.
+    """Write a PNG of the differences to the first variant.
+
+    It has one row per metric and one panel per set of views. A point is a variant and column; with several
+    samples it has the 95 % interval of the paired difference. For a single variant, the plot shows values.
     """
     import matplotlib
 
@@ -82,21 +83,21 @@ def _panel(panel: Axes, cells: Cells, labels: Mapping[str, str], views: ViewSet,
             fmt=_MARKERS[number // _COLOURS % len(_MARKERS)],
             color=f"C{number % _COLOURS}",
             markersize=4,
-            label=_plain(labels[variant]),
+            label=_escape_dollars(labels[variant]),
         )
     if others:
         panel.axhline(0.0, color="black", linewidth=0.8)
-    names = [_plain(name) for name in columns]
+    names = [_escape_dollars(name) for name in columns]
     panel.set_xticks(range(len(columns)), names, rotation=30, ha="right", fontsize=8)
     panel.set_xlim(-0.6, len(columns) - 0.4)
-    against = f", minus {_plain(labels[baseline])}" if others else ""
+    against = f", minus {_escape_dollars(labels[baseline])}" if others else ""
     panel.set_ylabel(metric_title(metric) + against, fontsize=8)
     panel.set_title(TITLES[views].split(",")[0], fontsize=9)
     panel.grid(axis="y", alpha=0.3)
 
 
-def _plain(name: str) -> str:
-    """``name`` as it is, dollars and all: between two of them matplotlib would read a formula."""
+def _escape_dollars(name: str) -> str:
+    """Escape dollar signs: matplotlib reads text between two of them as a formula."""
     return name.replace("$", r"\$")
 
 
@@ -108,10 +109,17 @@ def comparison_sheet(
     variants: Sequence[str],
     captures: Mapping[str, Path],
 ) -> None:
-    """Write a PNG with a row a column of the tables: truth, input, and the scenes of ``variants``.
+    """Write a contact sheet with one row per column of the tables: truth, input and scenes.
 
-    Each row shows one of the worse frames of the first sample of its column; ``captures`` maps samples to
-    their captures.
+    Each row shows a frame of the first sample of its column, chosen by `_typical_frame`.
+
+    Args:
+        path: Image file to write.
+        out: Folder of the comparison.
+        cells: Cells of the comparison.
+        labels: Variant -> label.
+        variants: Variants to show.
+        captures: Sample -> folder of its capture.
     """
     views = cells.view_sets()[0]
     rows = []
@@ -125,24 +133,26 @@ def comparison_sheet(
         capture = captures[first.sample]
         name = _typical_frame(out, first, capture)
         tiles = [
-            Tile(_find(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
-            Tile(_find(capture / "images", name), "input"),
+            Tile(_find_image(capture / "truth" / "observed" / "images", name), f"{column}: truth of {name}"),
+            Tile(_find_image(capture / "images", name), "input"),
         ]
         for variant, cell in shown.items():
-            tiles.append(Tile(_find(out / cell.evaluation, name), labels[variant]))
+            tiles.append(Tile(_find_image(out / cell.evaluation, name), labels[variant]))
         rows.append([tile for tile in tiles if tile.image is not None])
     write_rgb(path, contact_sheet(rows, tile_width=320))
 
 
 def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
-    """The frame to show: a bad one, but not the worst. At the upper quartile of the input's error against the
-    truth; where there is no such pair, at the lower quartile of the scene's PSNR.
+    """Return the name of a bad frame that is not the worst one.
+
+    It is at the upper quartile of the input's error against the truth. Without truth, it is at the lower
+    quartile of the scene's PSNR.
     """
     truth, observed = capture / "truth" / "observed" / "images", capture / "images"
     evaluation = Evaluation.model_validate_json((out / cell.evaluation / "eval.json").read_bytes())
     errors = {}
     for image in evaluation.images:
-        sharp, seen = _find(truth, image.name), _find(observed, image.name)
+        sharp, seen = _find_image(truth, image.name), _find_image(observed, image.name)
         if sharp is not None and seen is not None and sharp.shape == seen.shape:
             errors[image.name] = float(np.square(sharp - seen).mean(dtype=np.float64))
         else:
@@ -151,7 +161,7 @@ def _typical_frame(out: Path, cell: Cell, capture: Path) -> str:
     return ordered[3 * len(ordered) // 4]
 
 
-def _find(folder: Path, stem: str) -> ImageF32 | None:
-    """The image of that stem as sRGB in [0, 1]; None without one."""
+def _find_image(folder: Path, stem: str) -> ImageF32 | None:
+    """Return the image with this stem as float32 sRGB in [0, 1]; None if it does not exist."""
     found = [path for path in image_files(folder) if path.stem == stem] if folder.is_dir() else []
     return read_rgb_float(max(found)) if found else None

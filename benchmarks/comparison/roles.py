@@ -1,4 +1,4 @@
-"""How many frames of a scene had each role: which of RVA's mechanisms a table exercises at all."""
+"""Number of frames of a scene by role; it shows which mechanisms of RVA a table exercises."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from cleargs.rva.tables import FRAMES
 FOR_COVERAGE = f"{Role.REACTIVATED} for {Rule.COVERAGE}"
 FOR_SHARE = f"{Role.REACTIVATED} for {Rule.ACTIVE_SHARE}"
 KINDS = (Role.STRONG, Role.GEOMETRIC, Role.AUXILIARY, FOR_COVERAGE, FOR_SHARE, Role.SUPPRESSED)
-"""What a frame can be; reactivated ones by the rule that woke them."""
+"""Roles of a frame; reactivated ones by the rule that reactivated them."""
 
 
 class Roles(FrozenModel):
-    """The training frames of one scene by role."""
+    """Training frames of one scene by role."""
 
     column: str
     sample: str
@@ -27,7 +27,7 @@ class Roles(FrozenModel):
 
 
 def count_roles(rva: Path) -> dict[str, int]:
-    """Each of `KINDS` -> number of training frames, from the finished folder of RVA. Raises StoreError."""
+    """Return the number of training frames for each of `KINDS`, from the finished folder of RVA."""
     rows = read_table(rva / "frames.parquet", FRAMES).to_pylist()
     found = Counter(
         f"{row['role']} for {row['reactivated_for']}" if row["reactivated_for"] else row["role"]

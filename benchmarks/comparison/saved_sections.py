@@ -1,6 +1,6 @@
-"""What was found in a section of the evidence, as a file beside the page.
+"""Results of each section of the evidence as a file next to the page.
 
-Sections that were made at different times, or on different machines, come together on one page.
+So one page can show sections that were made at different times or on different machines.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from cleargs.safe_io import read_bytes
 
 
 class SavedSection(Figures):
-    """``results/NAME.json``: all that the tables of a section are made from."""
+    """``results/NAME.json``: the data behind the tables of a section."""
 
     section: Section
     version: str
-    """Of the source that made it."""
+    """Version of the source that made it."""
     machine: str
     missing: tuple[str, ...]
-    """What could not be made, and why, a line each."""
+    """Names of missing captures and scenes with the reason, one per line."""
     cells: tuple[Cell, ...]
-    """Empty where nothing of the section could be made."""
+    """Empty if no scene of the section could be made."""
     roles: tuple[Roles, ...]
     choices: tuple[Choices, ...]
 
@@ -41,7 +41,7 @@ class SavedSection(Figures):
 
 
 def save_section(folder: Path, found: SectionOutcome, version: str, machine: str) -> None:
-    """Write what was found in a section to ``folder``, in place of what an earlier call found there."""
+    """Write the results of a section to ``folder``; they replace those of an earlier call."""
     compared = found.compared
     kept = SavedSection(
         section=found.section,
@@ -57,8 +57,9 @@ def save_section(folder: Path, found: SectionOutcome, version: str, machine: str
 
 
 def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter) -> list[SavedSection]:
-    """Those of ``sections`` that ``folder`` has, as they are listed now; what was made from another list, or
-    cannot be read, is left out with a warning.
+    """Read the results of ``sections`` from ``folder``.
+
+    Unreadable files, and those that another list of evidence made, are left out with a warning.
     """
     found = []
     for section in sections:
@@ -68,12 +69,12 @@ def read_sections(folder: Path, sections: Iterable[Section], reporter: Reporter)
         try:
             kept = SavedSection.model_validate_json(read_bytes(path))
         except (OSError, ValidationError):
-            reporter.warn(f"{path} cannot be read: the page leaves {section.title!r} out")
+            reporter.warn(f"cannot read {path}: the page does not include {section.title!r}")
             continue
         if kept.section == section:
             found.append(kept)
         else:
-            reporter.warn(f"{path} is of another list: the page leaves {section.title!r} out")
+            reporter.warn(f"{path} was made from another list: the page does not include {section.title!r}")
     return found
 
 

@@ -1,8 +1,8 @@
-"""Runs variants of captures over one store and judges each scene: the cells of the paper's tables.
+"""Run variants on captures and evaluate each scene: the cells of the paper's tables.
 
-``OUT/<capture>-<seed>/<variant>`` are ordinary run folders that share ``OUT/.store``, so that a stage which
-several variants agree on is made once, and a killed comparison resumes where it stopped. Evaluations are kept
-by content in ``OUT/evaluations``.
+``OUT/<capture>-<seed>/<variant>`` are ordinary run folders. They share ``OUT/.store``, so equal stages of
+several variants run once, and an interrupted comparison can be resumed. ``OUT/evaluations`` caches
+evaluations by content.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from cleargs.safe_io import read_bytes, read_json
 from cleargs.splat.ply import read_ply
 
 EVALUATION_VERSION = 3
-"""Raised when an evaluation of equal inputs would give other figures."""
+"""Version of the cache. Increase it when an evaluation of equal inputs gives other figures."""
 
 
 def capture_name(capture: Path) -> str:
-    """The name of a folder, dots and all, or of a video without its suffix."""
+    """Return the full name of a folder, or the name of a video without its suffix."""
     place = capture.resolve()
     return place.name if place.is_dir() else place.stem
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A capture and a seed: what all variants are made from."""
+    """A capture and a seed, from which all variants are made."""
 
     capture: Path
     seed: int
     reference: Path | None
-    """A reference that the user named; None: the capture's own truth or held-out frames."""
+    """Reference images that the user gave; None for the capture's truth or held-out frames."""
 
     @property
     def name(self) -> str:
@@ -59,7 +59,7 @@ class Sample:
 
     @property
     def column(self) -> str:
-        """The protocol of a synthetic capture, else the name of the capture."""
+        """Protocol of a synthetic capture, or the name of a real one."""
         try:
             note = read_json(self.capture / "truth" / "capture.json")
             return str(note["protocol"])
@@ -69,7 +69,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class SceneRecipe:
-    """What all runs of a comparison have in common."""
+    """Settings that all runs of a comparison share."""
 
     dag: Dag
     workflow: str
@@ -78,11 +78,11 @@ class SceneRecipe:
     threads: int
     options: EvalOptions
     steps: int | None = None
-    """Training steps of every variant; None: those of the whole method under the recipe."""
+    """Training steps of each variant; None for those of the whole method with the recipe."""
 
     @cached_property
     def weights(self) -> dict[str, str]:
-        """Digests of the weights of the metrics that can be had now."""
+        """Digests of the weights of all metrics that are available now."""
         from cleargs.evaluate.metrics import load_metrics
 
         return dict(load_metrics(self.options).weights)
@@ -90,12 +90,12 @@ class SceneRecipe:
 
 @dataclass
 class ChargedStages:
-    """Which stages of a sample are made and paid for."""
+    """Stages of a sample whose time is already charged to a variant."""
 
     keys: set[str] = field(default_factory=set)
 
     def charge(self, manifests: Sequence[Manifest]) -> tuple[float, float]:
-        """Seconds of the stages that are new to the ledger, and of the others."""
+        """Charge stages; return the seconds of those that were not charged before, and of the others."""
         new = [manifest for manifest in manifests if manifest.key not in self.keys]
         self.keys.update(manifest.key for manifest in new)
         own = sum(manifest.seconds for manifest in new)
@@ -103,7 +103,7 @@ class ChargedStages:
 
 
 @dataclass(frozen=True)
-class Made:
+class FinishedScene:
     """A finished scene of one variant of one sample."""
 
     sample: Sample
@@ -112,7 +112,7 @@ class Made:
     seconds: float
     shared_seconds: float
     manifests: tuple[Manifest, ...]
-    """Of all stages up to the scene's."""
+    """Manifests of all stages up to that of the scene."""
 
     @property
     def scene(self) -> Path:
@@ -126,11 +126,24 @@ def make_scenes(
     recipe: SceneRecipe,
     store: Store,
     reporter: Reporter,
-) -> Iterator[Made | str]:
-    """Each scene as soon as it is there, or the line that says why it could not be made.
+) -> Iterator[FinishedScene | str]:
+    """Train every variant on every sample.
 
-    A variant that fails ends neither its sample nor the others. Raises InputError, before anything is made,
-    for a sample that nothing could be compared with.
+    A failed variant does not stop the others.
+
+    Args:
+        out: Folder of the comparison.
+        samples: Captures with seeds.
+        variants: Variants to train on each sample.
+        recipe: Settings that all runs share.
+        store: Store of the runs.
+        reporter: Receives progress and warnings.
+
+    Yields:
+        Each scene as soon as it is finished, or a line with the reason why it is missing.
+
+    Raises:
+        InputError: A sample has no reference to compare with. It is raised before any run starts.
     """
     for sample in samples:
         _require_reference(sample, load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed))
@@ -151,16 +164,18 @@ def make_scenes(
                 continue
             manifests = tuple(outcome.manifest for outcome in outcomes)
             if manifests[-1].status == "partial":
-                lacking = ", ".join((*manifests[-1].inherited, *manifests[-1].missing))
-                yield f"{sample.name}, {variant.label}: {lacking}"
+                missing = ", ".join((*manifests[-1].inherited, *manifests[-1].missing))
+                yield f"{sample.name}, {variant.label}: {missing}"
                 continue
-            made = Made(sample, variant, runner.run.folder, *charged.charge(manifests), manifests)
-            if (trained := trained_steps(made)) != work.steps:
+            finished = FinishedScene(
+                sample, variant, runner.run.folder, *charged.charge(manifests), manifests
+            )
+            if (trained := trained_steps(finished)) != work.steps:
                 reporter.warn(
-                    f"{sample.name}, {variant.label}: {trained} of {work.steps} steps, since no repair was "
-                    "accepted that could be distilled"
+                    f"{sample.name}, {variant.label}: {trained} of {work.steps} steps, because no repair "
+                    "was accepted for distillation"
                 )
-            yield made
+            yield finished
 
 
 def _runner(
@@ -180,82 +195,104 @@ def _runner(
 def _work_of(
     out: Path, sample: Sample, variant: Variant, recipe: SceneRecipe, store: Store, reporter: Reporter
 ) -> EqualWork:
-    """What all variants of a sample get, from its ingest, which is made in the run of the first of them."""
+    """Choose the work of all variants of a sample; ``variant`` is the first and runs the ingest."""
     config = load_config(recipe.dag, recipe.workflow, recipe.overrides, sample.seed)
     runner = _runner(out, sample, variant, config, recipe, store, reporter)
     return decide_work(config, runner.run_until("ingest")[-1].folder, recipe.steps)
 
 
-def judge(out: Path, made: Made, recipe: SceneRecipe, store: Store, reporter: Reporter) -> list[Cell]:
-    """The cells of one scene, one a set of views. Raises InputError when there is nothing to compare with."""
+def evaluate_views(
+    out: Path, finished: FinishedScene, recipe: SceneRecipe, store: Store, reporter: Reporter
+) -> list[Cell]:
+    """Evaluate a scene on all sets of views.
+
+    Args:
+        out: Folder of the comparison.
+        finished: The scene.
+        recipe: Settings that all runs share.
+        store: Store of the runs.
+        reporter: Receives progress.
+
+    Returns:
+        One cell per set of views.
+
+    Raises:
+        InputError: There is no reference to compare with.
+    """
     cells = []
-    gaussians = read_ply(made.scene).gaussians
-    for view_set in view_sets(made):
-        evaluation, folder = evaluated(out, made, view_set, recipe, store, reporter)
+    gaussians = read_ply(finished.scene).gaussians
+    for view_set in view_sets(finished):
+        evaluation, folder = cached_evaluation(out, finished, view_set, recipe, store, reporter)
         cells.append(
             Cell(
-                column=made.sample.column,
-                sample=made.sample.name,
-                variant=made.variant.name,
+                column=finished.sample.column,
+                sample=finished.sample.name,
+                variant=finished.variant.name,
                 views=view_set.views,
                 means=evaluation.means,
                 images=len(evaluation.images),
-                trained_on=_trained_on(made, view_set),
-                seconds=made.seconds,
-                shared_seconds=made.shared_seconds,
+                trained_on=_trained_on(finished, view_set),
+                seconds=finished.seconds,
+                shared_seconds=finished.shared_seconds,
                 gaussians=gaussians.num,
-                steps=trained_steps(made),
+                steps=trained_steps(finished),
                 sh_degree=gaussians.sh_degree,
-                cpu_seconds=_all_noted(sum, [manifest.cpu_seconds for manifest in made.manifests]),
-                peak_memory_gb=_all_noted(max, [manifest.peak_memory_gb for manifest in made.manifests]),
+                cpu_seconds=_combine_complete(sum, [manifest.cpu_seconds for manifest in finished.manifests]),
+                peak_memory_gb=_combine_complete(
+                    max, [manifest.peak_memory_gb for manifest in finished.manifests]
+                ),
                 evaluation=folder.relative_to(out).as_posix(),
             )
         )
     return cells
 
 
-def _trained_on(made: Made, view_set: Views) -> int | None:
-    """How many of the views show frames that the scene was trained on; None where that is not known."""
+def _trained_on(finished: FinishedScene, view_set: ReferenceSet) -> int | None:
+    """Return the number of views that show frames of the training; None if unknown."""
     from cleargs.evaluate.references import reference_of, views_trained_on
 
     reference = reference_of(
-        made.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=SilentReporter()
+        finished.run,
+        view_set.directory,
+        poses=view_set.poses,
+        align=view_set.align,
+        reporter=SilentReporter(),
     )
-    return views_trained_on(made.run, made.variant.stage, reference)
+    return views_trained_on(finished.run, finished.variant.stage, reference)
 
 
 @dataclass(frozen=True)
-class Views:
-    """Where a scene can be judged."""
+class ReferenceSet:
+    """Reference images of one set of views."""
 
     views: ViewSet
     directory: Path | None
-    """Folder of the references; None: the frames that the run held out."""
+    """Folder of the images; None for the frames that the run held out."""
     poses: Literal["reference", "given"] = "reference"
     align: Path | None = None
-    """References of the run's own frames, by which worlds are aligned where ``directory`` shows others."""
+    """References of the run's frames, to align the worlds if ``directory`` shows other views."""
 
 
-def view_sets(made: Made) -> list[Views]:
-    """All that the scene can be judged on. Raises InputError when there is nothing."""
-    truth = made.sample.capture / "truth"
+def view_sets(finished: FinishedScene) -> list[ReferenceSet]:
+    """Return all sets of views for a scene; raise InputError if there is none."""
+    truth = finished.sample.capture / "truth"
     observed, novel = truth / "observed", truth / "novel"
-    if made.sample.reference is not None:
-        return [Views("reference", made.sample.reference)]
+    if finished.sample.reference is not None:
+        return [ReferenceSet("reference", finished.sample.reference)]
     if (observed / "transforms.json").is_file():
-        sets = [Views("observed", observed)]
-        if _matrices(observed) != _matrices(made.sample.capture):
-            sets.append(Views("given", observed, "given"))
+        sets = [ReferenceSet("observed", observed)]
+        if _matrices(observed) != _matrices(finished.sample.capture):
+            sets.append(ReferenceSet("given", observed, "given"))
         if (novel / "transforms.json").is_file():
-            sets.append(Views("novel", novel, align=observed))
+            sets.append(ReferenceSet("novel", novel, align=observed))
         return sets
-    if read_toml(made.run / RUN_FILE)["ingest"].get("holdout", "none") != "none":
-        return [Views("held-out", None)]
-    raise _without_reference(made.sample)
+    if read_toml(finished.run / RUN_FILE)["ingest"].get("holdout", "none") != "none":
+        return [ReferenceSet("held-out", None)]
+    raise _without_reference(finished.sample)
 
 
 def _require_reference(sample: Sample, config: Config) -> None:
-    """Raise InputError where `view_sets` would find nothing, before there is a run."""
+    """Raise InputError if `view_sets` would find no reference; it needs no run."""
     ingest: Any = config.sections["ingest"]
     truth = sample.capture / "truth" / "observed" / "transforms.json"
     if sample.reference is None and ingest.holdout == "none" and not truth.is_file():
@@ -269,22 +306,27 @@ def _without_reference(sample: Sample) -> InputError:
     )
 
 
-def evaluated(
-    out: Path, made: Made, view_set: Views, recipe: SceneRecipe, store: Store, reporter: Reporter
+def cached_evaluation(
+    out: Path,
+    finished: FinishedScene,
+    view_set: ReferenceSet,
+    recipe: SceneRecipe,
+    store: Store,
+    reporter: Reporter,
 ) -> tuple[Evaluation, Path]:
-    """The evaluation of a scene on a set of views, and the folder that keeps it with the renders.
+    """Return the evaluation of a scene on a set of views, and its folder with the renders.
 
-    One from an earlier call is taken where nothing changed, the weights of the metrics included: those that
-    were not installed then may be now.
+    An earlier evaluation is reused if nothing changed. The digests of metric weights count too: some may have
+    been installed since.
     """
     from cleargs.evaluate.evaluate import evaluate_scene
     from cleargs.evaluate.references import reference_of
 
-    ingest = linked_manifest(made.run, "ingest")
+    ingest = linked_manifest(finished.run, "ingest")
     folders = (view_set.directory, view_set.align)
     parts = {
         "version": EVALUATION_VERSION,
-        "scene": store.memo.digest(made.scene.resolve()),
+        "scene": store.memo.digest(finished.scene.resolve()),
         "ingest": ingest.digest if ingest is not None else None,
         "references": [None if folder is None else store.memo.digests_of(folder) for folder in folders],
         "poses": view_set.poses,
@@ -297,43 +339,43 @@ def evaluated(
         if kept.weights == recipe.weights:
             return kept, folder
     except (OSError, ValidationError):
-        pass  # not made yet, or damaged
+        pass  # missing or damaged
     reference = reference_of(
-        made.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=reporter
+        finished.run, view_set.directory, poses=view_set.poses, align=view_set.align, reporter=reporter
     )
     evaluation = evaluate_scene(
-        made.scene,
+        finished.scene,
         reference,
         options=recipe.options,
         threads=recipe.threads,
         reporter=reporter,
-        subject=made.variant.name,
+        subject=finished.variant.name,
         save=folder,
     )
     write_bytes(path, evaluation.model_dump_json(indent=2).encode())
     return evaluation, folder
 
 
-def existing(run: Path, dag: Dag, reference: Path | None) -> Made:
-    """The last scene of a finished run, as a variant of its own name. Raises InputError when it has none."""
-    noted = read_run_file(run, dag)
+def scene_of_run(run: Path, dag: Dag, reference: Path | None) -> FinishedScene:
+    """Return the last scene of a run, as a variant with the run's name; raise InputError without a scene."""
+    spec = read_run_file(run, dag)
     for stage in ("consolidate", "rivr", "g0"):
         if linked_manifest(run, stage) is not None:
             variant = Variant(run.resolve().name, run.resolve().name, stage)
-            sample = Sample(noted.source, noted.config.seed, reference)
+            sample = Sample(spec.source, spec.config.seed, reference)
             manifests = tuple(
                 found for name in dag.until(stage) if (found := linked_manifest(run, name)) is not None
             )
             seconds = sum(manifest.seconds for manifest in manifests)
-            return Made(sample, variant, run, seconds, 0.0, manifests)
+            return FinishedScene(sample, variant, run, seconds, 0.0, manifests)
     raise InputError(f"{run} has no scene yet", hint=f"first: cleargs run INPUT -o {run}")
 
 
-def trained_steps(made: Made) -> int:
-    """The steps behind a scene: the rows of the logs of all its trainings. Raises StoreError."""
+def trained_steps(finished: FinishedScene) -> int:
+    """Count the rows in the logs of all trainings of a scene; raise StoreError if a log is damaged."""
     from pyarrow import parquet
 
-    logs = [made.run / manifest.stage / "train.parquet" for manifest in made.manifests]
+    logs = [finished.run / manifest.stage / "train.parquet" for manifest in finished.manifests]
     steps = 0
     for log in filter(Path.is_file, logs):
         with read_errors(log):
@@ -341,14 +383,16 @@ def trained_steps(made: Made) -> int:
     return steps
 
 
-def _all_noted(combine: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
-    """The combined values; None where one is missing."""
+def _combine_complete(
+    combine: Callable[[list[float]], float], values: Sequence[float | None]
+) -> float | None:
+    """Combine ``values``; None if one is missing."""
     known = [value for value in values if value is not None]
     return combine(known) if known and len(known) == len(values) else None
 
 
 def _matrices(folder: Path) -> list[Any]:
-    """The poses that ``transforms.json`` lists; none without the file."""
+    """Return the poses in ``transforms.json``; an empty list without the file."""
     try:
         frames = read_json(folder / "transforms.json")["frames"]
         return [frame.get("transform_matrix") for frame in frames]

@@ -1,4 +1,4 @@
-"""A trained Gaussian scene as the world of a capture, as GS2E does, and the walk along its real cameras."""
+"""A trained Gaussian scene as the world of a synthetic capture, as in GS2E; a path along real cameras."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from cleargs.synth.path import SceneSetup
 from cleargs.types import ArrayF64
 
 OPAQUE = 0.5
-"""Alpha from which a pixel has a depth."""
+"""Minimum alpha of a pixel with a depth."""
 SMOOTHING = 0.5
-"""Weight of the curvature of a spline through cameras, which are one apart."""
+"""Weight of the curvature in the smoothing spline; cameras are one unit of its parameter apart."""
 MIN_CAMERAS = 5
+"""Minimum number of points for `make_smoothing_spline`."""
 
 
 class SplatWorld:
-    """A Gaussian scene as a `cleargs.synth.optics.World`; its lengths are the scene's own.
+    """A Gaussian scene as a `cleargs.synth.optics.World`, in the units of the scene.
 
-    The splatting core renders each pose once, with its own pixel filter; rows are taken from the pictures
-    of their poses. Averages are taken of what a display would show, clipped to [0, 1], in linear light.
+    Each pose is rendered once. Rows of the image come from the renders of their poses (rolling shutter).
+    Renders are clipped to [0, 1] and averaged in linear light.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -43,8 +44,10 @@ class SplatWorld:
         self._engine = rasteriser_for()
 
     def render(self, shutter: Shutter, lens: Lens, aperture: Aperture = PINHOLE) -> ArrayF64:
-        """The mean over the samples. Off the optical axis the principal point moves with the lens, so that
-        what is in focus stays where it is.
+        """Return the mean over the samples of the exposure and the aperture, linear light [H, W, 3].
+
+        For a point of the aperture off the optical axis, the principal point moves too, so that the focus
+        plane stays in place.
         """
         points = np.broadcast_to(aperture.points, (shutter.samples, 2))
         shares: defaultdict[tuple[int, float, float], ArrayF64] = defaultdict(lambda: np.zeros(lens.height))
@@ -66,17 +69,18 @@ class SplatWorld:
         return total
 
     def depth(self, pose: ArrayF64, lens: Lens) -> ArrayF64:
-        """The expected depth of the render; 0 where it is mostly transparent.
+        """Return the expected depth [H, W] in scene units; 0 for pixels with an alpha below `OPAQUE`.
 
-        Raises InputError where all of it is transparent.
+        Raises:
+            InputError: All pixels are below `OPAQUE`.
         """
         rendered = self._rendered(pose, lens, depth=True)
         assert rendered.depth is not None
         alpha = rendered.alpha.numpy().astype(np.float64)
         if (alpha < OPAQUE).all():
             raise InputError(
-                "a frame of the walk sees nothing of the scene",
-                hint="give cameras in the scene's own world, or a scene that fills their view",
+                "the scene is not visible in a frame of the path",
+                hint="give cameras in the coordinates of the scene, or a scene that fills their view",
             )
         mean = rendered.depth.numpy() / np.maximum(alpha, OPAQUE)
         return np.where(alpha >= OPAQUE, mean, 0.0)
@@ -90,33 +94,40 @@ class SplatWorld:
 
 @dataclass(frozen=True)
 class CameraCourse:
-    """A smoothing spline through real cameras in the order in which they were taken."""
+    """A smoothing spline through real cameras in the order of capture."""
 
     spline: BSpline
-    """Number of a camera of the course -> the 12 numbers of a pose, its rotation not yet orthonormal."""
+    """Index of a camera -> the 12 numbers of a pose [3, 4]; its rotation is not orthonormal."""
     steps: float
-    """Number of the last camera."""
+    """Index of the last camera."""
     spacing: float
-    """Median distance of neighbouring cameras of the course, world units."""
+    """Median distance between consecutive cameras, world units."""
 
     def poses(self, shares: ArrayF64) -> ArrayF64:
+        """Return camera-to-world poses [N, 3, 4] at ``shares`` [N] of the course, from 0 to 1."""
         raw = np.asarray(self.spline(shares * self.steps), np.float64).reshape(-1, 3, 4)
         u, _, vt = np.linalg.svd(raw[:, :, :3])
         return np.concatenate([u @ vt, raw[:, :, 3:]], 2)
 
     def novel(self, share: float, rng: np.random.Generator) -> ArrayF64:
-        """Off by up to one and a half spacings in each of the camera's axes."""
+        """Return a pose [3, 4] that is up to 1.5 spacings off the course along each camera axis."""
         pose: ArrayF64 = self.poses(np.array([share]))[0]
         pose[:, 3] += pose[:, :3] @ rng.uniform(-1.5, 1.5, 3) * self.spacing
         return pose
 
 
 def camera_course(cameras: Sequence[ArrayF64], frames: int) -> CameraCourse:
-    """The course along ``frames`` consecutive ``cameras`` [3, 4] whose longest step is the shortest.
+    """Return a course along consecutive real cameras.
 
-    So that neighbours overlap as in the real capture, and the walk never crosses a gap that another stretch
-    avoids. Raises InputError when there are fewer cameras than frames, fewer than `MIN_CAMERAS`, or all at
-    one place.
+    The course uses the ``frames`` consecutive cameras whose largest step is smallest. So frames overlap as in
+    the real capture, and the course crosses no avoidable gap.
+
+    Args:
+        cameras: Camera-to-world poses [3, 4] in the order of capture.
+        frames: Number of cameras to follow.
+
+    Raises:
+        InputError: There are fewer cameras than frames or than `MIN_CAMERAS`, or all are at one place.
     """
     poses = np.stack(cameras) if cameras else np.empty((0, 3, 4))
     if len(poses) < max(frames, MIN_CAMERAS):
@@ -131,39 +142,45 @@ def camera_course(cameras: Sequence[ArrayF64], frames: int) -> CameraCourse:
     spacing = float(np.median(windows[start]))
     if spacing <= 0:
         raise InputError(
-            "the cameras stand at one place",
-            hint="give cameras that move, as those of a walk through the scene",
+            "all cameras are at one place",
+            hint="give the cameras of a path through the scene",
         )
     stretch = poses[start : start + used].reshape(used, 12)
     spline = make_smoothing_spline(np.arange(used), stretch, lam=SMOOTHING)
     return CameraCourse(spline, float(frames - 1), spacing)
 
 
-def scene_setting(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> SceneSetup:
-    """The scene in ``path``, in its own units, and a walk along ``frames`` of its real cameras.
+def scene_setup(path: Path, cameras: Path | None, frames: int, width: int, height: int) -> SceneSetup:
+    """Return a scene as a world, with a course along its real cameras.
 
-    The cameras are those that ``cameras`` names (`_read_cameras`), else those of the run that ``path`` lies
-    in: RUN/STAGE/scene.ply. The lens fills ``width`` x ``height`` and is that of the first camera.
+    Args:
+        path: The scene file.
+        cameras: Source of the cameras (`_read_cameras`); None for the run that contains ``path``, as in
+            RUN/STAGE/scene.ply.
+        frames: Number of cameras to follow.
+        width: Image width in px. The lens of the first camera is scaled and cropped to the image size.
+        height: Image height in px.
 
-    Raises InputError when the file is no scene, empty, or the cameras are missing or too few.
+    Raises:
+        InputError: The file is not a scene or is empty, or cameras are missing or too few.
     """
     run = path.absolute().parent.parent  # not resolved: RUN/STAGE is a link into the store
     if cameras is None and not (run / "ingest" / "frames.parquet").is_file():
         if not path.is_file():
-            raise InputError(f"there is no scene {path}", hint="give a scene.ply")
+            raise InputError(f"{path} does not exist", hint="give a scene.ply")
         raise InputError(
-            f"{path} does not lie in a run, so its cameras are not known",
-            hint="give --cameras DIR, a folder with a transforms.json in the scene's world",
+            f"{path} is not in a run, so its cameras are unknown",
+            hint="give --cameras DIR, a folder with a transforms.json in the coordinates of the scene",
         )
     world = SplatWorld(_read_scene(path))
     real = _read_cameras(run if cameras is None else cameras)
     course = camera_course([pose for _, pose in real], frames)
     name = path.stem if cameras is not None else run.name
-    return SceneSetup(name, world, course, _fitted(real[0][0], width, height))
+    return SceneSetup(name, world, course, _fit_lens(real[0][0], width, height))
 
 
-def _fitted(lens: Lens, width: int, height: int) -> Lens:
-    """The lens of the same view scaled to fill ``width`` x ``height``, cropped about its middle."""
+def _fit_lens(lens: Lens, width: int, height: int) -> Lens:
+    """Scale a lens until it fills ``width`` x ``height``, and crop the image at its centre."""
     scale = max(width / lens.width, height / lens.height)
     left, top = (lens.width * scale - width) / 2, (lens.height * scale - height) / 2
     cx, cy = lens.cx * scale - left, lens.cy * scale - top
@@ -171,9 +188,9 @@ def _fitted(lens: Lens, width: int, height: int) -> Lens:
 
 
 def _read_cameras(source: Path) -> list[tuple[Lens, ArrayF64]]:
-    """Lens and pose [3, 4] in frame order: of a run, of a transforms.json, or of the folder that holds one.
+    """Read lenses and camera-to-world poses [3, 4] in frame order; raise InputError without cameras.
 
-    Raises InputError when there are none.
+    ``source`` is a run, a transforms.json or a folder that contains one.
     """
     ingest = source / "ingest"
     if (ingest / "frames.parquet").is_file():
@@ -187,9 +204,7 @@ def _read_cameras(source: Path) -> list[tuple[Lens, ArrayF64]]:
         ]
     transforms = source / "transforms.json" if source.is_dir() else source
     if not transforms.is_file():
-        raise InputError(
-            f"{source} holds no cameras", hint="give a transforms.json, a folder that holds one, or a run"
-        )
+        raise InputError(f"{source} contains no cameras", hint="give a transforms.json, its folder, or a run")
     found = []
     for frame in read_transforms(transforms, poses=True):
         assert frame.camera is not None and frame.pose is not None
@@ -199,14 +214,14 @@ def _read_cameras(source: Path) -> list[tuple[Lens, ArrayF64]]:
 
 
 def _read_scene(path: Path) -> Scene:
-    hint = "give a scene.ply with Gaussians in the layout of the Inria code"
+    hint = "give a scene.ply in the format of the Inria code"
     try:
         scene = read_ply(path)
     except StoreError as error:
         reason = str(error.__cause__ or error).splitlines()[0]
         raise InputError(f"{path} is not a Gaussian scene: {reason}", hint=hint) from error
     if scene.gaussians.num == 0:
-        raise InputError(f"{path} holds no Gaussians", hint=hint)
+        raise InputError(f"{path} contains no Gaussians", hint=hint)
     return scene
 
 

@@ -1,4 +1,4 @@
-"""The tables of a comparison, as Markdown."""
+"""Tables of a comparison as Markdown."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ TITLES: Mapping[ViewSet, str] = {
     "reference": "Against the given reference",
 }
 NOTES: Mapping[ViewSet, str] = {
-    "observed": "Training poses: the scenes were trained on the frames filmed from here, not on this truth.",
-    "given": "Training poses: the scenes were trained on the frames filmed from here, not on this truth.",
-    "novel": "No frame was filmed from these places.",
-    "held-out": "No scene was trained on these frames. They are as sharp as they were filmed.",
+    "observed": "Training poses: the scenes were trained on the frames filmed here, not on this truth.",
+    "given": "Training poses: the scenes were trained on the frames filmed here, not on this truth.",
+    "novel": "No frame was filmed at these poses.",
+    "held-out": "No scene was trained on these frames. They may be blurred themselves.",
 }
-"""What to know of a set of views."""
-UNKNOWN = "Which of these frames the scenes were trained on is not known."
-SEEN = "Scenes were trained on some of these frames, as the first lines say."
+"""Notes on the sets of views."""
+UNKNOWN_NOTE = "It is unknown which of these frames the scenes were trained on."
+SEEN_NOTE = "Scenes were trained on some of these frames: see the first lines."
 NAMES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
 COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
-"""Metrics whose differences are tabled."""
+"""Metrics in the tables of differences."""
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
 
 
 def metric_title(metric: str) -> str:
-    """Name and direction of a metric, as a heading."""
+    """Return the heading of a metric: its name and an arrow to better values."""
     return f"{NAMES.get(metric, metric)} {'↓' if metric in LOWER_IS_BETTER else '↑'}"
 
 
 class Bold(str):
-    """A text of a table that stands out."""
+    """Text of a table cell in bold."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True)
 class Table:
-    """Words in rows below a head."""
+    """A table of texts."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
     def markdown(self) -> str:
-        """The table as Markdown."""
+        """Return the table as Markdown."""
         rows = [[f"**{text}**" if isinstance(text, Bold) else text for text in row] for row in self.rows]
         lines = [self.head, ["---"] * len(self.head), *rows]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -59,7 +59,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Results:
-    """All that a comparison found."""
+    """Results that the tables of a comparison show."""
 
     cells: Cells
     roles: Sequence[Roles]
@@ -67,12 +67,17 @@ class Results:
 
 
 def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]) -> str:
-    """All tables: per set of views one table a metric, differences to the baselines; then the work, the roles
-    of the frames and how well RIVR chose.
+    """Return all tables as Markdown.
 
-    ``labels`` maps each variant to what it is called. A mean stands with the sample standard deviation, a
-    paired difference with half its 95 % interval (Student's t over the samples); one whose interval holds 0
-    is marked as none.
+    Each set of views has one table per metric and one of differences per baseline. Tables of the work, of the
+    roles of the frames and of the choices of RIVR follow. A mean has the sample standard deviation. A paired
+    difference has half its 95 % interval (Student's t over the samples) and is marked "none" if the interval
+    includes 0.
+
+    Args:
+        found: Results of the comparison.
+        labels: Variant -> label.
+        baselines: Variants that are subtracted from the others.
     """
     cells, parts = found.cells, []
     for views in cells.view_sets():
@@ -92,48 +97,49 @@ def markdown(found: Results, labels: Mapping[str, str], baselines: Sequence[str]
         roles_table(found.roles, labels).markdown(),
     ]
     if found.choices:
-        parts += ["## The choice against the truth", choices_table(found.choices, labels).markdown()]
+        parts += ["## Choices of RIVR against the truth", choices_table(found.choices, labels).markdown()]
     return "\n\n".join(parts) + "\n"
 
 
 def note_on(cells: Cells, views: ViewSet) -> str:
-    """What to know of a set of views in this comparison; "" for nothing."""
+    """Return the note on a set of views in this comparison; "" without a note."""
     seen = [cell.trained_on for cell in cells.cells if cell.views == views]
     if views == "held-out" and any(seen):
-        return SEEN
-    return UNKNOWN if views == "held-out" and None in seen else NOTES.get(views, "")
+        return SEEN_NOTE
+    return UNKNOWN_NOTE if views == "held-out" and None in seen else NOTES.get(views, "")
 
 
 def training_lines(cells: Cells, labels: Mapping[str, str]) -> list[str]:
-    """The scenes that are judged on frames that they were trained on, where the views are not called so."""
+    """Return a note for each scene that is evaluated on frames of its training, unless the views imply it."""
     return [
-        f"note: {cell.trained_on} of {cell.images} views of {labels[cell.variant]} are of frames that it was "
-        "trained on"
+        f"note: {cell.trained_on} of {cell.images} views of {labels[cell.variant]} show its training frames"
         for cell in cells.cells
         if cell.views in ("held-out", "reference") and cell.trained_on
     ]
 
 
 def metric_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, metric: str) -> Table:
-    """A metric of every variant by column, the best of a column in bold."""
+    """Return the means of a metric by variant and column; the best of a column is bold."""
     rows = [[labels[variant], *value_texts(cells, views, variant, metric)] for variant in cells.variants()]
     return Table(["", *cells.columns(views)], rows)
 
 
 def value_texts(cells: Cells, views: ViewSet, variant: str, metric: str) -> list[str]:
-    """A variant's values of a metric by column, in bold where it is the best."""
+    """Return a variant's means of a metric by column; bold if it is the best."""
     return [value_text(cells, views, column, variant, metric) for column in cells.columns(views)]
 
 
 def value_text(cells: Cells, views: ViewSet, column: str, variant: str, metric: str) -> str:
-    """A variant's value of a metric in one column, in bold where it is the best."""
+    """Return a variant's mean of a metric in one column; bold if it is the best."""
     text = _value(cells.spread(views, column, variant, metric), metric)
     return Bold(text) if variant == cells.best(views, column, metric) else text
 
 
 def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, baseline: str) -> Table:
-    """PSNR, SSIM and LPIPS of every other variant minus the baseline's, paired within samples, with 95 %
-    intervals; for LPIPS the share of the baseline's too.
+    """Return PSNR, SSIM and LPIPS of every other variant minus those of the baseline.
+
+    Differences are paired within samples and have 95 % intervals. For LPIPS they are also in percent of the
+    baseline.
     """
     columns = cells.columns(views)
     metrics = [metric for metric in COMPARED if metric in cells.metrics()]
@@ -147,11 +153,11 @@ def difference_table(cells: Cells, labels: Mapping[str, str], views: ViewSet, ba
                 difference = cells.difference(views, column, variant, baseline, metric)
                 row.append(difference_text(difference, cells.spread(views, column, baseline, metric), metric))
             rows.append(row)
-    return Table(["", "", *counted(cells, views)], rows)
+    return Table(["", "", *columns_with_counts(cells, views)], rows)
 
 
-def counted(cells: Cells, views: ViewSet) -> list[str]:
-    """The columns with their numbers of samples, over which differences are taken."""
+def columns_with_counts(cells: Cells, views: ViewSet) -> list[str]:
+    """Return the columns with their numbers of samples."""
     found = []
     for column in cells.columns(views):
         samples = {cell.sample for cell in cells.cells if (cell.views, cell.column) == (views, column)}
@@ -160,10 +166,10 @@ def counted(cells: Cells, views: ViewSet) -> list[str]:
 
 
 def work_table(cells: Cells, labels: Mapping[str, str]) -> Table:
-    """What each variant was given and what it took: means over all samples, ranges of what must be equal."""
+    """Return the work of each variant: ranges of what must be equal, means over all samples of the rest."""
     rows = []
     for variant in cells.variants():
-        # One cell a scene: the sets of views share all of this.
+        # One cell per scene: the cells of all its sets of views have the same work.
         own = [cell for cell in cells.cells if cell.variant == variant]
         chosen = list({(cell.column, cell.sample): cell for cell in own}.values())
         rows.append(
@@ -183,7 +189,7 @@ def work_table(cells: Cells, labels: Mapping[str, str]) -> Table:
 
 
 def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> Table:
-    """Frames of all samples of a column by role; variants whose counts agree share a row."""
+    """Return the number of frames by role and column, over all samples; equal variants share a row."""
     rows = []
     for column in dict.fromkeys(scene.column for scene in roles):
         groups: dict[tuple[int, ...], list[str]] = {}
@@ -198,7 +204,7 @@ def roles_table(roles: Sequence[Roles], labels: Mapping[str, str]) -> Table:
 
 
 def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> Table:
-    """How often the chosen repair is the best candidate, over all rows of all samples of a column."""
+    """Return how often the chosen repair is the best candidate, over all samples of a column."""
     rows = []
     for column, variant in dict.fromkeys((scene.column, scene.variant) for scene in choices):
         own = [scene for scene in choices if (scene.column, scene.variant) == (column, variant)]
@@ -224,13 +230,13 @@ def choices_table(choices: Sequence[Choices], labels: Mapping[str, str]) -> Tabl
         "best by PSNR",
         "best by LPIPS (AlexNet)",
         "by chance",
-        "lost against the best, dB",
+        "PSNR below the best, dB",
     ]
     return Table(head, rows)
 
 
-def number(value: float, metric: str) -> str:
-    """A value with the digits that its metric deserves."""
+def format_value(value: float, metric: str) -> str:
+    """Return a value with the number of digits for its metric."""
     return f"{value:.{_DIGITS.get(metric, 2)}f}"
 
 
@@ -240,19 +246,19 @@ def _range(values: Iterable[int]) -> str:
 
 
 def _mean(values: Sequence[float | None], digits: int) -> str:
-    noted = [value for value in values if value is not None]
-    return f"{sum(noted) / len(noted):.{digits}f}" if noted else "n/a"
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.{digits}f}" if known else "n/a"
 
 
 def _value(found: Spread | None, metric: str) -> str:
     if found is None:
         return "n/a"
-    text = number(found.mean, metric)
-    return text if found.deviation is None else f"{text} ± {number(found.deviation, metric)}"
+    text = format_value(found.mean, metric)
+    return text if found.deviation is None else f"{text} ± {format_value(found.deviation, metric)}"
 
 
 def difference_text(found: Spread | None, base: Spread | None, metric: str) -> str:
-    """A paired difference with half its 95 % interval; and of how many pairs, where ``base`` has more."""
+    """Return a paired difference with half its 95 % interval; with its count if ``base`` has more samples."""
     if found is None:
         return "n/a"
     digits = _DIGITS.get(metric, 2)
@@ -260,7 +266,7 @@ def difference_text(found: Spread | None, base: Spread | None, metric: str) -> s
     if found.half_width is not None:
         text += f" ± {found.half_width:.{digits}f}"
     pairs = f" (n = {found.count})" if base is not None and found.count < base.count else ""
-    if found.is_none:
+    if found.includes_zero:
         return f"none ({text}){pairs}"
     if metric in LOWER_IS_BETTER and base is not None and base.mean > 0:
         text += f" ({100 * found.mean / base.mean:+.0f} %)"

@@ -1,4 +1,4 @@
-"""The variants that the paper's tables compare: which settings make each, and whose scene is judged."""
+"""The variants of the paper's tables: their settings, and the stage whose scene is evaluated."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from cleargs.errors import InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to make a scene from a capture. How long it trains is no matter of its own: see `work`."""
+    """One way to make a scene from a capture; `equal_work` sets its training steps."""
 
     name: str
     label: str
-    """As the tables call it."""
+    """Name in tables."""
     stage: str
-    """Whose ``scene.ply`` is judged."""
+    """Stage whose ``scene.ply`` is evaluated."""
     overrides: tuple[str, ...] = ()
-    """Settings that differ from the recipe, as ``--set`` takes them."""
+    """Settings that differ from the recipe, in the form of ``--set``."""
     workflow: str | None = None
-    """A recipe of its own (all but its ingest); None: that of the comparison."""
+    """Recipe for all stages except ingest; None for that of the comparison."""
 
 
 _PAPER_RVA = ("rva.active_share=0",)
-"""Suppressed frames come back for an empty trajectory bin alone."""
+"""Suppressed frames are reactivated only to fill an empty bin of the trajectory, as in the paper."""
 _WEIGHT_ONE = (
     "rva.strong_base=1",
     "rva.strong_gain=0",
@@ -32,19 +32,24 @@ _WEIGHT_ONE = (
     "rva.attenuated_gain=0",
     "rva.reactivated_weight=1",
 )
-"""Every active frame weighs as much as a strong one."""
+"""Every active frame has weight 1."""
 
 _PLAIN_G0 = ("g0.formation.enabled=false",)
-"""Raw frames are compared with the sharp render."""
+"""Raw frames are compared with the sharp render, without image formation."""
 
 VARIANTS: tuple[Variant, ...] = (
     Variant("all-view", "all-view G0", "g0", ("rva.enabled=false", *_PLAIN_G0)),
     Variant("drop-blurry", "drop-blurry G0", "g0", ("rva.weighting=binary", *_PLAIN_G0)),
-    Variant("rva-paper", "RVA G0, the paper's", "g0", (*_PAPER_RVA, *_PLAIN_G0)),
+    Variant("rva-paper", "RVA G0 of the paper", "g0", (*_PAPER_RVA, *_PLAIN_G0)),
     Variant(
-        "rva-no-coverage", "the same w/o coverage", "g0", (*_PAPER_RVA, *_PLAIN_G0, "rva.coverage=false")
+        "rva-no-coverage",
+        "RVA G0 of the paper w/o coverage",
+        "g0",
+        (*_PAPER_RVA, *_PLAIN_G0, "rva.coverage=false"),
     ),
-    Variant("rva-binary", "the same, weights 0 and 1", "g0", (*_PAPER_RVA, *_PLAIN_G0, *_WEIGHT_ONE)),
+    Variant(
+        "rva-binary", "RVA G0 of the paper, weights 0 and 1", "g0", (*_PAPER_RVA, *_PLAIN_G0, *_WEIGHT_ONE)
+    ),
     Variant("rva", "RVA G0", "g0", _PLAIN_G0),
     Variant("formation", "RVA G0 with formation", "g0"),
     Variant("all-view-formation", "all-view G0 with formation", "g0", ("rva.enabled=false",)),
@@ -59,13 +64,15 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("rivr", "ClearGS w/o consolidation", "rivr"),
     Variant("full", "ClearGS", "consolidate"),
     Variant("paper-open", "paper's method, open models", "consolidate", workflow="paper-open"),
-    Variant("no-fused", "the same w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"),
+    Variant(
+        "no-fused", "paper's method w/o F_t", "consolidate", ("rivr.use_fused=false",), workflow="paper-open"
+    ),
 )
-"""From the plainest to the whole method, then the paper's. Those of equal settings share all stages; all
-share the ingest."""
+"""Variants from the simplest to the whole method, then those of the paper's recipe. Stages that have equal
+settings are shared; all variants share the ingest."""
 
 BASELINES = ("all-view", "drop-blurry")
-"""What the others are measured against."""
+"""Variants that are subtracted from the others in tables of differences."""
 
 WHOLE = "full"
 """The whole method."""
@@ -74,9 +81,9 @@ QUESTIONS: tuple[tuple[str, str, str], ...] = (
     ("the whole method, against all-view training", WHOLE, "all-view"),
     ("the whole method, against dropping blurry frames", WHOLE, "drop-blurry"),
     ("the whole method, against the paper's with open models", WHOLE, "paper-open"),
-    ("image formation alone, against RVA without it", "formation", "rva"),
+    ("only image formation, against RVA without it", "formation", "rva"),
     ("image formation in the whole method", WHOLE, "no-formation"),
-    ("repairs and consolidation, against formation alone as long", WHOLE, "formation"),
+    ("repairs and consolidation, against formation with equal steps", WHOLE, "formation"),
     ("RVA's weights under formation", "formation", "all-view-formation"),
     ("RVA, against all-view training", "rva", "all-view"),
     ("RIVR and consolidation, against RVA trained as long", WHOLE, "rva"),
@@ -87,13 +94,14 @@ QUESTIONS: tuple[tuple[str, str, str], ...] = (
     ("graded weights, against binary ones of the same frames", "rva-paper", "rva-binary"),
     ("the fused candidate", "paper-open", "no-fused"),
 )
-"""What the evidence is asked: (words, variant, variant that it is measured against)."""
+"""Questions that the evidence answers: (text, variant, variant that is subtracted)."""
 
 
 def find_variants(names: Sequence[str]) -> tuple[Variant, ...]:
-    """The variants of these names in the order of `VARIANTS`; all of them for none.
+    """Return the named variants in the order of `VARIANTS`, or all if ``names`` is empty.
 
-    Raises InputError for an unknown name.
+    Raises:
+        InputError: A name is unknown.
     """
     known = [variant.name for variant in VARIANTS]
     for name in names:

@@ -1,4 +1,4 @@
-"""``world``: captures with known truth in a trained scene."""
+"""``world``: make a synthetic capture in a trained scene."""
 
 from __future__ import annotations
 
@@ -25,15 +25,21 @@ Example:
     "--cameras",
     type=click.Path(path_type=Path),
     metavar="DIR|FILE",
-    help="Whose cameras the walk through the scene follows: a transforms.json, its folder, or a run. "
-    "Without it, the cameras of the run that holds the scene.",
+    help="Cameras that the path through the scene follows: a transforms.json, its folder, or a run. "
+    "Without it, the cameras of the run that contains the scene.",
 )
 @click.option("--protocol", default="mixed", show_default=True, help=PROTOCOL_HELP)
 @click.option(
-    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="How many frames."
+    "--frames", default=16, show_default=True, type=click.IntRange(2, 2000), help="Number of frames."
 )
 @click.option("--size", default="480x270", show_default=True, callback=parse_size, help="Image size.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Another walk.")
+@click.option(
+    "--seed",
+    default=0,
+    show_default=True,
+    type=click.IntRange(0),
+    help="Seed of the path and the degradations.",
+)
 def world(
     out: Path,
     scene: Path,
@@ -45,9 +51,9 @@ def world(
 ) -> None:
     """Make a synthetic handheld capture in a trained scene, in the new folder OUT.
 
-    OUT holds what ``cleargs synth`` makes of a procedural room.
+    OUT gets the same files as a capture of ``cleargs synth``.
     """
-    from benchmarks.comparison.splat_world import scene_setting
+    from benchmarks.comparison.splat_world import scene_setup
     from cleargs.synth.synthetic_capture import make_capture
 
     width, height = size
@@ -59,6 +65,6 @@ def world(
         height=height,
         seed=seed,
         reporter=make_reporter(),
-        setting=scene_setting(scene, cameras, frames, width, height),
+        setting=scene_setup(scene, cameras, frames, width, height),
     )
     print_capture(out, summary)

@@ -1,1 +1,1 @@
-"""The evaluators of frames against each other, and against known truth."""
+"""Compare evaluators of frames with each other and with the ground truth of synthetic captures."""

@@ -1,4 +1,4 @@
-"""``rva agree``: how far evaluators of frames agree about a run."""
+"""``rva agree``: compare evaluators on the frames of a run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from cleargs.capture.tables import Frame
 
 FOLDER = "agree"
-"""Where ``agree`` keeps scores, figures and pictures inside the run."""
+"""Folder in the run for the scores, figures and pictures of ``agree``."""
 
 _SHEET_COLUMNS = 3
 _TILE_WIDTH = 480  # px
@@ -42,7 +42,7 @@ _TILE_WIDTH = 480  # px
 def _names(context: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(part.strip() for part in value.split(",") if part.strip()))
     if len(names) < 2:
-        raise click.BadParameter("name at least two, separated by commas: statistics,qwen3-vl say")
+        raise click.BadParameter("give at least two, separated by commas, e.g. statistics,qwen3-vl")
     return names
 
 
@@ -63,7 +63,7 @@ Examples:
     help="Two or more: statistics, qwen3-vl, or qwen3-vl:MODEL.",
 )
 @click.option(
-    "--most", type=click.IntRange(min=0), default=9, show_default=True, help="How many frames to show."
+    "--most", type=click.IntRange(min=0), default=9, show_default=True, help="Number of frames to show."
 )
 @click.option("--set", "overrides", multiple=True, metavar="rva.FIELD=VALUE", help="Change one setting.")
 @work_options
@@ -81,10 +81,10 @@ def agree(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Say how far evaluators agree about the frames of RUN, and show those on which they do not.
+    """Compare evaluators on the frames of RUN and show the frames on which they disagree.
 
-    The run stays as it is: scores, figures and contact sheets go into RUN/agree. What was scored before is
-    not scored again.
+    The run does not change: scores, figures and contact sheets are written to RUN/agree. A repeated command
+    reuses the scores.
     """
     from benchmarks.rva.agreement import compare
     from cleargs.capture.tables import load_frames
@@ -127,7 +127,7 @@ def agree(
 
 
 def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> Any:
-    """The run's settings of RVA with another evaluator: NAME, or NAME:MODEL. Raises ConfigError."""
+    """Return the run's settings of RVA with another evaluator, NAME or NAME:MODEL."""
     evaluator, _, model = name.partition(":")
     document = config.document()
     for text in overrides:
@@ -139,7 +139,7 @@ def _config(dag: Dag, config: Config, name: str, overrides: Sequence[str]) -> An
 
 
 def _own_cues(dag: Dag, run: Path, config: Any, frames: Sequence[Frame]) -> EvaluatorCues | None:
-    """The cues in the run's own table, where this evaluator made them of these images; else None."""
+    """Return the cues in the run's table if this evaluator measured them on these images, else None."""
     import numpy as np
 
     from benchmarks.rva.agreement import EvaluatorCues
@@ -173,7 +173,7 @@ def _cues_of(
     threads: int,
     reporter: Reporter,
 ) -> EvaluatorCues:
-    """Score the frames, or take what RUN/agree keeps of an earlier call."""
+    """Score the frames, or read the scores of an earlier call from RUN/agree."""
     from benchmarks.rva.agreement import EvaluatorCues
     from cleargs.rva.evaluator import EvaluatedFrame, label
     from cleargs.rva.evaluators import make_evaluator
@@ -188,7 +188,7 @@ def _cues_of(
 
 
 def _write_sheet(path: Path, agreement: RankAgreement, frames: Sequence[Frame], ingest: Path) -> Path:
-    """The frames of the widest gaps, each with what both say of it."""
+    """Write a contact sheet of the frames with the widest gaps and the scores of both evaluators."""
     from benchmarks.images import read_rgb_float
     from cleargs.media.contact_sheet import Tile, contact_sheet
     from cleargs.media.image import write_rgb
@@ -208,12 +208,12 @@ def _write_sheet(path: Path, agreement: RankAgreement, frames: Sequence[Frame], 
 
 
 def _plain(name: str) -> str:
-    """``name`` as part of a file name."""
+    """Return ``name`` with the characters replaced that are unsafe in a file name."""
     return "".join(letter if letter.isalnum() or letter in "-._" else "_" for letter in name)
 
 
 def _print(document: dict[str, Any]) -> None:
-    """The report in the terminal."""
+    """Print the report in the terminal."""
     for pair in document["pairs"]:
         first, second = pair["evaluators"]
         click.echo(f"{first} | {second}: {pair['frames']} of {document['frames']} frames scored by both")

@@ -1,4 +1,4 @@
-"""How far two evaluators agree about the frames of one capture, and where they do not."""
+"""Rank agreement of two evaluators on the frames of a capture, and their largest disagreements."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from cleargs.types import ArrayF64
 
 @dataclass(frozen=True)
 class EvaluatorCues:
-    """What one evaluator says of n frames."""
+    """Cues of one evaluator for n frames."""
 
     evaluator: str
-    """Its label in the tables."""
-    cues: ArrayF64  # [n, 11], NaN where it could not score a frame
+    """Label in the tables."""
+    cues: ArrayF64  # [n, 11] in [0, 1]; NaN for frames without a score
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A frame about which two evaluators disagree."""
+    """A frame on which two evaluators disagree; pairs are (first, second evaluator)."""
 
     row: int
     gap: float
-    """Difference of its ranks by R - B, in [0, 1]: 1 when it is one's best and the other's worst."""
+    """Difference of the ranks by R - B, in [0, 1]; 1 if the frame is best for one and worst for the other."""
     R: tuple[float, float]
     B: tuple[float, float]
     rank: tuple[int, int]
-    """Place by R - B, 1 is best; equal frames share the place of the first."""
+    """Rank by R - B; 1 is best, and equal frames share the lowest rank."""
 
 
 @dataclass(frozen=True)
 class RankAgreement:
-    """Two evaluators side by side, over the frames that both scored."""
+    """Agreement of two evaluators over the frames that both scored."""
 
     evaluators: tuple[str, str]
     frames: int
     spearman: dict[str, float | None]
-    """R, B, R-B and each cue -> rank correlation; None where one of them is constant (or for < 2 frames)."""
+    """R, B, R-B and each cue -> rank correlation; None for constant values and for fewer than two frames."""
     reliable: dict[str, int]
-    """How many frames both, only the first, only the second, and neither put into the reliable set A."""
+    """Number of frames that both, only the first, only the second and neither put into the reliable set A."""
     disagreements: tuple[Disagreement, ...]
-    """Widest gap first; ties go to the earlier frame."""
+    """In order of decreasing gap; the earlier frame comes first in a tie."""
 
     def document(self, frame_id: list[int], names: list[str]) -> dict[str, Any]:
-        """As JSON values; ``frame_id`` and ``names`` of the rows."""
+        """Return JSON values; ``frame_id`` and ``names`` describe the rows."""
         return {
             "evaluators": list(self.evaluators),
             "frames": self.frames,
@@ -74,9 +74,13 @@ class RankAgreement:
 def compare(
     first: EvaluatorCues, second: EvaluatorCues, config: AssessmentConfig, *, most: int
 ) -> RankAgreement:
-    """Rank agreement of two evaluators and the ``most`` frames about which they disagree most.
+    """Compare two evaluators over the frames that both scored.
 
-    Frames that one of them could not score are left out.
+    Args:
+        first: Cues of one evaluator.
+        second: Cues of the other evaluator, for the same frames.
+        config: Weights and thresholds that turn cues into R, B and the reliable set.
+        most: Maximum number of disagreements to return, the widest gaps first.
     """
     rows = np.flatnonzero(~np.isnan(first.cues).any(axis=1) & ~np.isnan(second.cues).any(axis=1))
     sides = []
@@ -102,7 +106,7 @@ def compare(
 
 
 def spearman(x: ArrayF64, y: ArrayF64) -> float | None:  # [n] each
-    """Rank correlation with mean ranks for ties, in [-1, 1]; None where it is not defined."""
+    """Return Spearman's rank correlation in [-1, 1], with mean ranks for ties; None if it is undefined."""
     if len(x) < 2 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
     correlation = float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])

@@ -1,4 +1,4 @@
-"""``rva check``: cues against the known faults of synthetic captures."""
+"""``rva check``: correlation of cues with the known degradations of synthetic captures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from benchmarks.rva.truth import Check
 
 TRUTH = Path("truth", "frames.parquet")
-"""Where `cleargs synth` says what is wrong with each frame."""
+"""File of `cleargs synth` with the true degradations of each frame."""
 
 _HEADS = ("frames", "strong", "B ~ blur", "-R ~ blur", "motion ~ blur", "defocus ~ disc", "exposure ~ stops")
 
@@ -42,10 +42,11 @@ Examples:
 @json_option
 @click.pass_obj
 def check(dag: Dag, runs: tuple[Path, ...], as_json: bool) -> None:
-    """Say how well the cues of each RUN follow what its synthetic capture is known to suffer from.
+    """Correlate the cues of each RUN with the known degradations of its synthetic capture.
 
-    Spearman's rank correlation. A motion under 1 px and an exposure error under a quarter of a stop count as
-    none. B and R are compared with the length of the motion over the frames that have no other fault.
+    The table shows Spearman's rank correlation. Blur under 1 px and exposure errors under a quarter of a
+    stop count as zero. B and R are compared with the blur length over the frames without another
+    degradation.
     """
     found = {str(run): _check(run, dag) for run in runs}
     if as_json:
@@ -61,7 +62,7 @@ def check(dag: Dag, runs: tuple[Path, ...], as_json: bool) -> None:
 
 
 def _check(run: Path, dag: Dag) -> Check:
-    """Raises InputError where the run has no table of RVA, or its capture no truth."""
+    """Compare the run's cues with the truth; raise InputError if either is missing."""
     import numpy as np
 
     from benchmarks.rva.truth import Faults, check
@@ -75,7 +76,7 @@ def _check(run: Path, dag: Dag) -> Check:
         raise InputError(f"rva is not done in {run}", hint=f"first: cleargs stage rva {run}")
     if not (source / TRUTH).is_file():
         raise InputError(
-            f"the capture {source} has no {TRUTH}", hint="give runs on captures that `cleargs synth` made"
+            f"the capture {source} has no {TRUTH}", hint="give runs on captures made by `cleargs synth`"
         )
     judged = read_table((run / "rva").resolve() / "frames.parquet", FRAMES)
     true = read_table(source / TRUTH, TRUE_FRAMES)
@@ -85,7 +86,7 @@ def _check(run: Path, dag: Dag) -> Check:
     if absent:
         raise InputError(
             f"{absent[0]} is not in {source / TRUTH}",
-            hint="the capture changed: run it again, or make the capture again",
+            hint="the capture changed: repeat the run, or rebuild the capture",
         )
     scored = np.flatnonzero(~np.isnan(np.asarray(judged["R"].to_numpy(), dtype=np.float64)))
     order = np.array([row[names[k]] for k in scored], dtype=np.intp)

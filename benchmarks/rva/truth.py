@@ -1,4 +1,4 @@
-"""How well an evaluator's cues follow the faults that a synthetic capture is known to have."""
+"""Rank correlation of an evaluator's cues with the known degradations of a synthetic capture."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from benchmarks.rva.agreement import spearman
 from cleargs.types import ArrayBool, ArrayF64
 
 MIN_BLUR_PX = 1.0
-"""px: a shorter motion is no fault, and all such frames are equal."""
+"""Shorter blur, in px, counts as zero, so that such frames share one rank."""
 MIN_EXPOSURE_ERROR_EV = 0.25
-"""Smaller exposure errors are no fault: automatic exposure drifts by as much."""
+"""Smaller exposure errors, in stops, count as zero: automatic exposure drifts by as much."""
 MIN_DEFOCUS_PX = 0.1
-"""px, of the disc of defocus."""
+"""Smaller discs of defocus, in px, count as zero."""
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What is wrong with n frames: the columns of ``truth/frames.parquet`` of the same names."""
+    """True degradations of n frames: the columns of ``truth/frames.parquet`` with the same names."""
 
     blur_px: ArrayF64
     defocus_px: ArrayF64
     exposure_ev: ArrayF64
 
     def noticeable(self) -> Faults:
-        """The same with 0 for what is too small to be a fault, and exposure errors without sign."""
+        """Return a copy with 0 for values below the limits, and exposure errors without sign."""
         stops = np.abs(self.exposure_ev)
         return Faults(
             np.where(self.blur_px < MIN_BLUR_PX, 0.0, self.blur_px),
@@ -37,17 +37,17 @@ class Faults:
 
 @dataclass(frozen=True)
 class Check:
-    """Rank correlations of one capture; None where either side is constant."""
+    """Rank correlations of one capture; None if the cue or the truth is constant."""
 
     frames: int
     strong: float
-    """Share of the frames in the reliable set A."""
+    """Share of the frames that are in the reliable set A."""
     B_blur: float | None
-    """B against the length of the motion, over the frames without another fault."""
+    """B and the blur length, over the frames without another degradation."""
     R_blur: float | None
-    """-R against the same."""
+    """-R and the blur length, over the same frames."""
     motion: float | None
-    """b_motion_blur against the length of the motion, over all frames."""
+    """b_motion_blur and the blur length, over all frames."""
     defocus: float | None
     exposure: float | None
 
@@ -59,7 +59,7 @@ def check(
     reliable: ArrayBool,  # [n]
     faults: Faults,
 ) -> Check:
-    """Spearman's rank correlations (average ranks for ties) of scores and cues with the true faults."""
+    """Return Spearman's rank correlations of scores and cues with the true degradations."""
     true = faults.noticeable()
     alone = (true.defocus_px == 0.0) & (true.exposure_ev == 0.0)
     return Check(

@@ -1,1 +1,1 @@
-"""Time, memory and error of the splatting core and of whole runs."""
+"""Time, memory and error of the rasteriser, its training steps and whole runs."""

@@ -1,4 +1,4 @@
-"""Runs a plan: every case timed on each number of threads in turn, and checked against the oracle."""
+"""Measure the cases of a plan: time for each number of threads, memory, and error against the oracle."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from benchmarks.speed.peak_memory import peak_memory
 from benchmarks.speed.peaks import measure_peaks
 from benchmarks.speed.reference import Splats
 from benchmarks.speed.roofline import roofline
-from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
+from benchmarks.speed.timing import Clock, Quartiles, interleave, ratio
 from benchmarks.speed.work import size_of, work_of
 from cleargs.progress import Reporter
 from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.pace import random_scene
 
 RASTERISER = ("rasterise.forward", "rasterise.backward", "gradients.backpropagate")
-"""Our side of the comparison of rasterisers. The last adds the pairs up per Gaussian, which torch's side does
-too, and continues to the raw parameters, which it does not."""
+"""Kernels of ClearGS in the comparison of rasterisers. The last one sums the pairs per Gaussian, as autograd
+does for torch. It also computes gradients of the raw parameters, which torch does not."""
 
 
 def run(plan: Plan, reporter: Reporter) -> Benchmark:
-    """Measure everything that ``plan`` names."""
+    """Measure all cases of ``plan``."""
     load = os.getloadavg()[0]
     steps = len(plan.cases) + (plan.roofline is not None) + 1
     with reporter.task("measuring", steps) as task:
@@ -58,12 +58,12 @@ def run(plan: Plan, reporter: Reporter) -> Benchmark:
 
 
 def measure(case: BenchmarkCase, plan: Plan) -> ResultRow:
-    """Times, memory and errors of one case; the pure-torch rasteriser's too where the plan compares it."""
+    """Measure one case, and the pure-torch rasteriser on it if the plan asks for that."""
     use_threads(max(plan.threads))
     iteration = _iteration(case)
     size = size_of(projected_frame(iteration.gaussians, iteration.camera))
     truth = _truth(iteration, plan.seed)
-    times = take_turns(
+    times = interleave(
         {str(count): partial(iteration.run_on, count, plan.repetitions) for count in plan.threads},
         plan.rounds,
     )
@@ -79,13 +79,13 @@ def measure(case: BenchmarkCase, plan: Plan) -> ResultRow:
 
 
 def compare_rasterisers(iteration: Iteration, truth: Truth, plan: Plan) -> Rasterisers:
-    """Rasteriser against rasteriser: ours and the one in pure torch take turns on the same splats."""
+    """Time our rasteriser and the one in pure torch alternately on the same splats."""
     other = torch_rasteriser(iteration)
     variants: dict[str, Callable[[Clock], object]] = {}
     for count in plan.threads:
         variants[f"ours {count}"] = partial(iteration.run_on, count, plan.repetitions)
         variants[f"torch {count}"] = partial(other.run_on, count, truth.grad_image)
-    clocks = take_turns(variants, plan.torch_rounds)
+    clocks = interleave(variants, plan.torch_rounds)
     ours = {count: clocks[f"ours {count}"].by_round(*RASTERISER) for count in plan.threads}
     theirs = {count: clocks[f"torch {count}"].by_round("forward", "backward") for count in plan.threads}
     compared = TorchTimes(
@@ -97,7 +97,7 @@ def compare_rasterisers(iteration: Iteration, truth: Truth, plan: Plan) -> Raste
 
 
 def torch_rasteriser(iteration: Iteration) -> TorchRasteriser:
-    """The rasteriser in pure torch, ready to run on a scene."""
+    """Return the rasteriser in pure torch for the scene of ``iteration``."""
     tensors = iteration.gaussians.tensors()
     leaves = {name: tensor.double().requires_grad_() for name, tensor in tensors.items()}
     camera = iteration.camera
@@ -110,7 +110,7 @@ def torch_rasteriser(iteration: Iteration) -> TorchRasteriser:
 
 
 class TorchRasteriser:
-    """A rasteriser in pure torch, in float32, behind the oracle's projection in float64."""
+    """A float32 rasteriser in pure torch, after the oracle's projection in float64."""
 
     def __init__(self, leaves: dict[str, Tensor], exact: Splats, render: Callable[[Splats], Tensor]) -> None:
         self._leaves = leaves
@@ -119,7 +119,7 @@ class TorchRasteriser:
         self._splats = Splats(*(tensor.detach().float().requires_grad_() for tensor in exact))
 
     def run_on(self, threads: int, grad_image: Tensor, clock: Clock) -> None:
-        """Forward and backward pass on so many threads, a repetition on ``clock``."""
+        """Time forward and backward pass on ``threads`` threads; ``grad_image`` is dL/d(image) [H, W, 3]."""
         use_threads(threads)
         with clock.repetition():
             with clock.time("forward"):
@@ -128,21 +128,21 @@ class TorchRasteriser:
                 torch.autograd.grad(image, self._splats[:4], grad_image)
 
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
-        """Image [H, W, 3] and gradients of the raw parameters; through the projection in float64."""
+        """Return the image [H, W, 3] and the gradients of the raw parameters for dL/d(image) [H, W, 3]."""
         image = self._render(self._splats)
-        slopes = torch.autograd.grad(image, self._splats[:4], grad_image)
+        grad_splats = torch.autograd.grad(image, self._splats[:4], grad_image)
         gradients = torch.autograd.grad(
-            self._exact[:4], list(self._leaves.values()), [slope.double() for slope in slopes]
+            self._exact[:4], list(self._leaves.values()), [gradient.double() for gradient in grad_splats]
         )
         return image.detach(), Gaussians(*gradients)
 
 
 def measure_roofline(case: BenchmarkCase, plan: Plan) -> Rooflines:
-    """The machine's peaks, and every kernel's share of what they allow."""
+    """Measure the machine's peaks, and each kernel's time relative to them."""
     iteration = _iteration(case)
     size = size_of(projected_frame(iteration.gaussians, iteration.camera))
     work = work_of(size)
-    clocks = take_turns(
+    clocks = interleave(
         {str(count): partial(iteration.run_on, count, plan.repetitions) for count in plan.threads},
         plan.rounds,
     )
@@ -152,10 +152,10 @@ def measure_roofline(case: BenchmarkCase, plan: Plan) -> Rooflines:
 
 
 def measure_scaling(series: dict[str, Sequence[BenchmarkCase]], plan: Plan) -> dict[str, list[ScalingPoint]]:
-    """Forward and backward pass of every case, all in turn, on the most threads; and their memory."""
+    """Measure forward and backward pass of all cases alternately, on the largest number of threads."""
     iterations = {case: _iteration(case) for cases in series.values() for case in cases}
     threads = max(plan.threads)
-    clocks = take_turns(
+    clocks = interleave(
         {str(case): partial(iteration.run_on, threads, 1) for case, iteration in iterations.items()},
         plan.rounds,
     )

@@ -1,4 +1,4 @@
-"""What a benchmark measures: sizes, threads, repeats."""
+"""Plans of benchmarks: sizes, threads and repetitions."""
 
 from __future__ import annotations
 
@@ -6,33 +6,33 @@ import dataclasses
 from typing import NamedTuple
 
 MEDIAN_SIGMA = 1.8
-"""Median standard deviation of the projected splats, px: about five tiles per splat with its tails."""
+"""Median standard deviation of the projected splats, px: a splat then touches about five tiles."""
 
 
 class BenchmarkCase(NamedTuple):
-    """A random scene in a view."""
+    """A random scene and the size of its view."""
 
     gaussians: int
-    width: int
-    height: int
-    sigma: float = MEDIAN_SIGMA
+    width: int  # px
+    height: int  # px
+    sigma: float = MEDIAN_SIGMA  # px
 
     @property
     def title(self) -> str:
-        """As tables name it."""
+        """Name in tables."""
         return f"{self.gaussians:,} at {self.width}x{self.height}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A benchmark. Cases are timed on every number of threads in turn."""
+    """A benchmark of the CPU. Each case is timed alternately on each number of threads."""
 
     cases: tuple[BenchmarkCase, ...]
     threads: tuple[int, ...]
     rounds: int = 7
-    repetitions: int = 3  # iterations a round
-    torch_rounds: int = 3  # of the comparison with torch, one iteration a round
-    torch_largest: BenchmarkCase | None = None  # up to this many splats and pixels pure torch runs
+    repetitions: int = 3  # iterations per round
+    torch_rounds: int = 3  # rounds of the comparison with torch, one iteration per round
+    torch_largest: BenchmarkCase | None = None  # pure torch runs up to this many splats and pixels
     roofline: BenchmarkCase | None = None
     more_splats: tuple[BenchmarkCase, ...] = ()  # scaling: the number of splats grows
     larger_splats: tuple[BenchmarkCase, ...] = ()  # scaling: each splat grows
@@ -41,7 +41,7 @@ class Plan:
     seed: int = 0
 
     def compares_torch(self, case: BenchmarkCase) -> bool:
-        """Whether the pure-torch rasteriser runs on this case too."""
+        """Return True if the pure-torch rasteriser runs on this case too."""
         largest = self.torch_largest
         return (
             largest is not None
@@ -56,26 +56,26 @@ class DevicePlan:
 
     cases: tuple[BenchmarkCase, ...]
     rounds: int = 7
-    repetitions: int = 10  # iterations a round
+    repetitions: int = 10  # iterations per round
     seed: int = 0
 
 
 def device_plan() -> DevicePlan:
-    """100,000 to 3,000,000 splats, 1280x720 and 1920x1080."""
+    """Return the plan with 100,000 to 3,000,000 splats at 1280x720 and 1920x1080."""
     counts = (100_000, 500_000, 1_000_000, 3_000_000)
     sizes = ((1280, 720), (1920, 1080))
     return DevicePlan(tuple(BenchmarkCase(count, *size) for size in sizes for count in counts))
 
 
 def quick_device_plan() -> DevicePlan:
-    """Two small cases: to try the command, not to quote."""
+    """Return a plan with two small cases, to try the command; do not quote its figures."""
     return DevicePlan(
         (BenchmarkCase(4_000, 160, 90), BenchmarkCase(20_000, 320, 180)), rounds=3, repetitions=3
     )
 
 
 def full_plan(threads: tuple[int, ...]) -> Plan:
-    """10,000 to 400,000 splats, 320x180 to 1280x720."""
+    """Return the plan with 10,000 to 400,000 splats at 320x180 to 1280x720."""
     counts = (10_000, 50_000, 200_000, 400_000)
     sizes = ((320, 180), (640, 360), (960, 540), (1280, 720))
     return Plan(
@@ -93,7 +93,7 @@ def full_plan(threads: tuple[int, ...]) -> Plan:
 
 
 def quick_plan(threads: tuple[int, ...]) -> Plan:
-    """The same kinds of rows at sizes that take seconds: to try the command, not to quote."""
+    """Return a plan with the same tables in seconds, to try the command; do not quote its figures."""
     return Plan(
         cases=(BenchmarkCase(1_000, 160, 90), BenchmarkCase(4_000, 160, 90), BenchmarkCase(4_000, 320, 180)),
         threads=threads,

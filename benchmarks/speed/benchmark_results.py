@@ -1,4 +1,4 @@
-"""What a benchmark found, as plain data."""
+"""Results of a benchmark."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from benchmarks.speed.work import Size
 from cleargs.splat.pace import processor_name
 
 Times = dict[str, Quartiles]
-"""Part of an iteration -> milliseconds."""
+"""Part of an iteration -> time in ms."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where it was measured, and what else ran there."""
+    """The machine and its load during a benchmark."""
 
     processor: str
     cores: int
     versions: dict[str, str]
-    load_before: float  # load average over a minute
+    load_before: float  # mean load over one minute
     load_after: float
 
 
 @dataclass(frozen=True)
 class TorchTimes:
-    """The pure-torch rasteriser, forward and backward, by the number of threads."""
+    """Forward and backward pass of the pure-torch rasteriser, by number of threads."""
 
     times: dict[int, Quartiles]  # ms
-    ratio: dict[int, Quartiles]  # its time / ours, round by round
-    accuracy: Accuracy  # behind the oracle's projection
+    ratio: dict[int, Quartiles]  # its time / ours, per round
+    accuracy: Accuracy  # after the oracle's projection
 
 
 @dataclass(frozen=True)
 class Rasterisers:
-    """Our rasteriser against pure torch, forward and backward, by the number of threads."""
+    """Forward and backward pass of our rasteriser and of pure torch, by number of threads."""
 
     ours: dict[int, Quartiles]  # ms
     torch: TorchTimes
@@ -51,30 +51,30 @@ class Rasterisers:
 
 @dataclass(frozen=True)
 class ResultRow:
-    """One case."""
+    """Results of one case."""
 
     case: BenchmarkCase
-    pairs: int
+    pairs: int  # (tile, splat)
     contributions: int
-    times: dict[int, Times]  # by the number of threads
-    memory: int | None  # bytes; None where the system does not tell
+    times: dict[int, Times]  # by number of threads
+    memory: int | None  # peak, bytes; None if unknown
     accuracy: Accuracy
-    rasterisers: Rasterisers | None  # None: not run
+    rasterisers: Rasterisers | None  # None if not run
 
 
 @dataclass(frozen=True)
 class ScalingPoint:
-    """Forward and backward pass on all threads, and peak memory, at one number of pairs."""
+    """Time of forward and backward pass on all threads, and peak memory, for one number of pairs."""
 
     case: BenchmarkCase
     pairs: int
     milliseconds: Quartiles
-    memory: int | None
+    memory: int | None  # bytes
 
 
 @dataclass(frozen=True)
 class Rooflines:
-    """The kernels of one case under the machine's roof, by the number of threads."""
+    """Rooflines of the kernels for one case, by number of threads."""
 
     case: BenchmarkCase
     size: Size
@@ -84,7 +84,7 @@ class Rooflines:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Everything that ``python -m benchmarks splat`` reports."""
+    """Results of ``python -m benchmarks splat``."""
 
     machine: Machine
     threads: tuple[int, ...]
@@ -93,20 +93,20 @@ class Benchmark:
     scaling: dict[str, list[ScalingPoint]]  # series -> points
 
     def as_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists; a BenchmarkCase or a Size becomes an object with named fields."""
+        """Return dictionaries and lists; a BenchmarkCase or Size becomes a dictionary too."""
         plain: dict[str, Any] = asdict(self, dict_factory=named)
         return plain
 
 
 def named(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The fields of a dataclass; a BenchmarkCase or a Size becomes an object with named fields too."""
+    """Return the fields of a dataclass; a BenchmarkCase or Size becomes a dictionary too."""
     return {
         name: value._asdict() if isinstance(value, BenchmarkCase | Size) else value for name, value in items
     }
 
 
 def describe_machine(load_before: float) -> Machine:
-    """This machine, at the end of the measurements."""
+    """Describe this machine at the end of the measurements."""
     return Machine(
         processor=processor_name(),
         cores=len(os.sched_getaffinity(0)),

@@ -1,4 +1,4 @@
-"""Commands that measure the splatting core on this machine, and how far it is from the truth."""
+"""Commands that measure the speed and the error of ClearGS on this machine."""
 
 from __future__ import annotations
 
@@ -18,20 +18,26 @@ from cleargs.splat.config import Quality
     epilog="""\b
 Examples:
   python -m benchmarks splat -o bench            all sizes; tables, JSON and pictures
-  python -m benchmarks splat --quick             the same kinds of rows, small
-  python -m benchmarks splat -o bench --device cuda   the GPU, next to gsplat where it imports
+  python -m benchmarks splat --quick             the same tables, small sizes
+  python -m benchmarks splat -o bench --device cuda   a GPU, compared with gsplat if it is installed
 
 How to read the tables: docs/speed.md.
 """
 )
 @output_option("Folder to fill.", "out", required=False)
-@click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
-@click.option("--threads", type=click.IntRange(1), help="Measured besides 1.  [default: all cores]")
+@click.option("--quick", is_flag=True, help="Use small sizes, to try the command; do not quote the figures.")
 @click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Chooses the oracle's pixels."
+    "--threads", type=click.IntRange(1), help="Number of threads to measure besides 1.  [default: all cores]"
 )
 @click.option(
-    "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="What to measure."
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed for the oracle's pixels."
+)
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="Device to measure.",
 )
 @json_option
 @quiet_option
@@ -44,18 +50,19 @@ def splat(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Speed beside error: 10,000 to 400,000 splats, 320x180 to 1280x720, on 1 thread and on all.
+    """Measure speed and error of the rasteriser: 10,000 to 400,000 splats, 320x180 to 1280x720.
 
-    Forward and backward pass, loss, Adam and memory; the image's and every gradient's error against the
-    float64 oracle; a rasteriser in pure torch; each kernel under the machine's roof; how cost grows. With -o
-    the folder gets splat.md, splat.json, speed-error.png and scaling.png; without it the tables are printed.
+    Measures forward and backward pass, loss, Adam and memory, on 1 thread and on all. Compares image and
+    gradients with a float64 oracle, the time with a rasteriser in pure torch, and each kernel with the peaks
+    of the machine. With -o, the folder gets splat.md, splat.json, speed-error.png and scaling.png. Without
+    it, the tables are printed.
 
-    On a GPU: 100,000 to 3,000,000 splats at 1280x720 and 1920x1080, next to gsplat; splat-cuda.md and
-    splat-cuda.json.
+    On a GPU: 100,000 to 3,000,000 splats at 1280x720 and 1920x1080, compared with gsplat. The folder gets
+    splat-cuda.md and splat-cuda.json.
     """
     if device == "cuda":
         if threads is not None:
-            raise click.UsageError("--threads belongs to --device cpu")
+            raise click.UsageError("--threads only applies to --device cpu")
         _splat_on_gpu(out, quick=quick, seed=seed, as_json=as_json, quiet=quiet)
         return
     import dataclasses
@@ -78,7 +85,7 @@ def splat(
         write_json(out / "splat.json", values)
         plot_speed_error(out / "speed-error.png", benchmark)
         plot_scaling(out / "scaling.png", benchmark)
-    _answer(text, values, out and out / "splat.md", as_json)
+    _print_results(text, values, out and out / "splat.md", as_json)
 
 
 def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, quiet: bool) -> None:
@@ -100,10 +107,10 @@ def _splat_on_gpu(out: Path | None, *, quick: bool, seed: int, as_json: bool, qu
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     for benchmark in run(plan, device, make_reporter(quiet)):
-        if out is not None:  # after every case, since time on a GPU may end
+        if out is not None:  # after every case, in case the time on the GPU ends
             write_bytes(out / "splat-cuda.md", device_markdown(benchmark).encode())
             write_json(out / "splat-cuda.json", benchmark.as_json())
-    _answer(device_markdown(benchmark), benchmark.as_json(), out and out / "splat-cuda.md", as_json)
+    _print_results(device_markdown(benchmark), benchmark.as_json(), out and out / "splat-cuda.md", as_json)
 
 
 @click.command(
@@ -114,7 +121,7 @@ Examples:
 """
 )
 @click.option(
-    "--gaussians", default=50_000, show_default=True, type=click.IntRange(1), help="How many splats."
+    "--gaussians", default=50_000, show_default=True, type=click.IntRange(1), help="Number of splats."
 )
 @click.option(
     "--width", default=640, show_default=True, type=click.IntRange(1, 8192), help="Image width, px."
@@ -122,8 +129,8 @@ Examples:
 @click.option(
     "--height", default=360, show_default=True, type=click.IntRange(1, 8192), help="Image height, px."
 )
-@click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
-@click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Rounds to measure.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads.  [default: all cores]")
+@click.option("--repeats", default=4, show_default=True, type=click.IntRange(1), help="Number of rounds.")
 @json_option
 def train(
     gaussians: int,
@@ -133,7 +140,10 @@ def train(
     repeats: int,
     as_json: bool,
 ) -> None:
-    """Time one training iteration (SH degree 3): forward, loss, backward, Adam; and its error."""
+    """Time one training iteration (SH degree 3) and measure its error.
+
+    The parts are forward pass, loss, backward pass and Adam.
+    """
     from benchmarks.speed.benchmark import measure
     from benchmarks.speed.benchmark_plan import BenchmarkCase, Plan
     from benchmarks.speed.iteration import PARTS, WHOLE
@@ -161,15 +171,15 @@ Examples:
 """
 )
 @output_option("Folder to fill.", "out", required=False)
-@click.option("--quick", is_flag=True, help="Small sizes: to try the command, not to quote.")
-@click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
+@click.option("--quick", is_flag=True, help="Use small sizes, to try the command; do not quote the figures.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads.  [default: all cores]")
 @json_option
 @quiet_option
 def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool, quiet: bool) -> None:
-    """What a blurred frame costs a training step, and how near the photograph is to the true exposure.
+    """Measure the cost of a training step on a blurred frame, and the error of the simulated blur.
 
-    Blurs of 3, 10 and 30 px: a step that takes the frame for sharp, one through image formation, and the mean
-    of 3 to 17 renders along the path. The truth is the mean of many renders.
+    Compares three kinds of steps for blurs of 3, 10 and 30 px: without blur, with image formation, and with
+    the mean of 3 to 17 renders along the path. The true exposure is the mean of many renders.
     """
     from benchmarks.speed.formation_cost import plan_of, run
     from benchmarks.speed.formation_report import formation_markdown, plot_formation
@@ -184,7 +194,7 @@ def formation(out: Path | None, quick: bool, threads: int | None, as_json: bool,
         write_bytes(out / "formation.md", text.encode())
         write_json(out / "formation.json", values)
         plot_formation(out / "formation.png", benchmark)
-    _answer(text, values, out and out / "formation.md", as_json)
+    _print_results(text, values, out and out / "formation.md", as_json)
 
 
 @click.command(
@@ -198,7 +208,7 @@ Examples:
 @click.argument(
     "captures", metavar="INPUT...", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)
 )
-@output_option("Folder to fill; what is finished there is not made again.", "out")
+@output_option("Folder to fill; finished runs in it are reused.", "out")
 @click.option(
     "--quality",
     "qualities",
@@ -206,9 +216,9 @@ Examples:
     type=click.Choice(get_args(Quality)),
     default=("draft", "standard"),
     show_default=True,
-    help="What trainings may cost; give it several times.",
+    help="Quality to measure; may be repeated.",
 )
-@click.option("--until", default="consolidate", show_default=True, help="The stage whose scene is judged.")
+@click.option("--until", default="consolidate", show_default=True, help="Last stage; its scene is evaluated.")
 @click.option(
     "--set",
     "overrides",
@@ -216,7 +226,7 @@ Examples:
     metavar="STAGE.FIELD=VALUE",
     help="Change one setting of all runs (cleargs settings lists them).",
 )
-@click.option("--threads", type=click.IntRange(1), help="Threads; all by default.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads.  [default: all cores]")
 @json_option
 @quiet_option
 def quality(
@@ -229,10 +239,10 @@ def quality(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """What each --quality takes on real captures, and what it reaches on frames kept apart.
+    """Measure the time of each --quality on real captures, and its PSNR on held-out frames.
 
-    Runs every capture at every quality, every eighth frame held out; the folder gets quality.md, quality.json
-    and quality.png beside the runs. Minutes are those of a machine with nothing else to do.
+    Runs each capture at each quality, with every eighth frame held out. The folder gets the runs, quality.md,
+    quality.json and quality.png. Measure on an idle machine.
     """
     from benchmarks.speed.quality_cost import QualityPlan, run
     from benchmarks.speed.quality_report import plot_quality, quality_markdown
@@ -249,11 +259,11 @@ def quality(
     write_bytes(out / "quality.md", text.encode())
     write_json(out / "quality.json", values)
     plot_quality(out / "quality.png", benchmark)
-    _answer(text, values, out / "quality.md", as_json)
+    _print_results(text, values, out / "quality.md", as_json)
 
 
-def _answer(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
-    """The figures on stdout, or where they were written."""
+def _print_results(text: str, values: Mapping[str, Any], written: Path | None, as_json: bool) -> None:
+    """Print the figures as JSON, or the path of the written tables, or the tables."""
     if as_json:
         print_json(values)
     else:

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU: our iteration, gsplat's passes beside it, and the errors of both."""
+"""Benchmark of a GPU: our training iteration, the passes of gsplat, and the errors of both."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from benchmarks.speed.benchmark_results import Times, named
 from benchmarks.speed.gsplat_cuda import GsplatRasteriser, load_gsplat
 from benchmarks.speed.iteration import Iteration
 from benchmarks.speed.oracle import Accuracy, accuracy, choose_pixels, oracle
-from benchmarks.speed.timing import Clock, EventClock, Quartiles, ratio, take_turns
+from benchmarks.speed.timing import Clock, EventClock, Quartiles, interleave, ratio
 from cleargs.progress import Reporter
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
@@ -26,60 +26,61 @@ from cleargs.splat.kernels.cuda.pipeline import CudaRasteriser
 from cleargs.splat.pace import random_scene
 
 MEMORY_REPETITIONS = 3
+"""Iterations over which the peak memory is taken."""
 
 
 @dataclass(frozen=True)
-class Side:
-    """One rasteriser on one case."""
+class RasteriserResult:
+    """Results of one rasteriser on one case."""
 
     times: Times
-    memory: int | None  # peak bytes of its tensors; None where they do not lie on a GPU
+    memory: int | None  # peak bytes of its tensors; None without a GPU
     accuracy: Accuracy
 
 
 @dataclass(frozen=True)
 class DeviceRow:
-    """One case."""
+    """Results of one case."""
 
     case: BenchmarkCase
-    pairs: int
-    reached: int  # pairs before every pixel of their tile has stopped
-    ours: Side
-    gsplat: Side | None
-    ratio: Quartiles | None  # gsplat's forward and backward pass / ours, round by round
+    pairs: int  # (tile, splat)
+    reached: int  # pairs before all pixels in their tile are opaque
+    ours: RasteriserResult
+    gsplat: RasteriserResult | None
+    ratio: Quartiles | None  # forward and backward pass: gsplat's time / ours, per round
 
 
 @dataclass(frozen=True)
 class DeviceBenchmark:
-    """Everything that ``python -m benchmarks splat --device cuda`` reports."""
+    """Results of ``python -m benchmarks splat --device cuda``."""
 
     device: str
     versions: dict[str, str]
-    gsplat_missing: str | None  # why gsplat was not run
+    gsplat_missing: str | None  # the reason if gsplat was not run
     rows: list[DeviceRow]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists; a Case becomes an object with named fields."""
+        """Return dictionaries and lists; a BenchmarkCase becomes a dictionary too."""
         plain: dict[str, Any] = asdict(self, dict_factory=named)
         return plain
 
 
 class DeviceIteration(Iteration):
-    """A training iteration as the trainer runs it on a GPU, where nobody waits for the value of the loss."""
+    """A training iteration as on a GPU: the trainer does not wait for the value of the loss."""
 
     def differentiate(self, image: Tensor) -> Tensor:
-        """See `Iteration`; the loss itself stays on the device."""
-        self._losses.add(len(self._losses), image, self._target, gradient=self._slope)
-        return self._slope
+        """Return the gradient as in `Iteration`; the loss stays on the device."""
+        self._losses.add(len(self._losses), image, self._target, gradient=self._gradient)
+        return self._gradient
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
-        """Several iterations, then the losses are read."""
+        """Time ``repetitions`` iterations, then read their losses."""
         super().run_several(repetitions, clock)
         self._losses.take()
 
 
 def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[DeviceBenchmark]:
-    """Measure case by case: what is known so far after each, so that a time limit loses the rest alone."""
+    """Measure case by case; yield all results so far, so that a time limit loses only the rest."""
     gsplat: Any = None
     missing: str | None = "runs on a GPU only"
     if device.type == "cuda":
@@ -96,7 +97,7 @@ def run(plan: DevicePlan, device: torch.device, reporter: Reporter) -> Iterator[
 
 
 def measure(case: BenchmarkCase, plan: DevicePlan, device: torch.device, gsplat: Any | None) -> DeviceRow:
-    """Times, memory and errors of one case; ``gsplat`` takes turns where it is given."""
+    """Measure one case; with ``gsplat``, time both rasterisers alternately."""
     gaussians, camera = random_scene(case.gaussians, case.width, case.height, sigma=case.sigma)
     truth = oracle(gaussians, camera, choose_pixels(camera, case.gaussians, plan.seed), plan.seed)
     make: dict[str, Callable[[], DeviceIteration | GsplatRasteriser]] = {
@@ -106,13 +107,13 @@ def measure(case: BenchmarkCase, plan: DevicePlan, device: torch.device, gsplat:
         make["gsplat"] = partial(GsplatRasteriser, gsplat, gaussians, camera, device)
     memory = {name: peak_memory(device, made) for name, made in make.items()}
     rasterisers = {name: made() for name, made in make.items()}
-    clocks = take_turns(
+    clocks = interleave(
         {name: partial(made.run_several, plan.repetitions) for name, made in rasterisers.items()},
         plan.rounds,
         EventClock if device.type == "cuda" else Clock,
     )
     sides = {
-        name: Side(
+        name: RasteriserResult(
             clocks[name].quartiles(),
             memory[name],
             accuracy(truth, *made.image_and_gradients(truth.grad_image)),
@@ -132,7 +133,7 @@ def measure(case: BenchmarkCase, plan: DevicePlan, device: torch.device, gsplat:
 
 
 def peak_memory(device: torch.device, make: Callable[[], DeviceIteration | GsplatRasteriser]) -> int | None:
-    """Bytes that tensors take at their peak, from nothing on; None where they do not lie on a GPU."""
+    """Return the peak bytes of tensors while a new rasteriser runs; None without a GPU."""
     if device.type != "cuda":
         return None
     torch.cuda.empty_cache()
@@ -144,7 +145,7 @@ def peak_memory(device: torch.device, make: Callable[[], DeviceIteration | Gspla
 
 
 class _CountingRasteriser(CudaRasteriser):
-    """The GPU rasteriser with a view of how much work a picture was."""
+    """The GPU rasteriser with access to its counts of pairs."""
 
     @property
     def work(self) -> tuple[int, int]:
@@ -153,14 +154,14 @@ class _CountingRasteriser(CudaRasteriser):
 
 
 def count_pairs(gaussians: Gaussians, camera: Camera, device: torch.device) -> tuple[int, int]:
-    """(tile, splat) pairs of a view, and those before every pixel of their tile has stopped."""
+    """Return the number of (tile, splat) pairs, and of those before all pixels in their tile are opaque."""
     rasteriser = _CountingRasteriser(device)
     rasteriser.forward(gaussians, camera)
     return rasteriser.work
 
 
 def device_name(device: torch.device) -> str:
-    """The GPU's name and memory."""
+    """Return the GPU's name and memory."""
     if device.type != "cuda":
         return f"Triton's interpreter on {platform.machine()}"
     found = torch.cuda.get_device_properties(device)
@@ -168,7 +169,7 @@ def device_name(device: torch.device) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of what the times depend on; CUDA as PyTorch was built."""
+    """Return the versions of software that affects the times; CUDA is that of PyTorch."""
     known = {"cleargs": cleargs.__version__, "python": platform.python_version()}
     for name in ("torch", "triton", "gsplat"):
         try:

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU as Markdown."""
+"""Tables of the benchmark of a GPU as Markdown."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from benchmarks.speed.markdown import GROUPS, NOT_RUN, accuracy_cells, megabytes
 
 
 def device_markdown(benchmark: DeviceBenchmark) -> str:
-    """Every table, with what its figures mean."""
+    """Return all tables with an explanation of their figures."""
     versions = ", ".join(f"{name} {number}" for name, number in benchmark.versions.items())
     parts = [
-        "# Speed against error of the splatting core on a GPU",
+        "# Speed and error of the rasteriser on a GPU",
         f"{benchmark.device}; {versions}.",
-        "Times are milliseconds of the device, median [quartiles]. Random splats of SH degree 3, evenly over "
-        "the view, black background.",
+        "Times are device time in ms, median [quartiles]. Scenes are random splats of SH degree 3, spread "
+        "evenly over the view, on black.",
         "## A training iteration",
-        "Forward pass, L1 + D-SSIM with its gradient, backward pass, Adam. Pairs are (tile, splat); reached "
-        "are those before every pixel of their tile has stopped. Memory is the peak of parameters, moments, "
-        "gradients and buffers.",
+        "Forward pass, L1 + D-SSIM with its gradient, backward pass, Adam. Pairs are (tile, splat) pairs; "
+        "reached are those before all pixels in their tile are opaque. Memory is the peak of parameters, "
+        "moments, gradients and buffers.",
         table(
             ["splats", "pairs", "reached", *PARTS, WHOLE, "peak memory, MB"],
             [_iteration(row) for row in benchmark.rows],
         ),
-        "## Beside gsplat",
+        "## Comparison with gsplat",
     ]
     if benchmark.gsplat_missing is not None:
         parts.append(f"{NOT_RUN.capitalize()}: {benchmark.gsplat_missing}.")
     else:
         parts += [
-            "Forward and backward pass from the raw parameters, in turn in one process. gsplat's memory is "
-            "that of parameters, gradients and what autograd keeps, without moments.",
+            "Forward and backward pass from the raw parameters, timed alternately in one process. The memory "
+            "of gsplat includes parameters, gradients and tensors that autograd keeps, but no moments.",
             table(
                 ["splats", "ours", "gsplat forward", "gsplat backward", "gsplat / ours", "gsplat memory, MB"],
                 [_comparison_row(row) for row in benchmark.rows],

@@ -1,6 +1,6 @@
-"""What image formation costs a training step, and how near it is to the true exposure.
+"""Cost of image formation in a training step, and its error against the true exposure.
 
-Beside it the other way of putting a blur into the loss: the mean of N renders along the path, as in
+It is compared with the other way to put blur into the loss: the mean of N renders along the path, as in
 "BAD-Gaussians" (Zhao et al. 2024) and "Deblur-GS" (Chen & Liu 2024).
 """
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from benchmarks.speed.benchmark_results import Machine, describe_machine
 from benchmarks.speed.iteration import WHOLE, Iteration, use_threads
 from benchmarks.speed.random_scenes import surface_scene
-from benchmarks.speed.timing import Quartiles, ratio, take_turns
+from benchmarks.speed.timing import Quartiles, interleave, ratio
 from cleargs.formation.frame import FrameFormation, reach_of
 from cleargs.formation.motion import TWIST, FrameMotion
 from cleargs.formation.observed import FormedView
@@ -39,24 +39,25 @@ from cleargs.splat.kernels.rasteriser import Rasteriser
 from cleargs.types import PlaneF32
 
 PLAIN, FORMED = "sharp render", "formation"
-"""A step that takes the frame for sharp, and one through `cleargs.formation`."""
+"""A step without blur, and one with `cleargs.formation`."""
 
 CPU = torch.device("cpu")
 
 TRUTH_PER_PIXEL = 4
-"""Renders a pixel of blur whose mean is the truth."""
+"""Number of renders per pixel of blur whose mean is the true exposure."""
 
 
 @dataclass(frozen=True)
 class FormationPlan:
-    """What to measure."""
+    """Scene, blurs and repetitions of the benchmark."""
 
     gaussians: int = 50_000
     width: int = 640
     height: int = 360
     lengths: tuple[float, ...] = (3.0, 10.0, 30.0)
-    """Blurs, mean pixels."""
+    """Mean lengths of the blurs, px."""
     renders: tuple[int, ...] = (3, 5, 9, 17)
+    """Numbers of renders to average."""
     threads: int = 1
     rounds: int = 7
     repetitions: int = 3
@@ -64,59 +65,59 @@ class FormationPlan:
 
 @dataclass(frozen=True)
 class FormationRow:
-    """One blur: every way of a step by its name, `PLAIN`, `FORMED` or ``N renders``."""
+    """Results for one blur, by method: `PLAIN`, `FORMED` or ``N renders``."""
 
     length: float
     times: dict[str, Quartiles]
-    """ms a step."""
+    """Time per step, ms."""
     ratio: dict[str, Quartiles]
-    """Time over that of `PLAIN`, round by round."""
+    """Time / time of `PLAIN`, per round."""
     psnr: dict[str, float]
-    """Of the image against the true exposure, dB."""
+    """PSNR of the image against the true exposure, dB."""
 
 
 @dataclass(frozen=True)
 class FormationBenchmark:
-    """All rows, and where they were measured."""
+    """Results for all blurs, and the machine."""
 
     machine: Machine
     plan: FormationPlan
     rows: list[FormationRow]
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return dictionaries and lists."""
         return asdict(self)
 
 
 def plan_of(*, quick: bool, threads: int) -> FormationPlan:
-    """The measurement to quote, or a small one of the same kind."""
+    """Return the plan to quote, or with ``quick`` a small one of the same kind."""
     if quick:
         return FormationPlan(2_000, 96, 54, (3.0, 10.0), (3, 9), threads, rounds=2, repetitions=1)
     return FormationPlan(threads=threads)
 
 
 def run(plan: FormationPlan, reporter: Reporter) -> FormationBenchmark:
-    """Measure every blur of the plan, its ways taking turns."""
+    """Measure each blur of the plan; its methods are timed alternately."""
     load = os.getloadavg()[0]
     use_threads(plan.threads)
     gaussians, camera = surface_scene(plan.gaussians, plan.width, plan.height)
     rows = []
     with reporter.task("measuring", len(plan.lengths)) as task:
         for length in plan.lengths:
-            rows.append(_row(length, plan, gaussians, camera))
+            rows.append(_measure_blur(length, plan, gaussians, camera))
             task.update(done=len(rows), note=f"{length:g} px")
     return FormationBenchmark(describe_machine(load), plan, rows)
 
 
 def motion_of(length: float, median_depth: float) -> FrameMotion:
-    """A step to the right and a turn, half of the blur each at the median depth; pixels."""
+    """Return a motion to the right and a rotation, each with half of the blur ``length`` in px."""
     blur = np.zeros(TWIST)
     blur[0] = blur[4] = 0.5 * length
     return FrameMotion(blur=blur, median_depth=median_depth)
 
 
 def poses_along(camera: Camera, motion: FrameMotion, count: int) -> list[Camera]:
-    """The cameras at ``count`` instants of the exposure, the middles of equal parts of it."""
+    """Return cameras at the centres of ``count`` equal parts of the exposure."""
     cameras = []
     for t in (np.arange(count) + 0.5) / count - 0.5:
         moved = np.eye(4)
@@ -126,22 +127,22 @@ def poses_along(camera: Camera, motion: FrameMotion, count: int) -> list[Camera]
     return cameras
 
 
-def _row(length: float, plan: FormationPlan, gaussians: Gaussians, camera: Camera) -> FormationRow:
-    ways = _ways(length, plan.renders, gaussians, camera)
+def _measure_blur(length: float, plan: FormationPlan, gaussians: Gaussians, camera: Camera) -> FormationRow:
+    methods = _methods(length, plan.renders, gaussians, camera)
     truth = _truth(length, gaussians, camera)
-    clocks = take_turns(
-        {name: partial(way.run_several, plan.repetitions) for name, way in ways.items()}, plan.rounds
+    clocks = interleave(
+        {name: partial(method.run_several, plan.repetitions) for name, method in methods.items()}, plan.rounds
     )
     taken = {name: clock.by_round(WHOLE) for name, clock in clocks.items()}
     return FormationRow(
         length,
         times={name: clock.quartiles()[WHOLE] for name, clock in clocks.items()},
         ratio={name: ratio(values, taken[PLAIN]) for name, values in taken.items()},
-        psnr={name: psnr(way.image(), truth, None) for name, way in ways.items()},
+        psnr={name: psnr(method.image(), truth, None) for name, method in methods.items()},
     )
 
 
-def _ways(
+def _methods(
     length: float, counts: Sequence[int], gaussians: Gaussians, camera: Camera
 ) -> Mapping[str, Iteration]:
     motion = motion_of(length, _median_depth(gaussians, camera))
@@ -153,7 +154,7 @@ def _ways(
 
 
 def _truth(length: float, gaussians: Gaussians, camera: Camera) -> Tensor:
-    """The exposure [H, W, 3] as the mean of many renders along the true path, sRGB."""
+    """Return the exposure [H, W, 3]: the mean in linear light of many renders along the path, as sRGB."""
     motion = motion_of(length, _median_depth(gaussians, camera))
     engine, total = rasteriser_for(), np.zeros((camera.height, camera.width, 3))
     poses = poses_along(camera, motion, max(9, round(TRUTH_PER_PIXEL * length)))
@@ -174,7 +175,7 @@ def _depth(engine: Rasteriser, gaussians: Gaussians, camera: Camera) -> PlaneF32
 
 
 class _FormedStep(Iteration):
-    """A step through `FormedView`, its motion known."""
+    """A step with `FormedView` and a known motion."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion) -> None:
         super().__init__(gaussians, camera)
@@ -187,12 +188,12 @@ class _FormedStep(Iteration):
         render = self.engine.forward(self.gaussians, self._formed.camera, depth=True)
         return self._formed.forward(render)
 
-    def backward(self, slope: Tensor) -> Gaussians:
-        return self.engine.backward(self._formed.backward(slope))
+    def backward(self, gradient: Tensor) -> Gaussians:
+        return self.engine.backward(self._formed.backward(gradient))
 
 
 class _MeanOfRenders(Iteration):
-    """A step on the mean in linear light of renders along the path."""
+    """A step on the mean of ``count`` renders along the path, in linear light."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, motion: FrameMotion, count: int) -> None:
         super().__init__(gaussians, camera)
@@ -209,8 +210,8 @@ class _MeanOfRenders(Iteration):
         mean, self._slope_of_mean = through_curve(total / len(self._poses), srgb_curve(CPU))
         return mean
 
-    def backward(self, slope: Tensor) -> Gaussians:
-        light = times_slope(slope, self._slope_of_mean) / len(self._poses)
+    def backward(self, gradient: Tensor) -> Gaussians:
+        light = times_slope(gradient, self._slope_of_mean) / len(self._poses)
         found = [
             engine.backward(times_slope(light, of_render))
             for engine, of_render in zip(self._engines, self._slopes, strict=True)

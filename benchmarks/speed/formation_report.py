@@ -1,4 +1,4 @@
-"""The benchmark of image formation as tables and as a picture."""
+"""Table and plot of the benchmark of image formation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.speed.plots import COLOURS, save, show_plain_numbers
 
 
 def formation_markdown(benchmark: FormationBenchmark) -> str:
-    """The table, with what its figures mean."""
+    """Return the table with an explanation of its figures."""
     plan = benchmark.plan
     rows = [
         [
@@ -23,16 +23,23 @@ def formation_markdown(benchmark: FormationBenchmark) -> str:
         for row in benchmark.rows
         for name in row.times
     ]
-    head = ["blur, px", "frame compared with", "a step, ms", "over a plain step", "PSNR to the exposure, dB"]
+    head = [
+        "blur, px",
+        "frame compared with",
+        "ms per step",
+        "relative to a plain step",
+        "PSNR to the exposure, dB",
+    ]
     return (
         "\n\n".join(
             [
-                "# Image formation: speed against error",
+                "# Speed and error of image formation",
                 machine_line(benchmark.machine),
                 f"About {plan.gaussians:,} splats of SH degree 3 on two surfaces at {plan.width}x"
                 f"{plan.height}, {plan.threads} threads. A step is forward pass, loss, backward pass and "
-                "Adam; median [quartiles] of steps that took turns in one process. The exposure is the mean "
-                "in linear light of many renders along the true path, half of it a step aside, half a turn.",
+                "Adam. Times are median [quartiles]; methods are timed alternately in one process. The "
+                "exposure is the mean in linear light of many renders along the true path. Half of the blur "
+                "is a translation, half a rotation.",
                 table(head, rows),
             ]
         )
@@ -41,7 +48,7 @@ def formation_markdown(benchmark: FormationBenchmark) -> str:
 
 
 def plot_formation(path: Path, benchmark: FormationBenchmark) -> None:
-    """Write a PNG: the time of a step over a plain one (across) against the PSNR to the exposure (up)."""
+    """Write a PNG: relative time of a step (horizontal) against the PSNR to the exposure (vertical)."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -55,8 +62,8 @@ def plot_formation(path: Path, benchmark: FormationBenchmark) -> None:
         panel.plot(*points[PLAIN], "x", color=colour, label=f"{row.length:g} px: {PLAIN}")
         panel.plot(*points[FORMED], "*", color=colour, markersize=14, label=f"{row.length:g} px: {FORMED}")
     counts = ", ".join(map(str, benchmark.plan.renders))
-    panel.set_title(f"A step on a blurred frame; the lines: {counts} renders")
-    panel.set_xlabel("time over that of a plain step")
+    panel.set_title(f"A step on a blurred frame; lines: {counts} renders")
+    panel.set_xlabel("time relative to a plain step")
     panel.set_ylabel("PSNR to the true exposure, dB")
     panel.set_xscale("log")
     show_plain_numbers(panel.xaxis)

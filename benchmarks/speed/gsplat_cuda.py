@@ -1,4 +1,4 @@
-"""gsplat's CUDA rasteriser on the same splats: the other side of the comparison on a GPU."""
+"""gsplat's CUDA rasteriser on the same splats, for the comparison on a GPU."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from cleargs.splat.gaussians import Gaussians
 
 
 def load_gsplat() -> Any:
-    """gsplat with its kernels built. Raises ImportError, with the reason, where it cannot be had."""
+    """Import gsplat with its kernels; raise ImportError with the reason if they are unavailable."""
     try:
         import gsplat
         from gsplat.cuda._backend import _C
-    except Exception as error:  # whatever keeps it from building: a compiler, a version, a header
+    except Exception as error:  # any cause: a missing compiler, version or header
         raise ImportError(f"{type(error).__name__}: {str(error).strip()[:200]}") from error
     if _C is None:
         raise ImportError("its kernels were not built")
@@ -26,7 +26,7 @@ def load_gsplat() -> Any:
 
 
 class GsplatRasteriser:
-    """Forward and backward pass through autograd, from the raw parameters, as a trainer has them."""
+    """Forward and backward pass with autograd, from the raw parameters as in a training."""
 
     def __init__(self, gsplat: Any, gaussians: Gaussians, camera: Camera, device: torch.device) -> None:
         self._gsplat = gsplat
@@ -36,19 +36,19 @@ class GsplatRasteriser:
         self._view = torch.as_tensor(camera.world_to_camera, dtype=torch.float32).to(device)[None]
         intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         self._intrinsics = torch.tensor(intrinsics, device=device)[None]
-        self._slope = random_image(camera.width, camera.height).to(device)
+        self._gradient = random_image(camera.width, camera.height).to(device)
 
     def run_several(self, repetitions: int, clock: Clock) -> None:
-        """Several passes, each a repetition on ``clock``: forward and backward."""
+        """Time ``repetitions`` forward and backward passes."""
         for _ in range(repetitions):
             with clock.repetition():
                 with clock.time("forward"):
                     image = self._render()
                 with clock.time("backward"):
-                    self._gradients(image, self._slope)
+                    self._gradients(image, self._gradient)
 
     def image_and_gradients(self, grad_image: Tensor) -> tuple[Tensor, Gaussians]:
-        """Image [H, W, 3] and the gradients for dL/d(image) [H, W, 3], on the CPU."""
+        """Return the image [H, W, 3] and the gradients for dL/d(image) [H, W, 3], on the CPU."""
         image = self._render()
         gradients = self._gradients(image, grad_image.to(image.device))
         return image.detach().cpu(), Gaussians(*(gradient.cpu() for gradient in gradients))

@@ -1,4 +1,4 @@
-"""A benchmark as Markdown."""
+"""Tables of a benchmark as Markdown."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ GROUPS = ("means", "log_scales", "rotations", "logit_opacities", "sh")
 
 
 def markdown(benchmark: Benchmark) -> str:
-    """Every table, with what its figures mean."""
+    """Return all tables with an explanation of their figures."""
     parts = [
-        "# Speed against error of the splatting core",
+        "# Speed and error of the rasteriser",
         machine_line(benchmark.machine),
-        "Times are milliseconds, median [quartiles]; variants of a table took turns in one process. Random "
-        "splats of SH degree 3, evenly over the view, black background.",
+        "Times are ms, median [quartiles]; the variants of a table are timed alternately in one process. "
+        "Scenes are random splats of SH degree 3, spread evenly over the view, on black.",
         *_iterations(benchmark.rows),
         *_errors(benchmark.rows),
         *_rasterisers(benchmark.rows),
@@ -33,13 +33,13 @@ def markdown(benchmark: Benchmark) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; the first column to the left, the others to the right."""
+    """Return a Markdown table; the first column is left-aligned, the others right-aligned."""
     lines = [head, ["---", *("---:" for _ in head[1:])], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def milliseconds(value: Quartiles) -> str:
-    """Median [quartiles] with three digits or so."""
+    """Return median [quartiles] with about three digits."""
     digits = 2 if value.median < 10 else 1 if value.median < 100 else 0
     return f"{value.median:.{digits}f} [{value.low:.{digits}f} {value.high:.{digits}f}]"
 
@@ -53,7 +53,7 @@ def _error(error: Error) -> str:
 
 
 def machine_line(machine: Machine) -> str:
-    """Where it was measured."""
+    """Return a line on the machine, the versions and the load."""
     versions = ", ".join(f"{name} {number}" for name, number in machine.versions.items())
     return (
         f"{machine.processor}, {machine.cores} cores; {versions}. "
@@ -78,9 +78,9 @@ def _iterations(rows: list[ResultRow]) -> list[str]:
     head = ["splats", "threads", "pairs", *PARTS, WHOLE, "peak memory, MB", "image error", "gradient error"]
     return [
         "## A training iteration",
-        "Forward pass, L1 + D-SSIM with its gradient, backward pass, Adam. Pairs are (tile, splat). Memory "
-        "is the peak of a process of its own beyond the loaded program: parameters, moments, gradients, "
-        "buffers. The errors are the largest, explained below.",
+        "Forward pass, L1 + D-SSIM with its gradient, backward pass, Adam. Pairs are (tile, splat) pairs. "
+        "Memory is the peak of parameters, moments, gradients and buffers in a separate process. Errors are "
+        "the largest ones; the next section explains them.",
         table(head, lines),
     ]
 
@@ -91,17 +91,18 @@ def _errors(rows: list[ResultRow]) -> list[str]:
     seeds = ", ".join(sorted({str(row.accuracy.seed) for row in rows}))
     return [
         "## Errors against the float64 oracle",
-        "Largest / median. Image: absolute. Gradients, of a random linear functional of the compared "
-        "pixels: the largest error over the group's largest gradient / the median of the elements' "
-        f"relative errors. Pixels are random (seed {seeds}); splats below alpha 1/255 at all of them are "
-        f"left out of the oracle's work, which changes nothing. Pixels within {MARGIN:g} of a cut-off are "
-        f"not compared; the largest error of the image there was {left_out:.1e} (a splat that is cut adds "
-        "up to 3.9e-03).",
+        "Largest / median error. Errors of the image are absolute. Gradients are those of a random linear "
+        "functional of the compared pixels: the largest error is relative to the group's largest gradient, "
+        "the median is over the elements' relative errors. "
+        f"Pixels are random (seed {seeds}). The oracle leaves out splats below alpha 1/255 at all of them, "
+        f"without any effect on the result. Pixels within {MARGIN:g} of a cut-off are not compared; the "
+        f"largest error of the image there was {left_out:.1e} (a splat at the cut-off adds up to 3.9e-03).",
         table(["splats", "image", *GROUPS, "pixels", "not compared", "splats seen"], lines),
     ]
 
 
 def accuracy_cells(found: Accuracy) -> list[str]:
+    """Return the cells of a row of errors."""
     return [
         _error(found.image),
         *(_error(found.gradients[group]) for group in GROUPS),
@@ -130,11 +131,11 @@ def _rasterisers(rows: list[ResultRow]) -> list[str]:
     head = ["splats", "threads", "ours", "gradient error"]
     head += ["torch", "torch / ours", "image error", "gradient error"]
     return [
-        "## Rasteriser against rasteriser",
-        "Forward and backward pass. Ours: both kernels, and all that follows to the raw parameters. Pure "
-        "torch with autograd: from projected splats to the image and back to their means, conics, opacities "
-        "and colours, dense over stacked tiles, the lists of splats per tile given. Its errors are those "
-        "behind the oracle's float64 projection.",
+        "## Comparison of rasterisers",
+        "Forward and backward pass. Ours includes both kernels and the backward pass to the raw parameters. "
+        "Pure torch with autograd goes from projected splats to the image and back to their means, conics, "
+        "opacities and colours, dense over stacked tiles; it receives the lists of splats per tile. Its "
+        "errors include the oracle's float64 projection.",
         table(head, lines),
     ]
 
@@ -144,13 +145,13 @@ def _roofline(found: Rooflines | None) -> list[str]:
         return []
     parts = [
         f"## Roofline: {found.case.title}",
-        "Operations are those that reach a pixel or a parameter, bytes those that must move once, both "
-        "counted from the kernels' source (`benchmarks/speed/work.py`); float64 counts like float32. The "
-        "least time is the larger of operations and bytes at the measured peaks; reached is least time / "
-        "time. More than 100 % means that the caches serve what memory would have to.",
+        "Operations contribute to a pixel or a parameter; bytes must move between kernel and memory at least "
+        "once. Both are counted from the kernels' source (`benchmarks/speed/work.py`); float64 counts like "
+        "float32. The minimum time is the larger one of operations and bytes at the measured peaks; reached "
+        "is minimum time / time. More than 100 % means that caches deliver bytes faster than memory.",
         f"{found.size.pairs:,} pairs, {found.size.contributions:,} contributions of a splat to a pixel in "
         f"{found.size.vectors:,} vectors of {LANES} pixels: "
-        f"{found.size.contributions / max(1, found.size.vectors):.1f} of {LANES} lanes do work.",
+        f"{found.size.contributions / max(1, found.size.vectors):.1f} of {LANES} lanes are used.",
     ]
     for threads, roofs in found.kernels.items():
         peaks = found.peaks[threads]
@@ -182,8 +183,8 @@ def _plural(threads: int) -> str:
 def _scaling(series: dict[str, list[ScalingPoint]], threads: int) -> list[str]:
     parts = [
         "## Scaling",
-        f"Forward and backward pass on {_plural(threads)}, and peak memory, against the number of "
-        "(tile, splat) pairs; below each table the straight line that fits best.",
+        f"Forward and backward pass on {_plural(threads)}, and peak memory, by number of (tile, splat) "
+        "pairs. The line below each table is the best linear fit.",
     ]
     for name, points in series.items():
         if not points:
@@ -199,7 +200,7 @@ def _scaling(series: dict[str, list[ScalingPoint]], threads: int) -> list[str]:
             ]
             for point in points
         ]
-        head = ["splats", "pairs", "ms", "ns a pair", "memory, MB", "bytes a pair"]
+        head = ["splats", "pairs", "ms", "ns per pair", "memory, MB", "bytes per pair"]
         parts += [f"### {name.capitalize()}", table(head, lines), _lines(points)]
     return parts
 
@@ -207,14 +208,14 @@ def _scaling(series: dict[str, list[ScalingPoint]], threads: int) -> list[str]:
 def _lines(points: list[ScalingPoint]) -> str:
     time = straight_line([(point.pairs, point.milliseconds.median) for point in points])
     text = (
-        f"Time: {time.offset:.2f} ms and {1e6 * time.slope:.1f} ns a pair, off by at most "
+        f"Time: {time.offset:.2f} ms and {1e6 * time.slope:.1f} ns per pair, with a deviation of at most "
         f"{100 * time.deviation:.0f} %."
     )
     sizes = [(point.pairs, point.memory / 1e6) for point in points if point.memory is not None]
     if sizes:
         memory = straight_line(sizes)
         text += (
-            f" Memory: {memory.offset:.1f} MB and {1e6 * memory.slope:.0f} bytes a pair, off by at most "
-            f"{100 * memory.deviation:.0f} %."
+            f" Memory: {memory.offset:.1f} MB and {1e6 * memory.slope:.0f} bytes per pair, with a deviation "
+            f"of at most {100 * memory.deviation:.0f} %."
         )
     return text

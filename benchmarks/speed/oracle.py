@@ -1,8 +1,8 @@
-"""The error of a rasteriser against the float64 oracle, on pixels that brute force can afford.
+"""Error of a rasteriser against the float64 oracle on random pixels.
 
-On a large view the oracle renders some random pixels only, and the loss is a function of these pixels
-alone. Nothing is approximated by it: a splat whose alpha stays under 1/255 at all of them adds exactly
-nothing to their colours and gets exactly no gradient, so it is left out before the arithmetic starts.
+The oracle is slow. So on a large view it renders only some random pixels, and the loss depends only on these
+pixels. This is exact: a splat with an alpha below 1/255 at all of them adds nothing to their colours and gets
+a zero gradient, so it is left out.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from cleargs.splat import constants
 from cleargs.splat.camera import Camera
 from cleargs.splat.gaussians import Gaussians
 
-PIXELS = 1000
-"""The oracle renders at most so many random pixels,"""
-PRODUCTS = 50_000_000
-"""and at most so many (Gaussian, pixel) products (half a minute), as if every Gaussian were seen."""
+MAX_PIXELS = 1000
+"""Maximum number of random pixels that the oracle renders."""
+MAX_PRODUCTS = 50_000_000
+"""Maximum number of (Gaussian, pixel) products, as if every Gaussian were visible. It takes half a minute."""
 MARGIN = 1e-3
-"""Pixels where an alpha lies this close (relative) to 1/255, or a transmittance to 1e-4, are left out: there
-the image jumps, and float32 may decide the other way. A mean at x = 1000 px is good to 3e-5 px in float32,
-which moves the alpha of the narrowest splat at its rim by 2e-4."""
+"""Relative distance of an alpha from 1/255, or of a transmittance from 1e-4, below which a pixel is left out:
+the image is discontinuous there, and float32 may fall on the other side. A mean at x = 1000 px has an error
+of 3e-5 px in float32, which changes the alpha at the rim of the narrowest splat by 2e-4."""
 
 
 @dataclass(frozen=True)
 class Error:
-    """The largest and the median error of one quantity."""
+    """Largest and median error of one quantity."""
 
     max: float
     median: float
@@ -41,57 +41,60 @@ class Error:
 class Accuracy:
     """Errors against the oracle.
 
-    ``image`` is absolute. Of a gradient ``max`` is the largest error over the largest gradient of that group,
-    ``median`` is that of the elements' relative errors where the oracle's gradient is not zero.
+    Those of ``image`` are absolute. For a group of gradients, ``max`` is the largest error / the largest
+    gradient of the group, and ``median`` is over the relative errors of all elements with a nonzero gradient.
     """
 
     image: Error
     gradients: dict[str, Error]
     pixels: int  # compared
-    left_out: int  # too close to a cut-off
-    left_out_max: float  # largest error of the image there
-    gaussians: int  # that reach alpha 1/255 at a pixel of these
+    left_out: int  # pixels too close to a cut-off
+    left_out_max: float  # largest error of the image at these
+    gaussians: int  # with an alpha of at least 1/255 at one of the pixels
     seed: int
 
     @property
     def worst_gradient(self) -> float:
-        """The largest of the groups' largest errors."""
+        """Largest error of all groups of gradients."""
         return max(error.max for error in self.gradients.values())
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the oracle says about some pixels of a view."""
+    """Values of the oracle for some pixels of a view."""
 
     pixels: Tensor  # [S] y * width + x
     safe: Tensor  # [S] bool: not within MARGIN of a cut-off
     colours: Tensor  # [S, 3] float64
-    grad_image: Tensor  # [H, W, 3] float32, zero but at the safe pixels; the loss is sum(grad_image * image)
+    grad_image: Tensor  # [H, W, 3] float32, zero except at safe pixels; loss = sum(grad_image * image)
     gradients: Gaussians  # float64, of all Gaussians
-    seen: int  # Gaussians that reach alpha 1/255 at one of the pixels
+    seen: int  # Gaussians with an alpha of at least 1/255 at one of the pixels
     seed: int
 
 
 def choose_pixels(camera: Camera, gaussians: int, seed: int) -> Tensor:
-    """Different random pixels, as many as PIXELS and PRODUCTS allow: [S] y * width + x, ascending."""
+    """Return different random pixels [S], y * width + x in ascending order.
+
+    `MAX_PIXELS` and `MAX_PRODUCTS` limit their number.
+    """
     total = camera.width * camera.height
-    number = min(total, PIXELS, max(1, PRODUCTS // max(1, gaussians)))
+    number = min(total, MAX_PIXELS, max(1, MAX_PRODUCTS // max(1, gaussians)))
     chosen = np.random.default_rng(seed).choice(total, number, replace=False)
     return torch.from_numpy(np.sort(chosen))
 
 
 def pixel_centres(pixels: Tensor, width: int) -> Tensor:
-    """Coordinates [S, 2] float64 in px of pixels [S] numbered y * width + x."""
+    """Return the centres [S, 2] of ``pixels`` [S], float64 px."""
     return torch.stack([pixels % width, pixels // width], 1).double() + constants.PIXEL_CENTRE
 
 
 def seen_at(gaussians: Gaussians, camera: Camera, pixels: Tensor) -> Tensor:
-    """Indices, ascending, of the float64 Gaussians whose alpha reaches 1/255 at one of ``pixels`` or more."""
+    """Return ascending indices of the float64 Gaussians whose alpha reaches 1/255 at one of ``pixels``."""
     in_front = in_depth_order(gaussians, camera)
     splats = reference.project(gaussians.detach(), camera, gaussians.sh.shape[1], antialias=False)
     centres = pixel_centres(pixels, camera.width)
     a, b, c = splats.conics.unbind(-1)
-    # alpha >= 1/255 where half the quadratic form is at most this; a hair more, for the rounding.
+    # alpha >= 1/255 if half the quadratic form is at most this; 1e-9 covers rounding.
     reach = torch.log(splats.opacities / constants.ALPHA_CUT) + 1e-9
     seen = torch.zeros(len(reach), dtype=torch.bool)
     step = max(1, reference.CHUNK // len(centres))
@@ -104,8 +107,8 @@ def seen_at(gaussians: Gaussians, camera: Camera, pixels: Tensor) -> Tensor:
 
 
 def in_depth_order(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """The Gaussian that each row of ``reference.project`` belongs to, [M]."""
-    # The oracle orders by depth alone, so Gaussians that carry their number as colour tell where they went.
+    """Return the index [M] of the Gaussian behind each row of ``reference.project``."""
+    # The oracle sorts by depth only. So Gaussians whose colour is their index reveal the order.
     numbers = torch.arange(gaussians.num, dtype=torch.float64)
     tagged = Gaussians(
         **{
@@ -118,26 +121,30 @@ def in_depth_order(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def oracle(gaussians: Gaussians, camera: Camera, pixels: Tensor, seed: int) -> Truth:
-    """Colours of ``pixels`` over black and the gradients of a random linear functional of the safe ones.
+    """Render ``pixels`` over black, and differentiate a random linear functional of the safe ones.
 
-    ``gaussians`` are float32 and taken as exact.
+    Args:
+        gaussians: Float32 Gaussians; their values count as exact.
+        camera: The view.
+        pixels: Pixels [S], y * width + x.
+        seed: Seed of the functional.
     """
     double = Gaussians(**{name: tensor.detach().double() for name, tensor in gaussians.tensors().items()})
     seen = seen_at(double, camera, pixels)
     leaves = Gaussians(**{k: t.clone().requires_grad_() for k, t in double.select(seen).tensors().items()})
     colours, margin = render_pixels(leaves, camera, pixels)
     safe = margin > MARGIN
-    slope = torch.from_numpy(
+    weights = torch.from_numpy(
         np.random.default_rng([seed, 1]).normal(size=(len(pixels), 3)).astype(np.float32)
     )
-    slope[~safe] = 0.0
-    (colours * slope.double()).sum().backward()  # type: ignore[no-untyped-call]  # torch's own
+    weights[~safe] = 0.0
+    (colours * weights.double()).sum().backward()  # type: ignore[no-untyped-call]  # torch's own
     full = {name: torch.zeros_like(tensor) for name, tensor in double.tensors().items()}
     for name, leaf in leaves.tensors().items():
         if leaf.grad is not None:
             full[name][seen] = leaf.grad
     grad_image = torch.zeros(camera.height * camera.width, 3)
-    grad_image[pixels] = slope
+    grad_image[pixels] = weights
     return Truth(
         pixels=pixels,
         safe=safe,
@@ -150,7 +157,7 @@ def oracle(gaussians: Gaussians, camera: Camera, pixels: Tensor, seed: int) -> T
 
 
 def render_pixels(gaussians: Gaussians, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """The oracle's colours [S, 3] and margins [S] at ``pixels`` alone, differentiable in the parameters."""
+    """Return the oracle's colours [S, 3] and margins [S] at ``pixels``, differentiable in the parameters."""
     splats = reference.project(gaussians, camera, gaussians.sh.shape[1], antialias=False)
     background = torch.zeros(3, dtype=torch.float64)
     if len(splats.depths) == 0:
@@ -165,7 +172,7 @@ def render_pixels(gaussians: Gaussians, camera: Camera, pixels: Tensor) -> tuple
 
 
 def accuracy(truth: Truth, image: Tensor, gradients: Gaussians) -> Accuracy:
-    """Errors of an image [H, W, 3] and of the gradients for ``truth.grad_image``."""
+    """Return the errors of an image [H, W, 3] and of the gradients for ``truth.grad_image``."""
     difference = (image.reshape(-1, 3)[truth.pixels].double() - truth.colours).abs()
     inside, outside = difference[truth.safe], difference[~truth.safe]
     return Accuracy(
@@ -183,7 +190,7 @@ def accuracy(truth: Truth, image: Tensor, gradients: Gaussians) -> Accuracy:
 
 
 def gradient_error(gradient: Tensor, exact: Tensor) -> Error:
-    """Errors of one group of gradients as ``Accuracy`` defines them."""
+    """Return the errors of one group of gradients, as defined by `Accuracy`."""
     difference = (gradient.double() - exact).abs()
     some = exact != 0.0
     if not some.any():

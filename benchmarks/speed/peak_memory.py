@@ -1,7 +1,7 @@
-"""Peak memory of training at one size, measured in a process of its own.
+"""Peak memory of training at one size, measured in a separate process.
 
-``python -m benchmarks.speed.peak_memory COUNT WIDTH HEIGHT SIGMA`` prints the bytes that the scene and three
-iterations need at their peak beyond the loaded program, or ``null`` where the system does not tell.
+``python -m benchmarks.speed.peak_memory COUNT WIDTH HEIGHT SIGMA`` prints the peak bytes of a scene and three
+iterations, without the loaded program. It prints ``null`` if the system does not report memory.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ ITERATIONS = 3
 
 
 def peak_memory(count: int, width: int, height: int, sigma: float) -> int | None:
-    """Bytes that parameters, moments, gradients and buffers take at their peak; None where unknown."""
+    """Return the peak bytes of parameters, moments, gradients and buffers; None if unknown."""
     command = module_command("benchmarks.speed.peak_memory", str(count), str(width), str(height), str(sigma))
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}  # of the checkout
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}  # the checkout
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     value: int | None = json.loads(done.stdout)
     return value
@@ -46,7 +46,7 @@ def _measure(count: int, width: int, height: int, sigma: float) -> int | None:
     try:
         before = _resident("VmRSS")
         scene = random_scene(count, width, height, sigma=sigma)
-        RESET.write_text("5")  # forgets the peak so far: float64 numbers that the scene was made from
+        RESET.write_text("5")  # resets the peak: making the scene needs float64 copies
         iteration = Iteration(*scene)
         for _ in range(ITERATIONS):
             iteration.run(Clock())

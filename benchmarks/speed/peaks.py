@@ -1,4 +1,4 @@
-"""What the machine can do at most: multiply-adds per second, bytes per second."""
+"""Measure the peaks of the machine: multiply-adds and copied bytes per second."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from cleargs.splat.kernels.cpu.simd import LANES, broadcast, load, store
 from cleargs.types import ArrayF32
 
 CHAINS = 12
-"""Independent multiply-adds in flight: two pipes times the latency of four or five cycles, and some more."""
+"""Independent chains of multiply-adds: enough to fill two pipes with a latency of four to five cycles."""
 FMA_STEPS = 500_000
-"""Short (about a millisecond), so that on a busy machine some repeats run undisturbed."""
+"""Steps per repeat: about a millisecond, so that some repeats run undisturbed on a busy machine."""
 COPY_BYTES = 256 << 20
-"""Size of the arrays that are copied: many times a last-level cache,"""
+"""Size of the copied arrays: many times a last-level cache."""
 SLICES = 32
-"""in turn, so many equal parts: as short, and each out of the cache when its turn comes again."""
+"""Parts of the arrays, copied one per repeat. A part has left the cache before its next repeat."""
 BLOCKS = 64
+"""Units of work of the parallel copy."""
 HALF = np.float32(0.5)
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Best of the repeats; a fused multiply-add is two operations, a copied byte is read and written."""
+    """Best values of all repeats; a multiply-add counts as two operations, a copied byte as two bytes."""
 
     gflops: float  # 1e9 float32 operations per second in the kernels' vectors
     gbytes: float  # 1e9 bytes per second, read and written
@@ -35,11 +36,10 @@ class Peaks:
 
 @kernel
 def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float32, values: ArrayF32) -> None:
-    """CHAINS independent chains x = x m + c of LANES lanes on every worker."""
+    """Run `CHAINS` independent chains x = x m + c of `LANES` lanes on each worker."""
     for worker in prange(workers):
         start = worker * CHAINS * LANES
-        # Nothing that the compiler could see through: it would compute equal chains once, and fold steps by
-        # known numbers into one.
+        # Values must be unknown to the compiler: it would merge equal chains and fold known factors.
         m, c = broadcast(factor), broadcast(addend)
         x0 = load(values, start + 0 * LANES)
         x1 = load(values, start + 1 * LANES)
@@ -82,7 +82,7 @@ def multiply_add(workers: int, steps: int, factor: np.float32, addend: np.float3
 
 @kernel
 def copy(source: ArrayF32, target: ArrayF32) -> None:
-    """``target`` [n] = ``source`` [n]."""
+    """Copy ``source`` [n] to ``target`` [n]."""
     n = source.shape[0]
     for block in prange(BLOCKS):
         begin, end = n * block // BLOCKS, n * (block + 1) // BLOCKS
@@ -92,7 +92,7 @@ def copy(source: ArrayF32, target: ArrayF32) -> None:
 def measure_peaks(
     threads: int, repeats: int, *, steps: int = FMA_STEPS, copy_bytes: int = COPY_BYTES
 ) -> Peaks:
-    """The best of ``repeats`` on so many threads, after one to warm up."""
+    """Measure the peaks on ``threads`` threads: the best of ``repeats``, after a warm-up."""
     use_threads(threads)
     values = np.linspace(0.1, 0.9, threads * CHAINS * LANES, dtype=np.float32)
     source = np.ones(copy_bytes // 4, np.float32)

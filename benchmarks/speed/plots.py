@@ -1,4 +1,4 @@
-"""A benchmark as pictures: speed against error, and how cost grows."""
+"""Plots of a benchmark: speed against error, and scaling with the number of pairs."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ MARKERS = "os^Dvp"
 
 FLOAT32_ROUNDING = 2.0**-24
 MIN_RANGE = (3e-8, 1e-4)
-"""Errors that are always in the picture, so that its scale does not blow up differences of a few percent."""
+"""Minimum range of errors on the axis, so that differences of a few percent do not look large."""
 
 
 def plot_speed_error(path: Path, benchmark: Benchmark) -> None:
-    """Write a PNG of time (across) against the largest gradient error (up), on the most threads.
+    """Write a PNG of time (horizontal) against the largest gradient error (vertical), on all threads.
 
-    Left the rasterisers, a line from ours to torch's for each case; right whole training iterations.
+    The left panel shows the rasterisers, with a line from ours to torch's for each case. The right panel
+    shows training iterations.
     """
     figure, (rasterisers, iterations) = _panels()
     threads = max(benchmark.threads)
@@ -60,7 +61,7 @@ def plot_speed_error(path: Path, benchmark: Benchmark) -> None:
 
 
 def _rasterisers(panel: Axes, rows: list[ResultRow], threads: int) -> None:
-    """A colour for each case, a marker for each rasteriser."""
+    """Plot the rasterisers: a colour per case, a marker per rasteriser."""
     compared = [(row, row.rasterisers) for row in rows if row.rasterisers is not None]
     markers: dict[str, str] = {}
     for (row, found), colour in zip(compared, cycle(COLOURS), strict=False):
@@ -76,7 +77,7 @@ def _rasterisers(panel: Axes, rows: list[ResultRow], threads: int) -> None:
 
 
 def plot_scaling(path: Path, benchmark: Benchmark) -> None:
-    """Write a PNG of time and memory against the number of pairs, with the straight lines that fit best."""
+    """Write a PNG of time and memory against the number of pairs, with the best linear fits."""
     figure, (times, memory) = _panels()
     times.set_ylabel("ms, forward and backward")
     memory.set_ylabel("peak memory, MB")
@@ -107,7 +108,7 @@ def _line(panel: Axes, values: list[tuple[int, float]], colour: str) -> None:
         "--",
         color=colour,
         linewidth=1,
-        label="best straight line",
+        label="best linear fit",
     )
 
 
@@ -126,7 +127,7 @@ def _panels() -> tuple[Figure, tuple[Axes, Axes]]:
 
 
 def show_plain_numbers(axis: Axis) -> None:
-    """1, 2, 5, 10, ... instead of powers of ten."""
+    """Label the axis with 1, 2, 5, 10, ... instead of powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -1,4 +1,4 @@
-"""Times of the single kernels inside a call, without the kernels knowing."""
+"""Time each kernel inside a call, without changes to the kernels."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ KERNELS = (
     "gradients.backpropagate",
     "elementwise.adam",
 )
-"""Entry points of a training iteration (module.function below PACKAGE), in the order of their work."""
+"""Kernels of a training iteration (module.function in `PACKAGE`), in the order of their calls."""
 
 
 @contextmanager
 def timed_kernels(clock: Clock) -> Iterator[None]:
-    """Within the block every kernel's time is added to the part of ``clock`` that bears its name.
+    """Within the block, add the time of each kernel to the part of ``clock`` with its name.
 
-    Callers look kernels up in their modules, so they are replaced there. Costs about a microsecond a call.
+    Callers look kernels up in their modules, so timed versions replace them there. This costs about a
+    microsecond per call.
     """
     with ExitStack() as replaced:
         for name in KERNELS:

@@ -1,4 +1,4 @@
-"""What each quality costs on real captures and what it reaches: whole runs, judged on frames kept apart."""
+"""Time and quality of each ``--quality``: whole runs on real captures, evaluated on held-out frames."""
 
 from __future__ import annotations
 
@@ -19,51 +19,51 @@ from cleargs.progress import Reporter
 from cleargs.splat.config import Quality
 
 HOLDOUT = "every:8"
-"""As in the literature."""
+"""Every eighth frame, as in the literature (3D Gaussian Splatting, Mip-NeRF 360)."""
 
 
 @dataclass(frozen=True)
 class QualityPlan:
-    """What to run."""
+    """Runs of the benchmark."""
 
     captures: tuple[Path, ...]
     qualities: tuple[Quality, ...]
     settings: Mapping[str, Any]
-    """On top of the recipe, by name; ``ingest.holdout`` is `HOLDOUT` unless it is among them."""
+    """Changes to the recipe, by name; ``ingest.holdout`` is `HOLDOUT` by default."""
     until: str
-    """The stage whose scene is judged."""
+    """Last stage; its scene is evaluated."""
     threads: int
 
 
 @dataclass(frozen=True)
 class QualityRow:
-    """One capture at one quality."""
+    """Results of one capture at one quality."""
 
     capture: str
     quality: Quality
     seconds: Mapping[str, float]
-    """Stage -> wall seconds that its work took. What qualities share is done once and counted for each."""
+    """Stage -> wall seconds. A stage that qualities share runs once and counts for each."""
     cpu_seconds: float | None
-    """Processor time of all stages; None where one does not know it."""
+    """Processor time of all stages; None if it is unknown for one."""
     peak_memory_gb: float | None
     steps: int
     gaussians: int
     images: int
-    """Frames kept apart."""
+    """Number of held-out frames."""
     means: Mapping[str, float | None]
-    """Metric -> mean over them."""
+    """Metric -> mean over the held-out frames."""
 
 
 @dataclass(frozen=True)
 class QualityBenchmark:
-    """All rows, by capture and quality, and where they were measured."""
+    """Results by capture and quality, and the machine."""
 
     machine: Machine
     plan: QualityPlan
     rows: list[QualityRow]
 
     def as_json(self) -> dict[str, Any]:
-        """Every figure, for programs; captures by name."""
+        """Return dictionaries and lists; captures are given by name."""
         plan = {
             "qualities": self.plan.qualities,
             "settings": dict(self.plan.settings),
@@ -78,13 +78,15 @@ class QualityBenchmark:
 
 
 def run(plan: QualityPlan, folder: Path, reporter: Reporter) -> QualityBenchmark:
-    """Run each capture of ``plan`` at each quality in ``folder``; what is finished there is not made again.
+    """Run each capture of ``plan`` at each quality in ``folder``; finished runs are reused.
 
-    Raises InputError where two captures have one name, or what `cleargs.run` raises.
+    Raises:
+        InputError: Two captures have the same name.
+        CleargsError: A run failed.
     """
     names = [capture_name(capture) for capture in plan.captures]
     if len(set(names)) < len(names):
-        raise InputError("two captures have the same name", hint="rename one, or measure them apart")
+        raise InputError("two captures have the same name", hint="rename one, or measure them separately")
     load = os.getloadavg()[0]
     rows = [
         _row(capture, quality, plan, folder, reporter)
@@ -99,7 +101,7 @@ def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, repor
     done = run_capture(
         capture,
         folder / f"{capture_name(capture)}-{quality}",
-        workflow="default",  # or an earlier call's settings would stay
+        workflow="default",  # replaces the settings of an earlier call
         quality=quality,
         set={"ingest.holdout": HOLDOUT, **plan.settings},
         until=plan.until,
@@ -109,7 +111,7 @@ def _row(capture: Path, quality: Quality, plan: QualityPlan, folder: Path, repor
     )
     options = EvalOptions(lpips=("alex",), scorers=())
     found = evaluate_scene(done, stage=plan.until, options=options, threads=plan.threads, progress=reporter)
-    stages = installed().until(plan.until)  # what an earlier call went on to is no part of it
+    stages = installed().until(plan.until)  # an earlier call may have run later stages too
     manifests = [done[stage].manifest for stage in stages]
     logs = [done[m.stage].table("train") for m in manifests if "train.parquet" in m.files]
     return QualityRow(

@@ -1,4 +1,4 @@
-"""The benchmark of qualities as a table and as a picture."""
+"""Table and plot of the benchmark of qualities."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from benchmarks.speed.quality_cost import HOLDOUT, QualityBenchmark, QualityRow
 
 
 def quality_markdown(benchmark: QualityBenchmark) -> str:
-    """The table, with what its figures mean."""
+    """Return the table with an explanation of its figures."""
     plan = benchmark.plan
     settings = {"ingest.holdout": HOLDOUT, **plan.settings}
     head = [
         "capture",
         "quality",
         "minutes",
-        "of them training",
+        "minutes of training",
         "CPU minutes",
         "memory, GB",
         "steps",
@@ -29,12 +29,12 @@ def quality_markdown(benchmark: QualityBenchmark) -> str:
     return (
         "\n\n".join(
             [
-                "# Quality against time",
+                "# Quality and time",
                 machine_line(benchmark.machine),
                 f"Runs up to `{plan.until}`, {plan.threads} threads; settings "
-                f"{', '.join(f'`{name}={value}`' for name, value in settings.items())}. Means over the "
-                "frames kept apart. Minutes of all stages, by the clock; what two qualities share was done "
-                "once and counts for each. Training: `g0`.",
+                f"{', '.join(f'`{name}={value}`' for name, value in settings.items())}. Metrics are means "
+                "over held-out frames. Minutes are wall time of all stages; a stage that qualities share ran "
+                "once and counts for each. Training is `g0`.",
                 table(head, [_cells(row) for row in benchmark.rows]),
             ]
         )
@@ -44,7 +44,7 @@ def quality_markdown(benchmark: QualityBenchmark) -> str:
 
 def _cells(row: QualityRow) -> list[str]:
     return [
-        f"{row.capture} ({row.images} kept apart)",
+        f"{row.capture} ({row.images} held out)",
         row.quality,
         f"{sum(row.seconds.values()) / 60:.1f}",
         f"{row.seconds.get('g0', 0.0) / 60:.1f}",
@@ -64,7 +64,7 @@ def _figure(row: QualityRow, metric: str, digits: int) -> str:
 
 
 def plot_quality(path: Path, benchmark: QualityBenchmark) -> None:
-    """Write a PNG: minutes of a whole run (across) against PSNR on frames kept apart (up)."""
+    """Write a PNG: minutes of a run (horizontal) against PSNR on held-out frames (vertical)."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -83,9 +83,9 @@ def plot_quality(path: Path, benchmark: QualityBenchmark) -> None:
             panel.plot(minutes, psnr, MARKERS[benchmark.plan.qualities.index(quality)], color=colour)
     for quality, marker in zip(benchmark.plan.qualities, MARKERS, strict=False):
         panel.plot([], [], marker, color="0.3", label=quality)
-    panel.set_title("Quality against time")
+    panel.set_title("Quality and time")
     panel.set_xlabel(f"minutes up to {benchmark.plan.until}, {benchmark.plan.threads} threads")
-    panel.set_ylabel("PSNR on frames kept apart, dB")
+    panel.set_ylabel("PSNR on held-out frames, dB")
     panel.set_xscale("log")
     show_plain_numbers(panel.xaxis)
     panel.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""Scenes and images to measure on, next to `cleargs.splat.pace.random_scene`."""
+"""Scenes and images for benchmarks, in addition to `cleargs.splat.pace.random_scene`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,22 @@ from cleargs.splat.gaussians import Gaussians
 def surface_scene(
     count: int, width: int, height: int, *, near: float = 3.0, far: float = 6.0, seed: int = 0
 ) -> tuple[Gaussians, Camera]:
-    """About ``count`` opaque splats of SH degree 3 on a textured slanted wall and on a box before it.
+    """Return a scene of opaque splats (SH degree 3) on a textured slanted wall with a box in front of it.
 
-    Unlike a random scene it has surfaces and a depth edge, as what is filmed has. The wall goes on behind the
-    box and beyond the view.
+    Unlike a random scene it has surfaces and a depth edge, as a real scene. The wall continues behind the box
+    and outside the view.
+
+    Args:
+        count: Approximate number of splats.
+        width: Image width, px.
+        height: Image height, px.
+        near: Depth of the box.
+        far: Mean depth of the wall.
+        seed: Seed of the positions and rotations.
     """
     rng = np.random.default_rng(seed)
     focal = 0.87 * width
-    beyond, box = 0.15, 0.4  # of the view's sides
+    beyond, box = 0.15, 0.4  # as shares of the view's sides
     spacing = np.sqrt(width * height * ((1 + 2 * beyond) ** 2 + box**2) / count)
     parts = []
     for low, high, front in ((-beyond, 1 + beyond, False), (0.5 - box / 2, 0.5 + box / 2, True)):
@@ -50,7 +58,7 @@ def surface_scene(
 
 
 def random_image(width: int, height: int, seed: int = 1) -> Tensor:
-    """An image [H, W, 3] of independent values in [0, 1)."""
+    """Return an image [H, W, 3] of independent uniform values in [0, 1)."""
     return _float32(np.random.default_rng(seed).uniform(size=(height, width, 3)))
 
 

@@ -1,8 +1,8 @@
-"""The oracle: every Gaussian at every pixel in float64 torch, differentiated by autograd.
+"""Reference renderer (oracle): every Gaussian at every pixel in float64 torch, with gradients by autograd.
 
-It states the image formation in the plainest way and shares nothing with the kernels but the constants.
-Time and arithmetic grow with pixels times Gaussians; memory is bounded because rows of pixels are
-treated in chunks that are computed again in the backward pass.
+It computes the image in the simplest way and shares only the constants with the kernels. Time and arithmetic
+grow with pixels times Gaussians. Memory is bounded: rows of pixels are processed in chunks, which the
+backward pass recomputes.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from cleargs.splat.gaussians import Gaussians
 from cleargs.splat.transforms import rotation_matrices, sh_basis
 
 CHUNK = 2_000_000
-"""(pixel, Gaussian) products that are held at a time."""
+"""Largest number of (pixel, Gaussian) products in memory at a time."""
 
 
 class ReferenceRender(NamedTuple):
-    """A reference view; ``margin`` tells how far each pixel is from a discontinuity."""
+    """A reference view; ``margin`` is the distance of each pixel from a discontinuity."""
 
     image: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
@@ -45,8 +45,14 @@ class Splats(NamedTuple):
 def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool) -> Splats:
     """Project, cull at the near plane and sort by (depth, index).
 
-    By definition depths are compared as float32: which of two splats lies in front does not hang on the last
-    bits of a float64, so a wall facing the camera stays in the order of its indices.
+    Depths are compared as float32 by definition: the last bits of a float64 must not decide which of two
+    splats is in front. The splats of a wall that faces the camera thus stay in the order of their indices.
+
+    Args:
+        gaussians: Float64 Gaussians.
+        camera: Camera of the view.
+        sh_count: Number of SH coefficients in use: 1, 4, 9 or 16.
+        antialias: Apply the opacity compensation of Mip-Splatting.
     """
     pose = torch.as_tensor(camera.world_to_camera)
     rotation, translation = pose[:3, :3], pose[:3, 3]
@@ -74,7 +80,7 @@ def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool
     )
     scales = gaussians.log_scales[visible].exp()
     u = jacobian @ rotation @ rotation_matrices(gaussians.rotations[visible]) * scales[:, None, :]
-    # Lagrange's identity: positive terms only, so the determinant is exact to rounding for needles too.
+    # Lagrange's identity has positive terms only, so the determinant is exact to rounding for needles, too.
     u0, u1 = u[:, 0], u[:, 1]
     area = torch.linalg.cross(u0, u1).square().sum(-1)
     xx, xy, yy = (u0 * u0).sum(-1), (u0 * u1).sum(-1), (u1 * u1).sum(-1)
@@ -97,14 +103,14 @@ def project(gaussians: Gaussians, camera: Camera, sh_count: int, antialias: bool
 
 
 def blend(splats: Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour [P, 3], alpha [P], depth [P] and margin [P] at pixel centres [P, 2]."""
+    """Return colour [P, 3], alpha [P], depth [P] and margin [P] at pixel centres [P, 2] in px."""
     offsets = pixels[:, None, :] - splats.means[None]
     dx, dy = offsets.unbind(-1)
     a, b, c = splats.conics.unbind(-1)
     raw = splats.opacities * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
     alpha = torch.where(raw >= constants.ALPHA_CUT, raw.clamp_max(constants.ALPHA_MAX), 0.0)
     after = torch.cumprod(1 - alpha, dim=1)
-    kept = after >= constants.TRANSMITTANCE_STOP  # monotone: once it fails it fails for all that follow
+    kept = after >= constants.TRANSMITTANCE_STOP  # monotone: once false, it is false for all later splats
     alpha = torch.where(kept, alpha, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
@@ -130,7 +136,7 @@ def render(
     sh_count: int = 16,
     antialias: bool = False,
 ) -> ReferenceRender:
-    """Render a view of float64 Gaussians; see ``cleargs.splat.render.render`` for the arguments."""
+    """Render a view of float64 Gaussians with ``sh_count`` coefficients, as `cleargs.splat.render.render`."""
     splats = project(gaussians, camera, sh_count, antialias)
     colour = torch.tensor(background, dtype=torch.float64)
     height, width = camera.height, camera.width

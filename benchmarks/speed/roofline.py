@@ -1,4 +1,4 @@
-"""How near each kernel comes to what the machine allows (Williams et al. 2009)."""
+"""Roofline model: time of each kernel relative to the peaks of the machine (Williams et al. 2009)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from benchmarks.speed.work import KernelWork
 
 @dataclass(frozen=True)
 class Roof:
-    """A kernel under its roof: its least time is that of its operations or bytes at the machine's peak."""
+    """A kernel and its minimum time: that of its operations or of its bytes at the peak of the machine."""
 
     kernel: str
     operations: float
     bytes: float
     milliseconds: float
     bound: Literal["operations", "bytes"]
-    fraction: float  # least time / time; above 1 where caches serve bytes faster than memory would
+    fraction: float  # minimum time / time; above 1 if caches deliver bytes faster than memory
 
 
 def roof(kernel: str, work: KernelWork, milliseconds: float, peaks: Peaks) -> Roof:
-    """The roof of one kernel."""
+    """Return the roofline of one kernel."""
     by_operations = work.operations / (peaks.gflops * 1e6)
     by_bytes = work.bytes / (peaks.gbytes * 1e6)
     return Roof(
@@ -38,5 +38,5 @@ def roof(kernel: str, work: KernelWork, milliseconds: float, peaks: Peaks) -> Ro
 
 
 def roofline(work: Mapping[str, KernelWork], times: Mapping[str, Quartiles], peaks: Peaks) -> list[Roof]:
-    """Every kernel by the median of its times."""
+    """Return the rooflines of all kernels for their median times."""
     return [roof(name, work[name], times[name].median, peaks) for name in work]

@@ -1,4 +1,4 @@
-"""Whether cost grows in a straight line."""
+"""Linear fit of cost against size."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Line(NamedTuple):
-    """value = offset + slope * number, and the largest relative distance of a value from it."""
+    """A fit value = offset + slope * number, and the largest relative deviation of a value."""
 
     offset: float
     slope: float
@@ -17,9 +17,9 @@ class Line(NamedTuple):
 
 
 def straight_line(points: Sequence[tuple[float, float]]) -> Line:
-    """The line through (number, value > 0) that fits best by the squares of relative distances.
+    """Fit a line to (number, value > 0) by least squares of relative deviations.
 
-    A single point gives the line through the origin.
+    A single point gives a line through the origin.
     """
     numbers, values = np.asarray(points, np.float64).T
     terms = [np.ones_like(numbers), numbers] if len(points) > 1 else [np.zeros_like(numbers), numbers]

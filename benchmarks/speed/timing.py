@@ -1,6 +1,6 @@
-"""Times on a noisy machine: variants take turns in one process, medians and quartiles are kept.
+"""Timing on a noisy machine: variants run alternately in one process, and medians and quartiles are reported.
 
-A load from outside then falls on all variants alike, and the ratio of two is taken within each round.
+So other load affects all variants alike. The ratio of two variants is taken within each round.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 
 @dataclass(frozen=True)
 class Quartiles:
-    """The middle of a few measurements, and how far they scatter."""
+    """Median and quartiles of some measurements."""
 
     low: float
     median: float
@@ -25,55 +25,55 @@ class Quartiles:
 
     @classmethod
     def of(cls, values: list[float]) -> Quartiles:
-        """The quartiles of at least one value, interpolated between neighbours."""
+        """Return the quartiles of at least one value, with linear interpolation."""
         low, middle, high = np.quantile(np.asarray(values, np.float64), (0.25, 0.5, 0.75)).tolist()
         return cls(low, middle, high)
 
 
 @dataclass
 class Clock:
-    """Milliseconds of the named parts of repeated work, by round and repetition.
+    """Wall time in ms of named parts of repeated work, by round and repetition.
 
-    A part that runs several times within a repetition counts once, with the sum.
+    The times of a part within one repetition are added.
     """
 
     rounds: list[list[dict[str, float]]] = field(default_factory=lambda: [[]])
 
     @contextmanager
     def repetition(self) -> Iterator[None]:
-        """Everything timed within the block belongs to one repetition of the work."""
+        """Assign all times within the block to one new repetition."""
         self.rounds[-1].append({})
         yield
 
     @contextmanager
     def time(self, part: str) -> Iterator[None]:
-        """Add the duration of the block to a part of the current repetition."""
+        """Add the time of the block to ``part`` of the current repetition."""
         start = time.perf_counter()
         yield
         self.add(part, 1e3 * (time.perf_counter() - start))
 
     def add(self, part: str, milliseconds: float) -> None:
-        """Add to a part of the current repetition."""
+        """Add to ``part`` of the current repetition."""
         parts = self.rounds[-1][-1]
         parts[part] = parts.get(part, 0.0) + milliseconds
 
-    def settle(self) -> None:
-        """Called at the end of a round; nothing is pending on a clock of wall time."""
+    def finish_round(self) -> None:
+        """End a round; a subclass may collect pending times here."""
 
     def quartiles(self) -> dict[str, Quartiles]:
-        """Every part over all repetitions of all rounds."""
+        """Return the quartiles of each part over all repetitions."""
         repetitions = [repetition for turn in self.rounds for repetition in turn]
         parts = dict.fromkeys(part for repetition in repetitions for part in repetition)
         return {part: Quartiles.of([r[part] for r in repetitions if part in r]) for part in parts}
 
     def by_round(self, *parts: str) -> list[float]:
-        """The median sum of the parts in each round."""
+        """Return the median over repetitions of the sum of ``parts``, per round."""
         return [median(sum(r[part] for part in parts) for r in turn) for turn in self.rounds]
 
 
 @dataclass
 class EventClock(Clock):
-    """A GPU's own time between two points of its queue, so that timing makes nobody wait before `settle`."""
+    """Time on the GPU between two events of its queue; only `finish_round` waits for the device."""
 
     _pending: list[tuple[dict[str, float], str, torch.cuda.Event, torch.cuda.Event]] = field(
         default_factory=list
@@ -81,7 +81,7 @@ class EventClock(Clock):
 
     @contextmanager
     def time(self, part: str) -> Iterator[None]:
-        """Add what the device takes for the work that the block queues."""
+        """Add the device time of the work that the block queues."""
         start, end = (
             torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch's own
             for _ in range(2)
@@ -91,8 +91,8 @@ class EventClock(Clock):
         end.record()
         self._pending.append((self.rounds[-1][-1], part, start, end))
 
-    def settle(self) -> None:
-        """Wait for the device and note what was timed."""
+    def finish_round(self) -> None:
+        """Wait for the device and add the pending times."""
         torch.cuda.synchronize()
         for parts, part, start, end in self._pending:
             parts[part] = parts.get(part, 0.0) + start.elapsed_time(end)
@@ -100,16 +100,24 @@ class EventClock(Clock):
 
 
 def ratio(ours: list[float], theirs: list[float]) -> Quartiles:
-    """Quartiles over the rounds of ours / theirs."""
+    """Return the quartiles of the ratio ours / theirs over the rounds."""
     return Quartiles.of([mine / other for mine, other in zip(ours, theirs, strict=True)])
 
 
-def take_turns(
+def interleave(
     variants: Mapping[str, Callable[[Clock], object]], rounds: int, clock: type[Clock] = Clock
 ) -> dict[str, Clock]:
-    """Run every variant once to warm up, then ``rounds`` times in turn, each round starting with another one.
+    """Time variants alternately.
 
-    A variant times itself on the clock that it is given, one or more repetitions a round.
+    Each variant runs once to warm up, then once per round. The first variant of a round changes.
+
+    Args:
+        variants: Name -> function that times one or more repetitions on the clock it receives.
+        rounds: Number of rounds.
+        clock: Kind of clock.
+
+    Returns:
+        The clock of each variant.
     """
     for run in variants.values():
         run(clock())
@@ -120,5 +128,5 @@ def take_turns(
         for name in names[first:] + names[:first]:
             clocks[name].rounds.append([])
             variants[name](clocks[name])
-            clocks[name].settle()
+            clocks[name].finish_round()
     return clocks

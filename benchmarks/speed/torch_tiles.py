@@ -1,12 +1,12 @@
-"""A tile rasteriser in pure torch, differentiated by autograd: what the kernels are compared with.
+"""A tile rasteriser in pure torch with autograd, with which the kernels are compared.
 
-Per tile it does the arithmetic of gsplat's torch code (``_torch_impl.accumulate``), dense over the tile's
-pixels and splats, with the cut-offs of our image formation. It is written to be fast as such code goes:
+Per tile it does the same arithmetic as gsplat's torch code (``_torch_impl.accumulate``), dense over the
+pixels and splats of the tile, with the cut-offs of our rasteriser. It is fast for code of this kind:
 
-* The lists of splats per tile are given, outside its time, and as short as can be: a splat is in a tile's
-  list only when its alpha reaches 1/255 at one of the tile's pixels.
+* The lists of splats per tile are computed before timing starts, and are minimal: a splat is in a list only
+  if its alpha reaches 1/255 at a pixel of the tile.
 * Parameters are gathered once for all tiles, so that the backward pass scatters once.
-* Tiles with lists of similar length are stacked, in groups that stay in the cache and keep all threads busy.
+* Tiles with lists of similar length are stacked. Groups fit the cache and use all threads.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from benchmarks.speed.reference import Splats
 from cleargs.splat import constants
 
 TILE = 16
-GROUP = 1 << 19
-"""(pixel, splat) products of a group of tiles, about: two megabytes a tensor. Of 2^15 to 2^21 the fastest."""
+GROUP_PRODUCTS = 1 << 19
+"""Approximate number of (pixel, splat) products per group of tiles: 2 MB per tensor. The fastest of 2^15 to
+2^21."""
 
 
 class TileGroup(NamedTuple):
-    """Tiles that are rasterised together, their lists padded to one length K."""
+    """Tiles that are rasterised together, with lists padded to one length K."""
 
     tiles: Tensor  # [B] row * tiles across + column
-    ids: Tensor  # [B, K] rows of the splats by depth; M, one row past the end, is padding
+    ids: Tensor  # [B, K] rows of the splats in depth order; M, one row past the end, is padding
 
 
 def tile_lists(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Rows of the splats in every tile, in their order (depth): counts [T] and rows [P], tile by tile."""
+    """Return the number of splats per tile [T], and their rows [P] in depth order, tile by tile."""
     across, down = -(-width // TILE), -(-height // TILE)
     a, b, c = splats.conics.unbind(-1)
     det = a * c - b * b
@@ -56,14 +57,14 @@ def tile_lists(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]
 
 
 def _range(centres: Tensor, extents: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
-    """Tiles [begin, end) that intervals in px overlap."""
+    """Return the tiles [begin, end) that intervals in px overlap."""
     begin = torch.floor((centres - extents) / TILE).clamp(0, tiles).long()
     end = torch.ceil((centres + extents) / TILE).clamp(0, tiles).long()
     return begin, torch.maximum(begin, end)
 
 
 def _touches(splats: Splats, ids: Tensor, tiles: Tensor, across: int, width: int, height: int) -> Tensor:
-    """Whether each splat's alpha reaches 1/255 at a pixel of its tile, [P] bool."""
+    """Return [P] bool: True if the splat's alpha reaches 1/255 at a pixel of the tile."""
     centres = pixel_centres(tiles, across, splats.means.dtype)
     inside = (centres[..., 0] < width) & (centres[..., 1] < height)
     alpha = evaluate(centres, splats.means[ids, None], splats.conics[ids, None], splats.opacities[ids, None])
@@ -71,16 +72,16 @@ def _touches(splats: Splats, ids: Tensor, tiles: Tensor, across: int, width: int
 
 
 def groups(counts: Tensor, ids: Tensor, padding: int) -> list[TileGroup]:
-    """Stack the tiles that have splats, those with lists of similar length together; ``padding`` is M."""
+    """Stack tiles with lists of similar length, without empty tiles; ``padding`` is M."""
     offsets = counts.cumsum(0) - counts
     order = torch.argsort(counts, stable=True)
     order = order[counts[order] > 0]
     stacked = []
     start = 0
     while start < len(order):
-        # Groups are at most a quarter longer than their shortest list, and bounded in size.
+        # Lists of a group are at most a quarter longer than its shortest one, and groups have a maximum size.
         shortest = int(counts[order[start]])
-        most = max(1, GROUP // (TILE * TILE * shortest))
+        most = max(1, GROUP_PRODUCTS // (TILE * TILE * shortest))
         tiles = order[start : start + most]
         tiles = tiles[counts[tiles] <= max(shortest + 4, shortest * 5 // 4)]
         longest = int(counts[tiles].max())
@@ -93,7 +94,7 @@ def groups(counts: Tensor, ids: Tensor, padding: int) -> list[TileGroup]:
 
 
 def rasterise(splats: Splats, stacked: list[TileGroup], width: int, height: int) -> Tensor:
-    """The image [H, W, 3] over black, differentiable in means, conics, colours and opacities."""
+    """Return the image [H, W, 3] over black, differentiable in means, conics, colours and opacities."""
     across, down = -(-width // TILE), -(-height // TILE)
     columns = torch.cat([splats.means, splats.conics, splats.opacities[:, None], splats.colours], 1)
     table = torch.cat([columns, columns.new_zeros(1, columns.shape[1])])
@@ -110,7 +111,7 @@ def rasterise(splats: Splats, stacked: list[TileGroup], width: int, height: int)
 
 
 def pixel_centres(tiles: Tensor, across: int, dtype: torch.dtype) -> Tensor:
-    """Pixel centres of tiles, row by row, [B, 256, 2] px."""
+    """Return the pixel centres of tiles, row by row: [B, 256, 2] px."""
     steps = torch.arange(TILE, dtype=dtype) + constants.PIXEL_CENTRE
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
     corners = torch.stack([tiles % across, tiles // across], -1) * TILE
@@ -118,7 +119,7 @@ def pixel_centres(tiles: Tensor, across: int, dtype: torch.dtype) -> Tensor:
 
 
 def evaluate(centres: Tensor, means: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """Opacity times the Gaussian, over the broadcast shape of centres and splats."""
+    """Return opacity times Gaussian, in the broadcast shape of centres and splats."""
     dx, dy = (centres - means).unbind(-1)
     a, b, c = conics.unbind(-1)
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
@@ -127,7 +128,7 @@ def evaluate(centres: Tensor, means: Tensor, conics: Tensor, opacities: Tensor) 
 
 
 def _blend(group: TileGroup, rows: Tensor, across: int) -> Tensor:
-    """Colours [B, 256, 3] of stacked tiles from their splats' rows [B, K, 9]."""
+    """Blend stacked tiles from the rows of their splats [B, K, 9]; return colours [B, 256, 3]."""
     means, conics, opacities, colours = torch.split(rows, [2, 3, 1, 3], dim=-1)
     centres = pixel_centres(group.tiles, across, rows.dtype)
     raw = evaluate(centres[:, :, None], means[:, None], conics[:, None], opacities[:, None, :, 0])

@@ -1,10 +1,9 @@
-"""How much work a view is: what the kernels must compute and must move, counted from their source.
+"""Work of a view: operations and bytes of the kernels, counted from their source.
 
-Operations are float additions, multiplications, comparisons, minima, maxima, selections, divisions, roots
-and exponentials, one each; a fused multiply-add is two. Only work that reaches a pixel counts: a lane of a
-vector that the ellipse does not cover is overhead, not work. Bytes are those that must pass at least once
-between the kernel and memory: every array that it reads or writes, and one row a (tile, splat) pair where it
-gathers.
+A float addition, multiplication, comparison, minimum, maximum, selection, division, root or exponential is
+one operation; a fused multiply-add is two. Only operations that contribute to a pixel count: a vector lane
+outside the ellipse is overhead. Bytes are those that must move at least once between kernel and memory: each
+array that the kernel reads or writes, and one row per (tile, splat) pair if it gathers.
 """
 
 from __future__ import annotations
@@ -34,36 +33,38 @@ from cleargs.types import AnyArray, ArrayF32
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 PIXEL_CENTRE = np.float32(constants.PIXEL_CENTRE)
 
-VALUES = 59
+PARAMETER_COUNT = 59
 """Parameters of a Gaussian of SH degree 3: 3 + 3 + 4 + 1 + 48."""
-PARAMETERS = 4 * VALUES
-SPLAT = 64
+PARAMETER_BYTES = 4 * PARAMETER_COUNT
+"""Bytes of the parameters in float32."""
+SPLAT_BYTES = 64
 """Bytes of a packed splat, one cache line."""
-SET_UP = LANES * (6 * (TILE // LANES) + 7 * (TILE // LANES) ** 2)
-"""Operations that place a pair in its tile: six vectors a block of rows, seven a block of both."""
-PAIR_SUMS = 36
-"""Bytes of the sums of a pair without depth."""
+SETUP_OPERATIONS = LANES * (6 * (TILE // LANES) + 7 * (TILE // LANES) ** 2)
+"""Operations that set up a pair in its tile: six vector operations per block of rows, and seven per block of
+rows and columns."""
+PAIR_SUM_BYTES = 36
+"""Bytes of the gradient sums of a pair, without depth."""
 
 
 class Size(NamedTuple):
-    """What the work of a view grows with."""
+    """Numbers that determine the work of a view."""
 
     gaussians: int
     pairs: int  # (tile, splat)
-    contributions: int  # (splat, pixel): alpha at least 1/255, and the pixel not finished before
+    contributions: int  # (splat, pixel) with an alpha of at least 1/255, before the pixel is opaque
     vectors: int  # (splat, LANES pixels of a row) with a contribution
     pixels: int
 
 
 class KernelWork(NamedTuple):
-    """Operations and bytes."""
+    """Operations and bytes of one kernel."""
 
     operations: float
     bytes: float
 
 
 def size_of(frame: CpuForwardPass) -> Size:
-    """The size of a view, its contributions counted one by one."""
+    """Count the pairs, contributions and vectors of a view."""
     camera = frame.camera
     counts = np.zeros((len(frame.tile_offsets) - 1, 2), np.int64)
     count_contributions(
@@ -84,7 +85,7 @@ def count_contributions(
     last: ArrayF32,
     counts: AnyArray,
 ) -> None:
-    """Contributions and vectors of every tile, [T, 2]: those up to each pixel's last contributor."""
+    """Count contributions and vectors per tile, up to each pixel's last contributor: ``counts`` [T, 2]."""
     tiles_x = (width + TILE - 1) // TILE
     for tile in prange(counts.shape[0]):
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -105,38 +106,40 @@ def count_contributions(
 
 
 def work_of(size: Size) -> dict[str, KernelWork]:
-    """Work of every kernel of a training iteration (SH degree 3, no depth), in the order of KERNELS."""
+    """Return the work of all kernels of an iteration (SH degree 3, no depth), in the order of `KERNELS`."""
     n, pairs, hits, _, pixels = size
     values = 3 * pixels
     work = {
         # Mostly float64: position 18, quaternion 13, axes 45, Jacobian 24, covariance 63, ellipse 30,
         # direction 12, harmonics 70, colour 96.
-        "projection.project": KernelWork(371 * n, n * (PARAMETERS + SPLAT + 8 + 4)),
+        "projection.project": KernelWork(371 * n, n * (PARAMETER_BYTES + SPLAT_BYTES + 8 + 4)),
         "binning.pair_ranges": KernelWork(0, n * 16),
-        # Counts and depths once (a cache line each), then three passes over keys and numbers.
-        "binning.depth_order": KernelWork(0, n * (8 + SPLAT + 8 + 3 * 16)),
-        "binning.list_pairs": KernelWork(0, n * (SPLAT + 8) + pairs * 4),
-        # Counted, then placed: tiles read twice, Gaussian and slot written.
+        # Counts and depths once (a cache line each), then three passes over keys and indices.
+        "binning.depth_order": KernelWork(0, n * (8 + SPLAT_BYTES + 8 + 3 * 16)),
+        "binning.list_pairs": KernelWork(0, n * (SPLAT_BYTES + 8) + pairs * 4),
+        # A count, then the sort: tiles are read twice, Gaussian and slot written.
         "binning.sort_pairs_by_tile": KernelWork(0, 2 * n * 12 + pairs * 16),
-        # A pair: its geometry in the tile. A contribution: exponent 4, exp2 15, weight and T 3, cut-offs and
-        # the last contributor 9, three colours 6.
-        "rasterise.forward": KernelWork(SET_UP * pairs + 37 * hits, pairs * (4 + SPLAT) + pixels * 20),
-        # Planes are padded copies of both images and of the mask.
+        # Per pair: its geometry in the tile. Per contribution: exponent 4, exp2 15, weight and T 3, cut-offs
+        # and last contributor 9, three colours 6.
+        "rasterise.forward": KernelWork(
+            SETUP_OPERATIONS * pairs + 37 * hits, pairs * (4 + SPLAT_BYTES) + pixels * 20
+        ),
+        # Padded copies of both images and of the mask.
         "loss.pad_images": KernelWork(0, values * 20),
-        # Eleven taps each way, 10 operations down and 10 across, then SSIM and its derivatives.
+        # Two passes of eleven taps (10 operations down, 10 across), then SSIM and its derivatives.
         "loss.measure": KernelWork(257 * values, values * 24),
-        # Eleven taps of three maps each way, then the sum.
+        # Two passes of eleven taps over three maps, then the sum.
         "loss.differentiate": KernelWork(144 * values, values * 28),
-        # A pair: as forward, which pieces it reaches, nine sums over the lanes. A contribution: alpha again
-        # 24, T back 2, gain, S and v 12, nine sums 17.
+        # Per pair: the setup of forward, a test per piece, nine sums over the lanes. Per contribution: alpha
+        # 24, previous T 2, gain, S and v 12, nine sums 17.
         "rasterise.backward": KernelWork(
-            (SET_UP + PIECES + 9 * (LANES - 1)) * pairs + 55 * hits,
-            pairs * (4 + 4 + SPLAT + PAIR_SUMS) + pixels * 20,
+            (SETUP_OPERATIONS + PIECES + 9 * (LANES - 1)) * pairs + 55 * hits,
+            pairs * (4 + 4 + SPLAT_BYTES + PAIR_SUM_BYTES) + pixels * 20,
         ),
-        # Projection once more, then its chain rule, mostly in float64; nine additions a pair.
+        # Projection and its chain rule, mostly in float64; nine additions per pair.
         "gradients.backpropagate": KernelWork(
-            780 * n + 9 * pairs, n * (2 * PARAMETERS + SPLAT + 8) + pairs * PAIR_SUMS
+            780 * n + 9 * pairs, n * (2 * PARAMETER_BYTES + SPLAT_BYTES + 8) + pairs * PAIR_SUM_BYTES
         ),
-        "elementwise.adam": KernelWork(13 * VALUES * n, 28 * VALUES * n),
+        "elementwise.adam": KernelWork(13 * PARAMETER_COUNT * n, 28 * PARAMETER_COUNT * n),
     }
     return {name: work[name] for name in KERNELS}

@@ -125,8 +125,8 @@ def decode_frames(path: Path, pts: Collection[int]) -> Iterator[tuple[int, Image
 def decode_grey(path: Path, pts: Collection[int]) -> Iterator[tuple[int, ImageU8]]:
     """Yield frames like `decode_frames`, but grey [H, W] and as they are stored.
 
-    It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was cut out of another, are left
-    out.
+    It is several times as fast. Frames that cannot be decoded, for example at the start of a clip that was
+    cut out of another, are left out.
     """
     for number, frame, _ in _decoded(path, pts):
         yield number, np.asarray(frame.to_ndarray(format="gray"), np.uint8)

@@ -1,4 +1,4 @@
-"""What the tests of the programs that measure ClearGS borrow from the tests of ClearGS."""
+"""Paths to helpers of other test folders that the tests of the benchmarks use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of image formation measures what it says: its ways agree where they must."""
+"""The benchmark of image formation: its methods, their gradients and its command."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from cleargs.splat.backend import rasteriser_for
 
 
 @pytest.mark.slow
-def test_more_renders_come_nearer_to_the_exposure() -> None:
+def test_more_renders_are_closer_to_the_exposure() -> None:
     plan = FormationPlan(2_000, 96, 54, (4.0,), (3, 9), 1, rounds=1, repetitions=1)
     (row,) = run(plan, SilentReporter()).rows
     assert set(row.times) == {PLAIN, FORMED, "3 renders", "9 renders"}
     assert row.ratio[PLAIN].median == 1.0
-    # Found: 26, 33, 38 and 47 dB.
+    # Measured: 26, 33, 38 and 47 dB.
     assert row.psnr[PLAIN] + 3 < row.psnr[FORMED]
     assert row.psnr[PLAIN] + 3 < row.psnr["3 renders"] < row.psnr["9 renders"] - 3
 
 
-def test_the_gradient_of_a_mean_of_renders_is_that_of_finite_differences() -> None:
+def test_mean_of_renders_matches_finite_differences() -> None:
     gaussians, camera = surface_scene(400, 48, 27)
     step = _MeanOfRenders(gaussians, camera, motion_of(3.0, 5.0), 3)
     weight = torch.from_numpy(np.random.default_rng(0).normal(size=(27, 48, 3)).astype(np.float32))
@@ -51,11 +51,11 @@ def test_the_gradient_of_a_mean_of_renders_is_that_of_finite_differences() -> No
         return float((image.double() * weight).sum())
 
     slope = (value(1e-3) - value(-1e-3)) / 2e-3
-    # float32 images of 4,000 numbers, whose weighted sum is good to 1e-5 or so.
+    # The weighted sum over a float32 image of 4,000 numbers has a relative error of about 1e-5.
     assert slope == pytest.approx(float((found * moved).sum()), rel=2e-2)
 
 
-def test_the_path_is_centred_on_the_pose() -> None:
+def test_path_is_centred_on_the_pose() -> None:
     gaussians, camera = surface_scene(400, 48, 27)
     motion = motion_of(6.0, 5.0)
     (middle,) = poses_along(camera, motion, 1)
@@ -66,9 +66,7 @@ def test_the_path_is_centred_on_the_pose() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_table_picture_and_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_table_picture_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(["formation", "--quick", "--threads", "1", "-o", str(tmp_path), "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert [row["length"] for row in values["rows"]] == [3.0, 10.0]

@@ -1,4 +1,4 @@
-"""The error columns: exact on the chosen pixels, and a planted error is seen as large as it is."""
+"""The errors against the oracle: exact on the chosen pixels, and equal to a planted error."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ def double(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()})
 
 
-def test_leaving_unseen_splats_out_changes_nothing(scene, truth):
-    """Every splat at every pixel of the view, against a few pixels and the splats that they see."""
+def test_leaving_out_unseen_splats_changes_nothing(scene, truth):
+    """Compares all splats at all pixels with a few pixels and the splats visible there."""
     gaussians, camera = scene
     leaves = Gaussians(**{k: t.requires_grad_() for k, t in double(gaussians).tensors().items()})
     whole = reference.render(leaves, camera)
     (whole.image * truth.grad_image.double()).sum().backward()
     assert 0 < truth.seen < SPLATS // 2
     assert truth.safe.all()
-    # The order of a matrix product's sums is all that differs.
+    # Only the order of the sums in a matrix product differs.
     torch.testing.assert_close(
         truth.colours, whole.image.detach().reshape(-1, 3)[PIXELS], rtol=1e-13, atol=1e-15
     )
@@ -73,7 +73,7 @@ def test_seen_splats_are_those_that_reach_the_cut(scene):
     assert torch.equal(seen_at(double(gaussians), camera, PIXELS), expected)
 
 
-def test_a_planted_error_is_seen(scene, truth):
+def test_planted_error_is_measured(scene, truth):
     image = torch.zeros(HEIGHT * WIDTH, 3, dtype=torch.float64)
     image[PIXELS] = truth.colours
     perfect = accuracy(truth, image, truth.gradients)
@@ -89,7 +89,9 @@ def test_a_planted_error_is_seen(scene, truth):
     found = accuracy(truth, image, gradients)
     assert found.image.max == pytest.approx(0.02)
     assert found.image.median == 0
-    assert found.gradients["rotations"].max == pytest.approx(0.3)  # at a splat that no pixel sees
+    assert found.gradients["rotations"].max == pytest.approx(
+        0.3
+    )  # at a splat that is invisible at all pixels
     assert found.gradients["rotations"].median == 0
     assert found.gradients["sh"].max == pytest.approx(0.01)
     assert found.gradients["sh"].median == pytest.approx(0.01)
@@ -97,7 +99,7 @@ def test_a_planted_error_is_seen(scene, truth):
     assert found.worst_gradient == pytest.approx(0.3)
 
 
-def test_a_gradient_that_is_not_a_number_is_no_small_error(truth):
+def test_nan_gradient_is_a_large_error(truth):
     gradient = truth.gradients.means.clone()
     gradient[0, 0] = torch.nan
     assert not gradient_error(gradient, truth.gradients.means).max < 1e30
@@ -118,26 +120,26 @@ def test_pixels_near_a_cut_off_are_not_compared(scene, monkeypatch):
     assert measured.pixels + measured.left_out == len(pixels)
 
 
-def test_the_kernels_are_near_the_oracle(scene, truth):
-    """1e-5 as in the tests of the rasteriser; what is compared is not black and not saturated."""
+def test_kernels_agree_with_the_oracle(scene, truth):
+    """The limit 1e-5 is that of the tests of the rasteriser. The compared pixels are not black."""
     found = accuracy(truth, *Iteration(*scene).image_and_gradients(truth.grad_image))
     assert truth.colours.max() > 0.2
     assert found.image.max < 5e-6
     assert 0 < found.worst_gradient < 1e-5
 
 
-def test_pixels_are_few_different_and_the_same_for_a_seed(monkeypatch):
+def test_pixels_are_distinct_and_depend_on_the_seed(monkeypatch):
     _, camera = random_scene(1, 400, 300)
     chosen = choose_pixels(camera, 1000, seed=1)
     assert len(chosen.unique()) == 1000
     assert torch.equal(chosen, choose_pixels(camera, 1000, seed=1))
     assert not torch.equal(chosen, choose_pixels(camera, 1000, seed=2))
     assert int(chosen.min()) >= 0 and int(chosen.max()) < 400 * 300
-    assert len(choose_pixels(camera, 10_000_000, seed=1)) == oracle_module.PRODUCTS // 10_000_000
+    assert len(choose_pixels(camera, 10_000_000, seed=1)) == oracle_module.MAX_PRODUCTS // 10_000_000
     assert torch.equal(choose_pixels(random_scene(1, 7, 5)[1], 10, seed=1), torch.arange(35))
 
 
-def test_a_view_that_nothing_reaches(scene):
+def test_view_without_visible_splats(scene):
     gaussians, camera = scene
     behind = gaussians.clone()
     behind.means[:, 2] -= 100.0

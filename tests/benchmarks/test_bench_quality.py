@@ -1,4 +1,4 @@
-"""The benchmark of qualities: what it adds up and writes; what is finished is not made again."""
+"""The benchmark of qualities: its sums and files, and the reuse of finished runs."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ ROW = QualityRow(
 PLAN = QualityPlan((Path("fox"),), ("draft", "standard"), {"ingest.max_size": 473}, "g0", 2)
 
 
-def test_a_row_holds_the_whole_time_and_that_of_the_training(tmp_path: Path) -> None:
+def test_row_has_total_and_training_time(tmp_path: Path) -> None:
     rows = [ROW, replace(ROW, quality="standard", cpu_seconds=None, peak_memory_gb=None)]
     benchmark = QualityBenchmark(describe_machine(0.0), PLAN, rows)
     text = quality_markdown(benchmark)
     cells = "| 2.0 | 1.5 | 3.3 | 1.2 | 800 | 20,000 | 28.50 | 0.9000 | unknown |"
-    assert f"| fox (7 kept apart) | draft {cells}" in text
+    assert f"| fox (7 held out) | draft {cells}" in text
     assert "| standard | 2.0 | 1.5 | unknown | unknown | 800 |" in text
     assert "`ingest.holdout=every:8`, `ingest.max_size=473`" in text
     assert benchmark.as_json()["rows"][0]["total"] == 120.0
@@ -43,14 +43,14 @@ def test_a_row_holds_the_whole_time_and_that_of_the_training(tmp_path: Path) -> 
     assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_captures_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_captures_with_one_name_are_refused(tmp_path: Path) -> None:
     plan = replace(PLAN, captures=(tmp_path / "a" / "fox", tmp_path / "b" / "fox"))
     with pytest.raises(InputError, match="same name"):
         run(plan, tmp_path, SilentReporter())
 
 
 @pytest.mark.slow
-def test_the_command_runs_each_quality_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_runs_each_quality_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def call(*words: str) -> str:
         assert invoke(list(words)) == 0
         return capsys.readouterr().out
@@ -63,11 +63,11 @@ def test_the_command_runs_each_quality_once(tmp_path: Path, capsys: pytest.Captu
     draft, standard = values["rows"]
     assert (draft["quality"], standard["quality"]) == ("draft", "standard")
     assert draft["steps"] == standard["steps"] == 20
-    assert draft["images"] == 2  # of nine, every eighth
-    assert draft["seconds"]["ingest"] == standard["seconds"]["ingest"]  # made once, counted twice
+    assert draft["images"] == 2  # every eighth of nine
+    assert draft["seconds"]["ingest"] == standard["seconds"]["ingest"]  # ran once, counts twice
     assert draft["means"]["psnr"] > 10
     assert json.loads((tmp_path / "out" / "quality.json").read_text()) == values
-    # Nothing is made again, and what another call went on to is not counted.
+    # Finished stages are reused, and later stages of another call do not count.
     call(*words, "--until", "rivr", "--set", "rivr.distil.steps=5", "--quality", "draft")
     again = json.loads(call(*words))
     assert [row["seconds"] for row in again["rows"]] == [row["seconds"] for row in values["rows"]]

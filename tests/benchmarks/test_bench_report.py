@@ -1,4 +1,4 @@
-"""A whole benchmark at toy size: every table, file and picture, from the command line and from Python."""
+"""A small benchmark: all tables, files and pictures, from the command line and from Python."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def benchmark() -> Benchmark:
     return run(toy_plan(), SilentReporter())
 
 
-def test_every_row_has_its_errors_beside_its_times(benchmark):
+def test_every_row_has_times_and_errors(benchmark):
     for row, case in zip(benchmark.rows, (SMALL, LARGE), strict=True):
         assert row.case == case
         assert set(row.accuracy.gradients) == {"means", "log_scales", "rotations", "logit_opacities", "sh"}
@@ -58,7 +58,7 @@ def test_every_row_has_its_errors_beside_its_times(benchmark):
     assert other.ratio[1].median == pytest.approx(other.times[1].median / small.rasterisers.ours[1].median)
 
 
-def test_tables_say_what_was_not_run(benchmark):
+def test_tables_name_cases_that_were_not_run(benchmark):
     text = markdown(benchmark)
     lines = [line for line in text.splitlines() if line.startswith(f"| {LARGE.title} | 1 | {NOT_RUN}")]
     assert len(lines) == 1
@@ -82,7 +82,7 @@ def test_json_is_complete(benchmark):
 
 
 @pytest.mark.slow
-def test_the_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
+def test_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(plans, "quick_plan", lambda threads: toy_plan())
     options = ["--quick", "--threads", "1", "--seed", "9", "-q", "--json", "-o", str(tmp_path)]
     assert invoke(["splat", *options]) == 0
@@ -96,18 +96,18 @@ def test_the_command_writes_tables_and_pictures(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_tables(monkeypatch, capsys):
+def test_command_prints_the_tables(monkeypatch, capsys):
     monkeypatch.setattr(plans, "quick_plan", lambda threads: toy_plan())
     assert invoke(["splat", "--quick", "--threads", "1", "-q"]) == 0
-    assert capsys.readouterr().out.startswith("# Speed against error")
+    assert capsys.readouterr().out.startswith("# Speed and error of the rasteriser")
 
 
 @pytest.mark.slow
-def test_memory_is_that_of_the_scene():
-    """20,000 splats keep parameters, two moments and gradients: 4 x 59 floats each, and more in buffers."""
+def test_peak_memory_is_that_of_the_scene():
+    """Each of 20,000 splats has parameters, two moments and gradients, 59 floats each; buffers need more."""
     found = peak_memory(20_000, 64, 48, 1.8)
     if found is None:
-        pytest.skip("this system does not tell a process its peak memory")
+        pytest.skip("this system does not report peak memory")
     least = 20_000 * 4 * 59 * 4
     assert least < found < 5 * least
 

@@ -1,4 +1,4 @@
-"""The rasteriser in pure torch computes the same image formation as the oracle."""
+"""The rasteriser in pure torch computes the same image and gradients as the oracle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 45, 35
 
 
 def scene() -> tuple[Gaussians, Camera]:
-    """Float64, some pixels saturated, some nearly empty; sizes that are no multiple of the tile."""
+    """Float64 scene with saturated and almost empty pixels; sizes are not multiples of the tile."""
     gaussians, camera = random_scene(500, WIDTH, HEIGHT, sigma=3.0)
     gaussians.logit_opacities[:100] = 6.0
     leaves = {name: tensor.double().requires_grad_() for name, tensor in gaussians.tensors().items()}
@@ -43,18 +43,18 @@ def test_image_and_gradients_agree_with_the_oracle():
     image = stacked_tiles(project(gaussians, camera))
     truth = reference.render(gaussians, camera)
     assert truth.alpha.max() > 1 - 2 * constants.TRANSMITTANCE_STOP and truth.alpha.min() < 0.99
-    # Both in float64: what differs is the order of operations.
+    # Both are in float64; only the order of operations differs.
     torch.testing.assert_close(image, truth.image, rtol=0, atol=1e-11)
-    slope = torch.randn(HEIGHT, WIDTH, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    weight = torch.randn(HEIGHT, WIDTH, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     leaves = list(gaussians.tensors().values())
-    ours = torch.autograd.grad(image, leaves, slope)
-    exact = torch.autograd.grad(truth.image, leaves, slope)
+    ours = torch.autograd.grad(image, leaves, weight)
+    exact = torch.autograd.grad(truth.image, leaves, weight)
     for gradient, expected in zip(ours, exact, strict=True):
         assert expected.abs().max() > 0
         torch.testing.assert_close(gradient, expected, rtol=0, atol=1e-10 * float(expected.abs().max()))
 
 
-def test_lists_hold_exactly_the_splats_that_reach_a_tile():
+def test_tile_lists_are_exact():
     gaussians, camera = scene()
     splats = detached(project(gaussians, camera))
     counts, ids = tile_lists(splats, WIDTH, HEIGHT)
@@ -70,8 +70,8 @@ def test_lists_hold_exactly_the_splats_that_reach_a_tile():
 
 
 @pytest.mark.parametrize("size", [1, 1 << 14, 1 << 22])
-def test_groups_hold_every_pair_once(size, monkeypatch):
-    monkeypatch.setattr(torch_tiles, "GROUP", size)
+def test_groups_contain_every_pair_once(size, monkeypatch):
+    monkeypatch.setattr(torch_tiles, "GROUP_PRODUCTS", size)
     gaussians, camera = scene()
     splats = detached(project(gaussians, camera))
     counts, ids = tile_lists(splats, WIDTH, HEIGHT)

@@ -1,4 +1,4 @@
-"""What is counted is what the kernels do; every kernel is timed and left as it was."""
+"""Counts of work match the oracle; kernels are timed and restored; peaks, rooflines and fits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.speed.peaks import Peaks, measure_peaks
 from benchmarks.speed.probe import KERNELS, PACKAGE, timed_kernels
 from benchmarks.speed.roofline import roof, roofline
 from benchmarks.speed.scaling import straight_line
-from benchmarks.speed.timing import Clock, Quartiles, ratio, take_turns
+from benchmarks.speed.timing import Clock, Quartiles, interleave, ratio
 from benchmarks.speed.work import KernelWork, size_of, work_of
 from cleargs.splat import constants
 from cleargs.splat.gaussians import Gaussians
@@ -22,12 +22,12 @@ from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.pace import random_scene
 
 
-def test_contributions_are_those_of_the_oracle():
+def test_contributions_match_the_oracle():
     gaussians, camera = random_scene(120, 45, 35, sigma=3.0, seed=0)
     gaussians.logit_opacities[:60] = 6.0
     exact = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()})
     view = reference.render(exact, camera)
-    assert view.margin.min() > 1e-5, "float32 might decide the other way: take another seed"
+    assert view.margin.min() > 1e-5, "float32 may fall on the other side of a cut-off: use another seed"
     splats = reference.project(exact, camera, 16, antialias=False)
     x, y = torch.arange(45) + 0.5, torch.arange(35) + 0.5
     dx = x.double()[None, :, None] - splats.means[:, 0]
@@ -48,7 +48,7 @@ def test_contributions_are_those_of_the_oracle():
     assert expected / 256 <= size.pairs <= 120 * 9
 
 
-def test_every_kernel_is_timed_and_put_back():
+def test_every_kernel_is_timed_and_restored():
     originals = [_kernel(name) for name in KERNELS]
     clock = Clock(rounds=[[]])
     iteration = Iteration(*random_scene(20, 33, 17))
@@ -71,7 +71,7 @@ def _kernel(name):
     return getattr(import_module(f"{PACKAGE}.{module}"), function)
 
 
-def test_the_roof_is_the_slower_of_operations_and_bytes():
+def test_roof_is_the_slower_of_operations_and_bytes():
     peaks = Peaks(gflops=100.0, gbytes=10.0)
     bound = roof("k", KernelWork(operations=4e8, bytes=1e7), 8.0, peaks)  # at least 4 ms, and 1 ms
     assert (bound.bound, bound.fraction) == ("operations", pytest.approx(0.5))
@@ -79,7 +79,7 @@ def test_the_roof_is_the_slower_of_operations_and_bytes():
     assert (bound.bound, bound.fraction) == ("bytes", pytest.approx(0.75))
 
 
-def test_work_of_every_kernel_grows_with_its_size():
+def test_work_is_proportional_to_size():
     size = size_of(projected_frame(*random_scene(50, 33, 17)))
     once = work_of(size)
     twice = work_of(type(size)(*(2 * number for number in size)))
@@ -96,7 +96,7 @@ def test_peaks_are_measured():
     assert peaks.gflops > 0 and peaks.gbytes > 0
 
 
-def test_variants_take_turns():
+def test_variants_are_interleaved():
     order: list[str] = []
 
     def variant(name, values):
@@ -108,14 +108,14 @@ def test_variants_take_turns():
 
         return run
 
-    clocks = take_turns({"a": variant("a", [9.0, 1.0, 3.0]), "b": variant("b", [9.0, 5.0, 7.0])}, rounds=2)
+    clocks = interleave({"a": variant("a", [9.0, 1.0, 3.0]), "b": variant("b", [9.0, 5.0, 7.0])}, rounds=2)
     assert order == ["a", "b", "a", "b", "b", "a"]
     assert clocks["a"].by_round("work") == [2.0, 4.0]
     assert clocks["b"].quartiles() == {"work": Quartiles(6.5, 7.0, 7.5)}
     assert ratio([2.0, 4.0], [6.0, 8.0]).median == pytest.approx((1 / 3 + 1 / 2) / 2)
 
 
-def test_straight_lines():
+def test_linear_fits():
     line = straight_line([(100, 7.0), (200, 12.0), (1000, 52.0)])
     assert line == pytest.approx((2.0, 0.05, 0.0), abs=1e-9)
     bent = straight_line([(100, 7.0), (200, 12.0), (1000, 104.0)])

@@ -1,4 +1,4 @@
-"""What is read off the cells of a comparison: means, spreads, paired differences, and the tables of them."""
+"""Means, spreads and paired differences of the cells of a comparison, and their tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import pytest
 
 from benchmarks.comparison.cells import Cell, Cells, ViewSet, spread, student_t
-from benchmarks.comparison.findings import Compared
+from benchmarks.comparison.findings import Comparison
 from benchmarks.comparison.roles import FOR_SHARE, KINDS, Roles
 from benchmarks.comparison.tables import Results, difference_text, markdown
 from cleargs.evaluate.eval_report import Region
@@ -41,7 +41,7 @@ def roles(strong: int, reactivated: int) -> Roles:
 
 
 def cells(*gains: float) -> Cells:
-    """Samples of very different level, on which the full method gains so much each."""
+    """Samples with very different PSNR, on which the whole method gains ``gains`` dB."""
     found = []
     for number, gain in enumerate(gains):
         level = 20.0 + 5.0 * number
@@ -50,14 +50,14 @@ def cells(*gains: float) -> Cells:
     return Cells(found)
 
 
-def test_the_spread_of_one_value_is_unknown() -> None:
+def test_spread_of_one_value_is_unknown() -> None:
     assert spread([3.0]).deviation is None
-    assert not spread([3.0]).is_none
-    # Deviation with n - 1: values 1 and 3 lie 1 from their mean; sqrt(2 / 1).
+    assert not spread([3.0]).includes_zero
+    # Sample deviation (n - 1): values 1 and 3 are 1 from their mean, so sqrt(2 / 1).
     assert spread([1.0, 3.0]).deviation == 2.0**0.5
 
 
-def test_intervals_against_values_by_hand() -> None:
+def test_intervals_match_values_by_hand() -> None:
     # Quantiles from a printed table of Student's t, 97.5 %: 12.706, 2.776 and 2.262 for 1, 4 and 9 degrees of
     # freedom.
     assert student_t(1) == pytest.approx(12.706, abs=5e-4)
@@ -66,40 +66,40 @@ def test_intervals_against_values_by_hand() -> None:
     # 1 .. 5: mean 3, deviation sqrt(10 / 4), half width 2.776 sqrt(2.5) / sqrt(5) = 2.776 sqrt(0.5) = 1.963.
     found = spread([1.0, 2.0, 3.0, 4.0, 5.0])
     assert found.half_width == pytest.approx(1.963, abs=5e-4)
-    assert found.is_sure and not found.is_none
-    # The same around 1.5: the interval is 1.5 +- 1.963 and holds 0.
+    assert found.excludes_zero and not found.includes_zero
+    # The same around 1.5: the interval is 1.5 +- 1.963 and includes 0.
     found = spread([-0.5, 0.5, 1.5, 2.5, 3.5])
-    assert found.is_none and not found.is_sure
-    # A mean twice its deviation: enough for the deviation, not for the interval of two values.
-    assert spread([1.0, 3.0]).is_none
-    # One value has no interval, and so claims nothing.
-    assert spread([3.0]).half_width is None and not spread([3.0]).is_sure
+    assert found.includes_zero and not found.excludes_zero
+    # The mean is 1.4 deviations, but the interval of two values is much wider.
+    assert spread([1.0, 3.0]).includes_zero
+    # One value has no interval.
+    assert spread([3.0]).half_width is None and not spread([3.0]).excludes_zero
 
 
 def test_differences_are_paired_within_samples() -> None:
     difference = cells(1.0, 1.25, 1.125).difference("observed", "mixed", "full", "all-view", "psnr")
     assert difference is not None
-    # The samples' levels differ by 5 dB; the gains do not, and only these count.
+    # Only the gains count; the PSNR of samples differs by 5 dB.
     assert difference.mean == 1.125
     assert difference.deviation is not None and difference.deviation < 0.2
-    assert difference.is_sure
+    assert difference.excludes_zero
 
 
-def test_a_difference_whose_interval_holds_0_is_none() -> None:
+def test_insignificant_difference_is_shown_as_none() -> None:
     found = cells(1.0, -1.0, 0.2)
     difference = found.difference("observed", "mixed", "full", "all-view", "psnr")
-    assert difference is not None and difference.is_none
+    assert difference is not None and difference.includes_zero
     # Mean 0.0667, deviation 1.0066, times 4.303 / sqrt(3).
     assert "none (+0.07 ± 2.50)" in markdown(Results(found, (), ()), LABELS, ("all-view",))
 
 
-def test_a_sample_without_its_baseline_takes_no_part() -> None:
+def test_sample_without_baseline_is_left_out() -> None:
     found = Cells([*cells(1.0).cells, cell("full", "lonely", psnr=99.0)])
     difference = found.difference("observed", "mixed", "full", "all-view", "psnr")
     assert difference is not None and (difference.mean, difference.count) == (1.0, 1)
 
 
-def test_best_is_lowest_for_lpips_and_highest_elsewhere() -> None:
+def test_best_is_lowest_for_lpips_and_highest_for_others() -> None:
     found = cells(-1.0)
     assert found.best("observed", "mixed", "psnr") == "all-view"
     assert found.best("observed", "mixed", "lpips_alex") == "full"
@@ -113,13 +113,13 @@ def test_tables() -> None:
     assert "| ClearGS | LPIPS (AlexNet) | -0.1000 (-25 %) |" in text
     assert "| ClearGS | 100 | 10 | 1 | 4 | 0.50 | 2 + 1 |" in text
     assert "| mixed | ClearGS | 7 | 0 | 0 | 0 | 5 | 0 |" in text, "frames of both samples"
-    assert "against the truth\n\n|" not in text, "without RIVR there is no choice to judge"
-    assert "musiq" not in text, "a metric that was never measured has no table"
+    assert "against the truth\n\n|" not in text, "there are no choices without RIVR"
+    assert "musiq" not in text, "a metric without values has no table"
     assert "drop-blurry" not in text, "a baseline that was not run has no table"
 
 
-def test_a_mean_over_fewer_samples_is_not_the_best() -> None:
-    """A variant that failed on the hard capture would win by it."""
+def test_mean_over_fewer_samples_is_not_the_best() -> None:
+    """Else a variant that failed on the hard capture would win."""
     found = Cells(
         [
             cell("all-view", "easy", psnr=30.0),
@@ -135,10 +135,10 @@ def test_a_mean_over_fewer_samples_is_not_the_best() -> None:
     assert difference_text(lost, base, "psnr") == "+0.50 (n = 1)"
 
 
-def test_a_perfect_scene_survives_its_json() -> None:
+def test_infinite_psnr_survives_json() -> None:
     text = cell("full", "s", psnr=math.inf, ssim=1.0).model_dump_json()
-    json.loads(text, parse_constant=pytest.fail)  # Infinity is no JSON
+    json.loads(text, parse_constant=pytest.fail)  # Infinity is not valid JSON
     assert Cell.model_validate_json(text).means["psnr"] == math.inf
     assert Region.model_validate_json(Region(share=0.1, psnr=math.inf).model_dump_json()).psnr == math.inf
-    document = Compared(cells=[cell("full", "s", psnr=math.inf)]).document()
+    document = Comparison(cells=[cell("full", "s", psnr=math.inf)]).document()
     assert document["cells"][0]["means"] == {"psnr": "Infinity"}

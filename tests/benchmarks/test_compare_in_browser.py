@@ -1,4 +1,4 @@
-"""The page of a comparison in a real browser, wide and on a phone, light and dark."""
+"""The page of a comparison in a browser: wide and phone screens, light and dark."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_page_fits_its_screen(browser: Any, made: Path, size: str) -> None:
     check_page(browser, made.as_uri(), size)
 
 
-def test_a_pose_opens_under_a_slider_by_keyboard(browser: Any, made: Path) -> None:
+def test_pose_opens_with_slider_by_keyboard(browser: Any, made: Path) -> None:
     page = browser.new_page(viewport=SIZES["wide"])
     opened = Opened(page, made.as_uri())
     page.locator(".tile").nth(1).press("Enter")

@@ -1,4 +1,4 @@
-"""`compare` on a tiny capture: shared stages are made once, and a second call makes nothing."""
+"""`compare` on a tiny capture: shared stages run once, and a second call reuses everything."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ import pytest
 from benchmarks.commands import invoke
 from benchmarks.comparison import findings
 from benchmarks.comparison.cells import Cell
-from benchmarks.comparison.choices import judge_choices
+from benchmarks.comparison.choices import measure_choices
 from benchmarks.comparison.equal_work import EqualWork, decide_work
-from benchmarks.comparison.scenes import Made, SceneRecipe, evaluated, existing, view_sets
+from benchmarks.comparison.scenes import (
+    FinishedScene,
+    SceneRecipe,
+    cached_evaluation,
+    scene_of_run,
+    view_sets,
+)
 from cleargs.capture.tables import load_frames
 from cleargs.cli.common import DONE_IN_PART
 from cleargs.errors import InputError
@@ -36,7 +42,7 @@ pytestmark = pytest.mark.slow
 
 SETTINGS = {
     "ingest.max_features": "512",
-    "rva.tau_R": "0.95",  # so that binary and graded weights differ from one another and from 1
+    "rva.tau_R": "0.95",  # so that binary weights, graded weights and 1 differ
     "g0.steps": "12",
     "g0.min_points": "400",
     "g0.budget": "500",
@@ -60,7 +66,7 @@ def out(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 TOTAL = 12 + 6 + 6
-"""Steps of the whole method with these settings; the recipe `smoke` has one round."""
+"""Steps of the whole method with these settings. The recipe `smoke` has one round."""
 
 
 def compare(capture: Path, *more: str) -> int:
@@ -70,7 +76,7 @@ def compare(capture: Path, *more: str) -> int:
     )
 
 
-def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
+def test_every_variant_is_evaluated_on_both_view_sets(out: Path) -> None:
     found = json.loads((out / "comparison.json").read_text())
     assert found["failures"] == []
     cells = {(cell["variant"], cell["views"]): cell for cell in found["cells"]}
@@ -81,7 +87,7 @@ def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
     }
     for cell in cells.values():
         assert cell["column"] == "mixed"
-        # Two dozen steps make no good scene, but one that shows the room: its mean colour alone gives 12 dB.
+        # After two dozen steps the scene shows the room; its mean colour alone reaches 12 dB.
         assert 12.0 < cell["means"]["psnr"] < 40.0
         assert (out / cell["evaluation"] / "eval.json").is_file()
         assert (cell["steps"], cell["sh_degree"]) == (TOTAL, 1)
@@ -92,34 +98,28 @@ def test_every_variant_is_judged_on_both_sets_of_views(out: Path) -> None:
         assert (out / name).stat().st_size > 0
 
 
-def test_the_page_shows_every_variant_at_every_pose(out: Path) -> None:
+def test_page_shows_every_variant_at_every_pose(out: Path) -> None:
     text = (out / "report/index.html").read_text()
     poses = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])["frames"]
-    assert [len(pose["layers"]) for pose in poses] == [
-        6,
-        6,
-        6,
-        5,
-        5,
-        5,
-    ]  # filmed at the poses of the path only
-    assert "All were trained for as many steps" in text
+    # Only the poses of the path have a filmed frame.
+    assert [len(pose["layers"]) for pose in poses] == [6, 6, 6, 5, 5, 5]
+    assert "All were trained for the same number of steps" in text
     for page in (text, (out / "comparison.md").read_text()):
-        assert "Training poses: the scenes were trained on the frames filmed from here" in page
+        assert "Training poses: the scenes were trained on the frames filmed here" in page
 
 
-def test_variants_share_what_they_agree_on(out: Path) -> None:
+def test_variants_share_equal_stages(out: Path) -> None:
     stored = {stage: list((out / ".store" / stage).iterdir()) for stage in ("ingest", "rva", "g0")}
     assert len(stored["ingest"]) == 1
     assert len(stored["rva"]) == 3  # all views, binary weights, graded weights
-    assert len(stored["g0"]) == 4  # that of `full` has fewer steps than that of `rva`
+    assert len(stored["g0"]) == 4  # `full` has fewer G0 steps than `rva`
     cells = json.loads((out / "comparison.json").read_text())["cells"]
     shared = {cell["variant"]: cell["shared_seconds"] for cell in cells}
     assert shared["all-view"] == 0.0
     assert shared["full"] > shared["rva"] > 0.0
 
 
-def test_roles_and_choices_stand_beside_the_cells(out: Path) -> None:
+def test_results_contain_roles_and_choices(out: Path) -> None:
     found = json.loads((out / "comparison.json").read_text())
     roles = {scene["variant"]: scene["frames"] for scene in found["roles"]}
     assert all(sum(frames.values()) == 6 for frames in roles.values())
@@ -134,17 +134,17 @@ def test_roles_and_choices_stand_beside_the_cells(out: Path) -> None:
     assert "| all-view G0 | 24 |" in text and "best by PSNR" in text
 
 
-def test_a_frame_without_truth_is_judged_by_nobody(capture: Path, out: Path, tmp_path: Path) -> None:
+def test_frame_without_truth_is_left_out(capture: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(capture, tmp_path / "room")
     run = out / "room-0" / "full"
-    judged = {row.frame_id for row in judge_choices(run, tmp_path / "room", None)}
+    judged = {row.frame_id for row in measure_choices(run, tmp_path / "room", None)}
     lost = min(judged)
     stem = Path({frame.frame_id: frame.name for frame in load_frames(run / "ingest")}[lost]).stem
     (tmp_path / "room" / "truth" / "observed" / "images" / f"{stem}.png").unlink()
-    assert {row.frame_id for row in judge_choices(run, tmp_path / "room", None)} == judged - {lost}
+    assert {row.frame_id for row in measure_choices(run, tmp_path / "room", None)} == judged - {lost}
 
 
-def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
+def test_budget_and_degree_depend_on_every_frame(capture: Path, out: Path) -> None:
     config = load_config(installed(), "default", ("g0.budget=7",), 0)
     frames = 6 * 160 * 90
     open_ = decide_work(load_config(installed(), "default", (), 0), out / "room-0" / "rva" / "ingest", None)
@@ -152,14 +152,14 @@ def test_budget_and_degree_count_every_frame(capture: Path, out: Path) -> None:
     assert decide_work(config, out / "room-0" / "rva" / "ingest", 50) == EqualWork(50, 6, 7, 0)
 
 
-def test_steps_sets_the_total_of_all(capture: Path, out: Path) -> None:
+def test_steps_option_sets_the_total(capture: Path, out: Path) -> None:
     assert compare(capture, "-o", str(out), "--variants", "all-view,full", "--steps", "20") == 0
     cells = json.loads((out / "comparison.json").read_text())["cells"]
     assert {cell["steps"] for cell in cells} == {20}
     assert compare(capture, "-o", str(out), "--variants", "all-view,drop-blurry,rva,full") == 0
 
 
-def test_the_same_command_again_makes_nothing(capture: Path, out: Path) -> None:
+def test_repeated_command_reuses_everything(capture: Path, out: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (out / ".store").rglob("manifest.json")}
     judged = {path: path.stat().st_mtime_ns for path in (out / "evaluations").rglob("eval.json")}
     table = (out / "comparison.json").read_bytes()
@@ -169,9 +169,7 @@ def test_the_same_command_again_makes_nothing(capture: Path, out: Path) -> None:
     assert (out / "comparison.json").read_bytes() == table
 
 
-def test_finished_runs_stand_side_by_side(
-    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_finished_runs_are_compared(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
     more = ["-o", str(tmp_path / "runs"), "--lpips", "alex", "--quiet", "--json"]
     assert invoke(["compare", *runs, *more]) == 0
@@ -197,7 +195,7 @@ def test_bad_arguments(
     assert cause in capsys.readouterr().err
 
 
-def test_a_capture_without_truth_or_held_out_frames_is_refused(
+def test_capture_without_reference_is_refused(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bare = tmp_path / "bare"
@@ -206,42 +204,42 @@ def test_a_capture_without_truth_or_held_out_frames_is_refused(
     (bare / "transforms.json").symlink_to(capture / "transforms.json")
     assert compare(bare, "-o", str(tmp_path / "out"), "--variants", "all-view") == 2
     assert "sharpest:8" in capsys.readouterr().err
-    assert not (tmp_path / "out" / "bare-0").exists(), "nothing was made for it"
+    assert not (tmp_path / "out" / "bare-0").exists(), "no run was started"
 
 
-def test_two_captures_of_one_name_are_refused(
+def test_two_captures_with_one_name_are_refused(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "other" / "room").mkdir(parents=True)
     code = invoke(["compare", str(capture), str(tmp_path / "other" / "room"), "-o", str(tmp_path / "out")])
     assert code == 2
-    assert "two captures are called room" in capsys.readouterr().err
+    assert "two captures have the name room" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", [["--steps", "100"], ["--set", "g0.steps=9"], ["--quality", "draft"]])
-def test_options_without_effect_on_finished_runs_are_refused(
+def test_training_options_are_refused_for_runs(
     option: list[str], out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [str(out / "room-0" / name) for name in ("all-view", "full")]
     assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet", *option]) == 2
-    assert f"{option[0]}: finished runs are compared as they are" in capsys.readouterr().err
+    assert f"{option[0]} cannot change finished runs" in capsys.readouterr().err
 
 
-def test_two_runs_of_one_name_are_refused(
+def test_two_runs_with_one_name_are_refused(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """They would be one row of the tables, and one of them lost."""
+    """They would share one row of the tables."""
     other = tmp_path / "other"
     shutil.copytree(out / "room-0", other / "room-0", symlinks=True)
     runs = [str(out / "room-0" / "rva"), str(other / "room-0" / "rva")]
     assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet"]) == 2
-    assert "two runs are called rva" in capsys.readouterr().err
+    assert "two runs have the name rva" in capsys.readouterr().err
 
 
-def test_runs_of_two_captures_of_one_name_are_refused(
+def test_runs_of_captures_with_one_name_are_refused(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Their scenes would be paired as if they showed the same."""
+    """Their scenes would be paired although they show different places."""
     other = tmp_path / "house2"
     shutil.copytree(out / "room-0", other, symlinks=True)
     (other / "rva").rename(other / "rva2")
@@ -254,21 +252,23 @@ def test_runs_of_two_captures_of_one_name_are_refused(
     noted.write_text(text.replace(place[1], str(twin)))
     runs = [str(out / "room-0" / "all-view"), str(other / "rva2")]
     assert invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--quiet"]) == 2
-    assert "two captures of these runs are called room" in capsys.readouterr().err
+    assert "two captures of these runs have the name room" in capsys.readouterr().err
 
 
-def test_metrics_whose_weights_came_later_are_measured(
+def test_metric_is_measured_once_its_weights_exist(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What an earlier call could not measure is not taken for what there is."""
+    """A cached evaluation without a metric is not reused after its weights were installed."""
     run = out / "room-0" / "all-view"
     dag, options = installed(), EvalOptions(lpips=(), scorers=("clarity-net",))
 
     def kept_weights() -> dict[str, str]:
         recipe = SceneRecipe(dag, "smoke", (), "cpu", 1, options)
         with opened_store(out / STORE_FOLDER) as store:
-            made = existing(run, dag, None)
-            return evaluated(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[0].weights
+            made = scene_of_run(run, dag, None)
+            return cached_evaluation(tmp_path, made, view_sets(made)[0], recipe, store, SilentReporter())[
+                0
+            ].weights
 
     whole = metrics.load_metrics(options)
     bare = replace(whole, scorers={}, weights={}, unavailable={"clarity-net": "not installed"})
@@ -279,17 +279,17 @@ def test_metrics_whose_weights_came_later_are_measured(
     assert kept_weights() == whole.weights
 
 
-def test_a_scene_that_cannot_be_judged_ends_none_of_the_others(
+def test_failed_evaluation_does_not_stop_the_others(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    judged = findings.judge
+    evaluate_views = findings.evaluate_views
 
-    def judge(folder: Path, made: Made, *rest: Any) -> list[Cell]:
+    def fail_once(folder: Path, made: FinishedScene, *rest: Any) -> list[Cell]:
         if made.variant.name == "all-view":
-            raise InputError("two images are called 0001", hint="give each a name of its own")
-        return judged(folder, made, *rest)
+            raise InputError("two images are called 0001", hint="give them different names")
+        return evaluate_views(folder, made, *rest)
 
-    monkeypatch.setattr(findings, "judge", judge)
+    monkeypatch.setattr(findings, "evaluate_views", fail_once)
     runs = [str(out / "room-0" / name) for name in ("all-view", "rva", "full")]
     code = invoke(["compare", *runs, "-o", str(tmp_path / "out"), "--lpips", "none", "--quiet", "--json"])
     document = json.loads(capsys.readouterr().out)

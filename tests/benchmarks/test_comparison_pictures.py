@@ -1,4 +1,4 @@
-"""The picture of a comparison shows every variant, however many there are."""
+"""The plot of a comparison shows all variants; images are found by their exact names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison.cells import Cell, Cells
-from benchmarks.comparison.pictures import _find, plot_comparison
+from benchmarks.comparison.pictures import _find_image, plot_comparison
 from benchmarks.comparison.variants import VARIANTS
 from cleargs.media.image import write_rgb
 
@@ -32,11 +32,11 @@ def cell(variant: str, psnr: float) -> Cell:
     )
 
 
-def test_every_variant_is_within_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plot_shows_every_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from matplotlib import pyplot
 
     kept: list[object] = []
-    monkeypatch.setattr(pyplot, "close", kept.append)  # the figure is looked at after it was written
+    monkeypatch.setattr(pyplot, "close", kept.append)  # keeps the figure open for the checks
     cells = Cells([cell(variant.name, 30.0 + number) for number, variant in enumerate(VARIANTS)])
     plot_comparison(tmp_path / "plot.png", cells, {variant.name: variant.label for variant in VARIANTS})
     monkeypatch.undo()
@@ -49,23 +49,23 @@ def test_every_variant_is_within_the_picture(tmp_path: Path, monkeypatch: pytest
         (place,) = np.asarray(line.get_xdata())
         assert left < place < right
         looks.add((line.get_marker(), line.get_color()))
-    assert len(looks) == len(VARIANTS) - 1  # each its own; the first is what they are measured against
+    assert len(looks) == len(VARIANTS) - 1  # all differ; the first one is the baseline
     legend = figure.legends[0].get_window_extent()
     assert legend.x0 >= 0.0 and legend.x1 <= figure.bbox.width
     pyplot.close(figure)
 
 
-def test_dollars_in_names_are_no_formula(tmp_path: Path) -> None:
+def test_dollars_in_names_are_escaped(tmp_path: Path) -> None:
     found = [cell(name, 30.0) for name in ("all-view", "full")]
     cells = Cells([one.model_copy(update={"column": "b$1_x_$2"}) for one in found])
     plot_comparison(tmp_path / "plot.png", cells, {"all-view": "$a_b_c$", "full": "$^$"})
     assert (tmp_path / "plot.png").is_file()
 
 
-def test_only_an_image_of_that_very_name_is_shown(tmp_path: Path) -> None:
+def test_image_is_found_by_its_exact_name(tmp_path: Path) -> None:
     for name, level in (("b.png", 51), ("b.2.png", 255)):
         write_rgb(tmp_path / name, np.full((4, 4, 3), level, np.uint8))
-    (tmp_path / "b.AAE").write_text("what a phone notes beside its photo")
-    found = _find(tmp_path, "b")
+    (tmp_path / "b.AAE").write_text("metadata of a phone")
+    found = _find_image(tmp_path, "b")
     assert found is not None and np.allclose(found, 0.2)
-    assert _find(tmp_path, "b.1") is None and _find(tmp_path / "nowhere", "b") is None
+    assert _find_image(tmp_path, "b.1") is None and _find_image(tmp_path / "nowhere", "b") is None

@@ -1,4 +1,4 @@
-"""Every variant trains on the same frames, for as many steps, with one budget; names of captures."""
+"""All variants train on the same frames, with equal steps and budget; names of captures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.comparison import pictures
-from benchmarks.comparison.equal_work import EqualWork, Steps, split, steps_of, variant_config
+from benchmarks.comparison.equal_work import EqualWork, Steps, split_steps, steps_of, variant_config
 from benchmarks.comparison.scenes import capture_name
 from benchmarks.comparison.variants import VARIANTS, WHOLE, Variant
 from cleargs.errors import ConfigError
@@ -18,20 +18,20 @@ from cleargs.pipeline.dag import installed
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
-def test_the_settings_of_every_variant_exist(variant: Variant) -> None:
+def test_settings_of_every_variant_are_valid(variant: Variant) -> None:
     plain = load_config(installed(), "default", seed=0)
     changes = bool(variant.overrides or variant.workflow)
     assert (variant_config(installed(), variant, "default", (), 0) != plain) == changes
 
 
-def test_every_variant_sees_the_same_images() -> None:
+def test_every_variant_has_the_same_images() -> None:
     found = [variant_config(installed(), v, "default", ("ingest.max_size=320",), 0) for v in VARIANTS]
     assert all(config.sections["ingest"] == found[0].sections["ingest"] for config in found)
 
 
 @pytest.mark.parametrize("recipe", ["default", "smoke", "paper"])
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
-def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) -> None:
+def test_every_variant_has_the_same_steps(variant: Variant, recipe: str) -> None:
     plain = load_config(installed(), recipe)
     for total in (steps_of(plain, 20).total, 1000, 7777):
         work = EqualWork(steps=total, frames=20, budget=12_345, sh_degree=2)
@@ -50,38 +50,42 @@ def test_every_variant_trains_for_the_same_steps(variant: Variant, recipe: str) 
         assert {training.planned for training in made} == {total}
 
 
-def test_the_recipe_s_own_total_changes_nothing_but_budget_and_degree() -> None:
+def test_total_of_the_recipe_keeps_its_steps() -> None:
     full = next(variant for variant in VARIANTS if variant.name == WHOLE)
     plain = load_config(installed(), "default", seed=0)
     work = EqualWork(steps_of(plain, 20).total, 20, budget=40_000, sh_degree=1)
     same = (
         "g0.sh_degree=1",
         "g0.budget=40000",
-        *("g0.steps=3200", "rivr.distil.steps=200", "consolidate.distil.steps=200"),  # the least there are
+        *(
+            "g0.steps=3200",
+            "rivr.distil.steps=200",
+            "consolidate.distil.steps=200",
+        ),  # the minimum steps of the recipe
     )
     assert variant_config(installed(), full, "default", (), 0, work) == load_config(
         installed(), "default", same, 0
     )
 
 
-def test_steps_are_split_in_the_recipe_s_proportions() -> None:
+def test_steps_are_split_in_proportion() -> None:
     whole = Steps(g0=2000, round=600, rounds=2, consolidate=600)
-    assert split(whole, "consolidate", 7600) == Steps(4000, 1200, 2, 1200)
-    assert split(whole, "g0", 3800) == Steps(3800, 0, 0, 0)
+    assert split_steps(whole, "consolidate", 7600) == Steps(4000, 1200, 2, 1200)
+    assert split_steps(whole, "g0", 3800) == Steps(3800, 0, 0, 0)
     # Without consolidation its 600 steps go to the two rounds.
-    assert split(whole, "rivr", 3800) == Steps(2000, 900, 2, 0)
+    assert split_steps(whole, "rivr", 3800) == Steps(2000, 900, 2, 0)
     with pytest.raises(ConfigError, match="too few"):
-        split(whole, "consolidate", 3)
+        split_steps(whole, "consolidate", 3)
 
 
-def test_a_dot_in_the_name_of_a_folder_is_no_suffix(tmp_path: Path) -> None:
+def test_dot_in_a_folder_name_is_not_a_suffix(tmp_path: Path) -> None:
     (tmp_path / "scan.2024-05-01").mkdir()
     assert capture_name(tmp_path / "scan.2024-05-01") == "scan.2024-05-01"
     assert capture_name(tmp_path / "walk.mp4") == "walk"
 
 
-def test_brackets_in_a_name_are_no_pattern(tmp_path: Path) -> None:
+def test_brackets_in_a_name_are_not_a_pattern(tmp_path: Path) -> None:
     name = "Walk [dQw4w9WgXcQ]_000012"
     write_rgb(tmp_path / f"{name}.png", np.full((4, 4, 3), 51, np.uint8))
-    found = pictures._find(tmp_path, name)
+    found = pictures._find_image(tmp_path, name)
     assert found is not None and np.allclose(found, 0.2)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks evidence`: the frozen list, the page, and a tiny page made twice."""
+"""`python -m benchmarks evidence`: the fixed list, the page, and a tiny page that is resumed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from benchmarks.commands import invoke
 from benchmarks.comparison import results_page as results
 from benchmarks.comparison.cells import Cell
-from benchmarks.comparison.evidence import EvidenceContext, minutes, read_evidence
+from benchmarks.comparison.evidence import EvidenceContext, estimate_minutes, read_evidence
 from benchmarks.comparison.origin import version_of_source
 from benchmarks.comparison.results_page import Origin, losses, results_page
 from benchmarks.comparison.saved_sections import SavedSection
@@ -85,7 +85,7 @@ variants = ["all-view"]
 ORIGIN = Origin("python -m benchmarks evidence -o OUT", "default", False, read_evidence().quick)
 
 
-def test_the_test_set_is_no_tuning_set() -> None:
+def test_test_set_and_tuning_set_are_disjoint() -> None:
     evidence = read_evidence()
     assert min(evidence.test.rooms) >= evidence.tuning.rooms_below == 100
     for section in (*evidence.quick, *evidence.full):
@@ -95,7 +95,7 @@ def test_the_test_set_is_no_tuning_set() -> None:
     for sections in (evidence.quick, evidence.full):
         assert len({section.name for section in sections}) == len(sections)
         assert {"all-view", "rva", "formation", "full"} <= set(sections[0].variants)
-        assert len(sections[0].seeds) >= 5  # what the page claims first
+        assert len(sections[0].seeds) >= 5  # the first claims of the page need several samples
 
 
 @pytest.mark.parametrize(
@@ -107,35 +107,35 @@ def test_the_test_set_is_no_tuning_set() -> None:
         ("frames = 6", "pictures = 6", "quick.0"),
     ],
 )
-def test_a_list_that_breaks_its_own_rules_is_refused(old: str, new: str, cause: str, tmp_path: Path) -> None:
+def test_list_that_breaks_its_rules_is_refused(old: str, new: str, cause: str, tmp_path: Path) -> None:
     path = tmp_path / "list.toml"
     path.write_text(TINY.replace(old, new, 1))
     with pytest.raises(ConfigError, match=cause):
         read_evidence(path)
 
 
-def test_what_a_section_before_it_has_made_takes_no_time(tmp_path: Path) -> None:
+def test_shared_work_counts_once_in_the_estimate(tmp_path: Path) -> None:
     blur = read_evidence().quick[0]
     with opened_store(tmp_path / "store") as store:
         recipe = SceneRecipe(installed(), "default", (), "cpu", 2, EvalOptions())
         context = EvidenceContext(tmp_path, None, recipe, store, SilentReporter())
-        alone, again, more = minutes(
+        alone, again, more = estimate_minutes(
             [blur, blur, blur.model_copy(update={"variants": (*blur.variants, "rivr")})], context
         )
         assert again == 0.0 and 0.0 < more < alone / len(blur.variants)
-        (twice,) = minutes(
+        (twice,) = estimate_minutes(
             [blur.model_copy(update={"seeds": (*blur.seeds, 105, 106, 107, 108, 109)})], context
         )
         assert twice == pytest.approx(2 * alone)
 
 
-def test_prose_states_no_number() -> None:
+def test_template_contains_no_number() -> None:
     template = Path(results.__file__).with_name("results.md").read_text(encoding="utf-8")
-    # Digits within names (G0, 3DGS, gs2e-medium) are no numbers.
+    # Digits within names (G0, 3DGS, gs2e-medium) do not count.
     assert re.findall(r"(?<![\w.-])\d[\d.,]*(?![\w-])", template) == []
 
 
-def test_questions_ask_for_variants() -> None:
+def test_questions_name_variants() -> None:
     names = {variant.name for variant in VARIANTS}
     assert {name for _, *asked in QUESTIONS for name in asked} <= names
 
@@ -160,7 +160,7 @@ def cell(variant: str, sample: str, psnr: float, lpips: float) -> Cell:
 
 
 def found(*gains: float, version: str = "0.1.0, abc") -> SavedSection:
-    """The whole method gains so much PSNR in each sample, and always 0.1 of LPIPS."""
+    """The whole method gains ``gains`` dB of PSNR per sample, and about 0.1 of LPIPS in each."""
     cells = []
     for number, gain in enumerate(gains):
         cells.append(cell("all-view", f"s{number}", 20.0 + number, 0.4))
@@ -177,37 +177,37 @@ def found(*gains: float, version: str = "0.1.0, abc") -> SavedSection:
     )
 
 
-def test_losses_come_first_and_say_how_sure_they_are() -> None:
-    ((section, sure),) = losses([found(-1.0, -1.1, -0.9)])
+def test_losses_are_sorted_by_significance() -> None:
+    ((section, loss),) = losses([found(-1.0, -1.1, -0.9)])
     assert section == "Motion blur"
-    assert (sure.against, sure.metric, sure.verdict) == ("all-view", "psnr", "sure")
+    assert (loss.against, loss.metric, loss.verdict) == ("all-view", "psnr", "significant")
     ((_, chance),) = losses([found(-1.0, 0.5, -0.2)])
     assert chance.verdict == "none"
     ((_, single),) = losses([found(-1.0)])
     assert single.verdict == "one sample"
     assert losses([found(1.0, 1.1, 0.9)]) == []
     ordered = [loss.verdict for _, loss in losses([found(-1.0, 0.5), found(-1.5), found(-1.0, -1.1, -0.9)])]
-    assert ordered == ["sure", "one sample", "none"]
+    assert ordered == ["significant", "one sample", "none"]
 
 
-def test_scenes_that_two_sections_share_count_once() -> None:
+def test_scenes_shared_by_sections_count_once() -> None:
     whole, part, other = found(-1.0, -1.1, -0.9), found(-1.0), found(-2.0)
     assert len(losses([whole, whole, part])) == 1
     assert len(losses([whole, other])) == 2
     page = results_page([whole, part], ORIGIN)
-    assert "1 of 2 comparisons, 1 of them sure." in page
+    assert "Worse in 1 of 2 comparisons, significantly in 1 of them." in page
     assert "| the whole method, against all-view training | 0 / 1 / 0 | not made |" in page
 
 
-def test_scenes_judged_again_with_their_colours_aligned_do_not_count() -> None:
+def test_aligned_sections_do_not_count() -> None:
     plain, again = found(-1.0, -1.1, -0.9), found(-2.0, -2.1, -1.9)
     again = again.model_copy(update={"section": plain.section.model_copy(update={"align_colour": True})})
     assert losses([plain, again]) == losses([plain])
 
 
-def test_the_page_of_a_few_cells() -> None:
+def test_page_of_a_few_cells() -> None:
     page = results_page([found(-1.0, -1.1, -0.9)], ORIGIN)
-    assert "1 of 2 comparisons, 1 of them sure." in page
+    assert "Worse in 1 of 2 comparisons, significantly in 1 of them." in page
     row = "| Motion blur | mixed | At the input's true poses | all-view G0 | **-1.00 ± 0.25** |  |  |  |"
     assert row in page
     assert page.index(row) < page.index("## In short") < page.index("## Motion blur")
@@ -219,16 +219,16 @@ def test_the_page_of_a_few_cells() -> None:
     assert "`python -m benchmarks evidence -o OUT --section blur`, version 0.1.0, abc" in page
     assert "LPIPS (AlexNet) could not be measured" in page
     assert "| mixed (n = 3) |" in page
-    assert "@" not in page, "every place of the template is filled"
+    assert "@" not in page, "all placeholders of the template are filled"
 
 
-def test_a_section_that_could_not_be_made_stands_on_the_page() -> None:
+def test_page_shows_a_section_without_results() -> None:
     nothing = found().model_copy(update={"missing": ("kitchen: it is not there",)})
     page = results_page([nothing], ORIGIN)
-    assert "* kitchen: it is not there" in page and "Nothing of this section could be made" in page
+    assert "* kitchen: it is not there" in page and "No result of this section could be made" in page
 
 
-def test_the_page_says_which_sections_and_versions_it_is_made_of() -> None:
+def test_page_names_its_sections_and_versions() -> None:
     other = read_evidence().quick[1]
     pair = [found(1.0), found(2.0, version="0.2.0, def").model_copy(update={"section": other})]
     page = results_page(pair, ORIGIN)
@@ -243,7 +243,7 @@ def test_the_page_says_which_sections_and_versions_it_is_made_of() -> None:
     assert "Not made yet" not in whole and "`python -m benchmarks evidence -o OUT`, version 0.1.0" in whole
 
 
-def test_the_version_names_the_source() -> None:
+def test_version_contains_a_digest_of_the_source() -> None:
     assert re.search(r"source [0-9a-f]{12}$", version_of_source())
     assert version_of_source() == version_of_source()
 
@@ -253,23 +253,21 @@ def make(out: Path, spec: Path, *more: str) -> int:
 
 
 @pytest.mark.slow
-def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tiny_page_is_made_and_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, out = tmp_path / "list.toml", tmp_path / "out"
     spec.write_text(TINY)
     assert make(out, spec, "--dry-run") == 0
-    assert "min  on two quiet cores" in capsys.readouterr().out and not (out / "captures").exists()
-    # A maker that was killed leaves a capture under another name, which is not taken for done.
+    assert "min  on two idle cores" in capsys.readouterr().out and not (out / "captures").exists()
+    # An interrupted call leaves a capture under a temporary name, which does not count as complete.
     (out / "captures" / ".1-mixed-6x96x54-100" / "images").mkdir(parents=True)
-    assert make(out, spec) == 3, "done in part: a protocol and a video are missing"
+    assert make(out, spec) == 3, "partial: a protocol and a video are missing"
     page = (out / "results.md").read_bytes()
     text = page.decode()
     assert "* flood: no protocol is called 'flood'" in text
-    assert "* kitchen: it is a real capture, and --captures was not given" in text
+    assert "* kitchen: this real capture needs --captures" in text
     assert "| mixed 1x | mixed 2x |" in text
     assert "| all-view G0 | 24 to 48 |" in text and "| ClearGS | 24 to 48 |" in text
-    assert text.count("each image judged after the affine on sRGB that fits it to the truth best.") == 1
+    assert text.count("colours of each image fitted to the truth (affine in sRGB) before measuring.") == 1
     plain, aligned = (
         SavedSection.model_validate_json((out / f"results/{name}.json").read_bytes())
         for name in ("rooms", "aligned")
@@ -286,18 +284,21 @@ def test_a_tiny_page_is_made_and_goes_on_where_it_stopped(
     assert stored == {path: path.stat().st_mtime_ns for path in out.rglob("manifest.json")}
     assert (out / "results.md").read_bytes() == page
 
-    # A call for one section takes the others from beside the page; none that another list, or nobody, made.
+    # A call for one section reads the others from results/, except those of another list.
     (out / "results.md").unlink()
     assert make(out, spec, "--section", "videos") == 3
     assert (out / "results.md").read_bytes() == page
     spec.write_text(TINY.replace("steps = 24", "steps = 25", 1))
     capsys.readouterr()
     assert make(out, spec, "--section", "videos") == 3
-    assert "rooms.json is of another list: the page leaves 'Motion blur' out" in capsys.readouterr().err
+    assert (
+        "rooms.json was made from another list: the page does not include 'Motion blur'"
+        in capsys.readouterr().err
+    )
     assert "**Not made yet: Motion blur.**" in (out / "results.md").read_text()
 
 
-def test_a_list_or_note_that_is_a_pipe_or_too_deep_is_refused(tmp_path: Path) -> None:
+def test_list_that_is_a_pipe_or_too_deep_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     (tmp_path / "deep.toml").write_text("[" * 200_000)
     for name in ("pipe", "deep"):

@@ -1,4 +1,4 @@
-"""Agreement of evaluators: the figures by hand, and the command on a run that it must leave as it is."""
+"""Agreement of evaluators: figures by hand, and the command, which must not change the run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_spearman_by_hand() -> None:
     assert spearman(rising[:1], rising[:1]) is None
 
 
-def test_the_widest_gaps_come_first_and_unscored_frames_stay_out() -> None:
+def test_widest_gaps_come_first_without_unscored_frames() -> None:
     R = [0.9, 0.8, 0.7, 0.6, 0.5]
     first = EvaluatorCues("a", uniform_cues(R, [0.1] * 5))
     second = EvaluatorCues("b", uniform_cues([0.5, 0.8, 0.7, 0.6, 0.9], [0.1] * 5))
@@ -51,7 +51,7 @@ def test_the_widest_gaps_come_first_and_unscored_frames_stay_out() -> None:
     assert agreement.disagreements[0].rank == (4, 1)
 
 
-def test_evaluators_that_agree_have_nothing_to_show() -> None:
+def test_equal_evaluators_have_no_disagreements() -> None:
     same = EvaluatorCues("a", uniform_cues([0.9, 0.2], [0.1, 0.8]))
     agreement = compare(same, same, RvaConfig(), most=9)
     assert agreement.disagreements == () and agreement.spearman["B"] == 1.0
@@ -83,7 +83,7 @@ class Shell:
         return code, streams.out, streams.err
 
     def files(self) -> dict[str, bytes]:
-        """All of the run but what ``agree`` may write."""
+        """Files of the run, except those of ``agree``."""
         return {
             str(file.relative_to(self.folder)): file.read_bytes()
             for file in self.folder.rglob("*")
@@ -99,7 +99,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return Shell(tmp_path, capsys)
 
 
-def test_agree_leaves_the_run_as_it_is(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agree_does_not_change_the_run(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     before = shell.files()
     with vlm_server() as log:
         monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
@@ -120,8 +120,8 @@ def test_agree_leaves_the_run_as_it_is(shell: Shell, monkeypatch: pytest.MonkeyP
     assert sheet is not None and sheet.std() > 0
 
 
-def test_agree_between_models_and_in_words(shell: Shell) -> None:
-    """Two models that rank the frames the other way round."""
+def test_agree_prints_a_report_for_models(shell: Shell) -> None:
+    """The two models rank the frames in opposite orders."""
 
     def script(asked: Asked, before: int) -> Answer:
         frame = asked.frame if asked.chat["model"] == "up" else FRAMES - 1 - asked.frame
@@ -137,16 +137,16 @@ def test_agree_between_models_and_in_words(shell: Shell) -> None:
     assert sum(line.startswith("picture: ") for line in out.splitlines()) == 3
 
 
-def test_agree_takes_the_scores_that_the_run_has(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agree_reuses_the_scores_of_the_run(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     with vlm_server() as log:
         monkeypatch.setenv("CLEARGS_VLM_URL", log.url)
         assert shell.run("rva.evaluator=qwen3-vl") == 0
     code, out, _ = shell.agree("qwen3-vl,statistics", "--json")
-    assert code == 0, "nobody was there to ask"
+    assert code == 0, "no server was needed"
     assert json.loads(out)["pairs"][0]["evaluators"][0] == "qwen3-vl:qwen3-vl:8b:prompt-1"
 
 
-def test_agree_names_the_frames_that_were_not_scored(shell: Shell) -> None:
+def test_agree_names_frames_without_score(shell: Shell) -> None:
     def script(asked: Asked, before: int) -> Answer:
         return Answer(json.dumps(truth(asked.frame)) if asked.frame != 2 else "no")
 
@@ -164,7 +164,7 @@ def test_agree_names_the_frames_that_were_not_scored(shell: Shell) -> None:
         ("statistics,statistics", "two"),
     ],
 )
-def test_agree_refuses_what_it_cannot_compare(shell: Shell, evaluators: str, words: str) -> None:
+def test_agree_refuses_bad_evaluators(shell: Shell, evaluators: str, words: str) -> None:
     code, _, err = shell.agree(evaluators)
     assert code == 2 and words in err
 

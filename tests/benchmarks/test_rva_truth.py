@@ -1,4 +1,4 @@
-"""Cues against the known faults of a synthetic capture."""
+"""Correlation of cues with the known degradations of a synthetic capture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.rva.truth import Faults, check
 from cleargs.cli.main import invoke as cleargs
 
 
-def judged(B: list[float], faults: Faults, **cues: list[float]) -> tuple[float | None, ...]:
+def correlations(B: list[float], faults: Faults, **cues: list[float]) -> tuple[float | None, ...]:
     columns = {"b_motion_blur": B, "b_defocus": B, "b_exposure_failure": B} | cues
     found = check(
         1.0 - np.array(B),
@@ -24,14 +24,14 @@ def judged(B: list[float], faults: Faults, **cues: list[float]) -> tuple[float |
     return found.B_blur, found.motion, found.defocus, found.exposure
 
 
-def test_other_faults_stay_out_of_the_comparison_with_blur() -> None:
-    """A defocused and a misexposed frame have a high B and no motion."""
+def test_blur_is_compared_without_other_degradations() -> None:
+    """A defocused and a badly exposed frame have a high B but no motion."""
     faults = Faults(
         blur_px=np.array([0.0, 5.0, 9.0, 0.0, 0.0]),
         defocus_px=np.array([0.0, 0.0, 0.0, 4.0, 0.0]),
         exposure_ev=np.array([0.0, 0.0, 0.0, 0.0, -2.0]),
     )
-    B_blur, motion, defocus, exposure = judged(
+    B_blur, motion, defocus, exposure = correlations(
         [0.0, 0.3, 0.4, 0.9, 0.9],
         faults,
         b_motion_blur=[0.0, 0.3, 0.6, 0.0, 0.0],
@@ -41,21 +41,21 @@ def test_other_faults_stay_out_of_the_comparison_with_blur() -> None:
     assert (B_blur, motion, defocus, exposure) == pytest.approx((1.0, 1.0, 1.0, 1.0))
 
 
-def test_what_is_too_small_to_be_a_fault_is_none() -> None:
-    """Sub-pixel motion and the drift of an automatic exposure rank nothing."""
+def test_small_degradations_count_as_zero() -> None:
+    """Sub-pixel blur and drift of automatic exposure do not affect the ranks."""
     faults = Faults(
         blur_px=np.array([0.9, 0.1, 0.5, 8.0]),
         defocus_px=np.zeros(4),
         exposure_ev=np.array([0.2, -0.2, 0.1, 0.0]),
     )
-    B_blur, _, defocus, exposure = judged([0.0, 0.0, 0.0, 0.6], faults)
+    B_blur, _, defocus, exposure = correlations([0.0, 0.0, 0.0, 0.6], faults)
     assert B_blur == pytest.approx(1.0)
     assert defocus is None
     assert exposure is None
 
 
 def test_check_reads_the_truth_of_the_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From the command line: a synthetic capture, its run up to RVA, the table."""
+    """Runs the commands: a synthetic capture, its run up to RVA, the table."""
     capture, run = tmp_path / "capture", tmp_path / "run"
     synth = ["synth", str(capture), "--protocol", "gs2e-severe", "--frames", "6", "--size", "160x96"]
     assert cleargs(synth) == 0

@@ -1,4 +1,4 @@
-"""A Gaussian scene as the world, along the cameras of its run or of a transforms.json."""
+"""A Gaussian scene as a world, with the cameras of its run or of a transforms.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from benchmarks.comparison.splat_world import CameraCourse, camera_course, scene_setting
+from benchmarks.comparison.splat_world import CameraCourse, camera_course, scene_setup
 from cleargs.capture.cameras import Pose
 from cleargs.capture.tables import FRAMES
 from cleargs.errors import InputError
@@ -27,7 +27,7 @@ CAMERAS = 9
 
 
 def real_poses() -> np.ndarray:
-    """A walk past the origin, as camera to world [CAMERAS, 3, 4]."""
+    """A path past the origin, camera to world [CAMERAS, 3, 4]."""
     centres = np.stack([np.linspace(-0.8, 0.8, CAMERAS), np.zeros(CAMERAS), np.full(CAMERAS, -3.0)], 1)
     return look_at(centres, np.zeros(3))
 
@@ -47,7 +47,7 @@ def scene(count: int = 300) -> Scene:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """RUN/g0 is a link into the store, as the runner leaves it."""
+    """A run whose g0 is a link into the store, as in a run of the program."""
     store, run = tmp_path / "elsewhere" / "g0" / "key", tmp_path / "myrun"
     store.mkdir(parents=True)
     (run / "ingest").mkdir(parents=True)
@@ -70,11 +70,11 @@ def run(tmp_path: Path) -> Path:
     return run
 
 
-def test_a_capture_of_a_run_follows_its_cameras(run: Path, tmp_path: Path) -> None:
+def test_capture_follows_the_cameras_of_the_run(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = make_capture(
         out, "gsotm-mb-rs", frames=6, width=96, height=54, seed=0, reporter=SilentReporter(),
-        setting=scene_setting(run / "g0" / "scene.ply", None, 6, 96, 54),
+        setting=scene_setup(run / "g0" / "scene.ply", None, 6, 96, 54),
     )  # fmt: skip
     assert summary["world"] == "myrun"
     scale = 96 / 640
@@ -86,14 +86,14 @@ def test_a_capture_of_a_run_follows_its_cameras(run: Path, tmp_path: Path) -> No
     real = real_poses()[:, :, 3]
     for frame in transforms["frames"]:
         centre = np.array(frame["transform_matrix"])[:3, 3]
-        # Cameras stand 0.2 apart on a line, which smoothing leaves alone.
+        # Cameras are 0.2 apart on a line, which smoothing does not change.
         assert np.linalg.norm(real - centre, axis=1).min() < 0.11
         assert abs(centre[1]) < 1e-6 and abs(centre[2] + 3) < 1e-6
     assert len(pq.read_table(out / "truth" / "frames.parquet")) == 6
     assert len(list((out / "truth" / "observed" / "depth").iterdir())) == 6
 
 
-def test_the_course_takes_the_stretch_without_the_gap() -> None:
+def test_course_avoids_a_gap() -> None:
     poses = real_poses()
     poses[:4, 0, 3] -= 5.0
     course = camera_course(list(poses), 5)
@@ -102,40 +102,40 @@ def test_the_course_takes_the_stretch_without_the_gap() -> None:
     np.testing.assert_allclose(np.linalg.det(course.poses(np.linspace(0, 1, 7))[:, :, :3]), 1, atol=1e-12)
 
 
-def test_cameras_of_a_transforms_file_will_do(tmp_path: Path) -> None:
+def test_cameras_from_a_transforms_file(tmp_path: Path) -> None:
     make_capture(tmp_path / "c", "sharp", frames=6, width=32, height=18, seed=0, reporter=SilentReporter())
     write_ply(tmp_path / "fox.ply", scene())
-    with pytest.raises(InputError, match="does not lie in a run") as error:
-        scene_setting(tmp_path / "fox.ply", None, 6, 32, 18)
+    with pytest.raises(InputError, match="is not in a run") as error:
+        scene_setup(tmp_path / "fox.ply", None, 6, 32, 18)
     assert "--cameras" in error.value.hint
     for cameras in (tmp_path / "c", tmp_path / "c" / "transforms.json"):
-        setting = scene_setting(tmp_path / "fox.ply", cameras, 6, 64, 36)
+        setting = scene_setup(tmp_path / "fox.ply", cameras, 6, 64, 36)
         lens = setting.lens
         assert setting.name == "fox" and (lens.width, lens.height) == (64, 36)
     assert isinstance(setting.course, CameraCourse) and setting.course.steps == 5
     with pytest.raises(InputError, match="7 frames cannot follow 6 cameras"):
-        scene_setting(tmp_path / "fox.ply", tmp_path / "c", 7, 32, 18)
-    with pytest.raises(InputError, match="holds no cameras"):
-        scene_setting(tmp_path / "fox.ply", tmp_path / "nowhere", 6, 32, 18)
+        scene_setup(tmp_path / "fox.ply", tmp_path / "c", 7, 32, 18)
+    with pytest.raises(InputError, match="contains no cameras"):
+        scene_setup(tmp_path / "fox.ply", tmp_path / "nowhere", 6, 32, 18)
 
 
-def test_refuses_what_is_not_a_scene(run: Path, tmp_path: Path) -> None:
+def test_invalid_scene_is_refused(run: Path, tmp_path: Path) -> None:
     path = run / "g0" / "scene.ply"
     write_ply(path, scene(0))
-    with pytest.raises(InputError, match="holds no Gaussians"):
-        scene_setting(path, None, 4, 32, 18)
+    with pytest.raises(InputError, match="contains no Gaussians"):
+        scene_setup(path, None, 4, 32, 18)
     mesh = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
     for content in (b"not a ply", mesh.encode() + bytes(4), b""):
         path.write_bytes(content)
         with pytest.raises(InputError, match="is not a Gaussian scene") as error:
-            scene_setting(path, None, 4, 32, 18)
+            scene_setup(path, None, 4, 32, 18)
         assert "\n" not in str(error.value) and error.value.hint
     with pytest.raises(InputError):
-        scene_setting(tmp_path / "missing.ply", None, 4, 32, 18)
+        scene_setup(tmp_path / "missing.ply", None, 4, 32, 18)
 
 
-def test_a_camera_that_sees_nothing_is_refused(run: Path) -> None:
-    setting = scene_setting(run / "g0" / "scene.ply", None, 6, 32, 18)
+def test_camera_without_view_of_the_scene_is_refused(run: Path) -> None:
+    setting = scene_setup(run / "g0" / "scene.ply", None, 6, 32, 18)
     away = setting.course.poses(np.array([0.5]))[0] @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match="sees nothing of the scene"):
+    with pytest.raises(InputError, match="the scene is not visible in a frame"):
         setting.world.depth(away, setting.lens)

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU at toy size: its tables, and its errors, which do not depend on where it runs."""
+"""The benchmark of a GPU at toy size: its tables, and its errors, which do not depend on the device."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ SMALL, LARGE = BenchmarkCase(6, 15, 12), BenchmarkCase(9, 16, 14)
 
 @pytest.fixture
 def bench(device):
-    """The modules, imported late, since they import Triton."""
+    """The benchmark, imported here because it imports Triton."""
     return importlib.import_module("benchmarks.speed.device")
 
 
-def test_every_row_has_its_errors_beside_its_times(device, bench):
+def test_every_row_has_times_and_errors(device, bench):
     plan = DevicePlan((SMALL, LARGE), rounds=1, repetitions=1, seed=4)
     first, found = bench.run(plan, device, SilentReporter())
     assert len(first.rows) == 1

@@ -33,7 +33,7 @@ def test_pairs_that_do_not_fit_are_refused_before_they_are_made(device, monkeypa
     gaussians = make_gaussians(camera, 12).to(device)
     engine = rasteriser_for(device)
     monkeypatch.setattr(rasteriser, "available_memory", lambda device: 100)
-    with pytest.raises(StageError, match=r"12 Gaussians touch .* more than fit"):
+    with pytest.raises(StageError, match=r"12 Gaussians give .* more than fit"):
         engine.forward(gaussians.select(torch.arange(12, device=device)), camera)
     monkeypatch.undo()
     assert support.available_memory(device) > 2**20

@@ -57,7 +57,7 @@ def run() -> list[str]:
     return result.stdout.split()
 
 
-def test_training_steps_are_bitwise_equal_for_1_2_and_16_threads_and_for_two_runs():
+def test_training_is_bitwise_equal_across_threads_and_runs():
     digests = [*run(), *run()]
     assert len(digests) == 8
     assert len(set(digests)) == 1
@@ -74,7 +74,7 @@ print(hashlib.sha256(project(make_gaussians(camera, 200), camera)[0].tobytes()).
 
 
 @pytest.mark.slow
-def test_a_kernel_compiled_just_now_rounds_like_one_from_the_cache(tmp_path: Path):
+def test_compiled_and_cached_kernels_round_alike(tmp_path: Path):
     here = Path(__file__).parent
     paths = f"{here}{os.pathsep}{here.parent}"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": paths}

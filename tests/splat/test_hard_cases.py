@@ -1,4 +1,4 @@
-"""Hard cases against the float64 oracle, on each back end. Scenes are small for Triton's interpreter."""
+"""Hard cases against the float64 oracle, on each back end. Scenes are small, for Triton's interpreter."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def join(*parts: Gaussians) -> Gaussians:
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize(("distance", "image", "gradient"), [(1500.0, 2e-4, 5e-4), (5e4, 5e-3, 2e-2)])
 def test_needles_centred_far_away(distance, image, gradient, antialias, device):
-    """The centre is held in float32, which the needle's thin side feels; CPU and GPU feel the same."""
+    """The float32 rounding of the centre shows across the thin needle, in the same way on CPU and GPU."""
     camera = make_camera(36, 27)
     needles = make_needles(camera, 12, length_px=distance, aspect=1e4, distance=distance)
     result = compare(needles, camera, antialias=antialias, margin=2e-3, device=device)
@@ -44,7 +44,7 @@ def test_needles_centred_far_away(distance, image, gradient, antialias, device):
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_determinant_that_rounds_to_zero_or_below(antialias, device):
-    """Needles of 1e4 px: of xx yy - xy², two products of 1e15, 3e7 is left, beyond float32's seven digits."""
+    """Needles of 1e4 px: xx yy - xy² = 3e7 is a difference of products of 1e15. float32 has seven digits."""
     camera = make_camera(36, 27)
     needles = make_needles(camera, 12, length_px=1e4, aspect=1e5)
     conics = reference.project(leaves(needles, torch.float64).detach(), camera, 16, antialias).conics
@@ -55,7 +55,7 @@ def test_determinant_that_rounds_to_zero_or_below(antialias, device):
 
 
 def test_no_thickness_at_all(device):
-    """Disks seen edge-on, lines seen end-on and points; with anti-aliasing what has no area is invisible."""
+    """Disks seen edge-on, lines seen end-on, points. With anti-aliasing, splats without area do not show."""
     camera = make_camera(36, 27)
     gaussians = make_gaussians(camera, 16)
     gaussians.log_scales[:8, 0] = -100.0
@@ -71,8 +71,8 @@ def test_no_thickness_at_all(device):
     assert all(not tensor[4:12].any() for tensor in gradients.tensors().values())
 
 
-def test_a_wall_facing_a_turned_camera_is_ordered_by_depth_then_index(device):
-    """Splats at one depth up to the rounding of their means: by definition depths are compared as float32."""
+def test_wall_is_ordered_by_float32_depth_then_index(device):
+    """Splats of equal depth except for the rounding of their means: depths are compared as float32."""
     camera = make_camera(16, 16)
     gaussians = make_gaussians(camera, 150, opacity=(0.02, 0.3), size_px=3.0)
     pose = torch.as_tensor(camera.world_to_camera)
@@ -85,7 +85,7 @@ def test_a_wall_facing_a_turned_camera_is_ordered_by_depth_then_index(device):
 
 
 def test_all_transparent(device):
-    """Every opacity just below 1/255: exactly the background and exactly no gradient, as the oracle says."""
+    """Every opacity is just below 1/255: exactly the background, and gradients of exactly 0."""
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12)
     gaussians.logit_opacities[:] = float(-np.log(255.1 - 1))
@@ -100,8 +100,8 @@ def test_all_transparent(device):
     assert render(gaussians.to(device), camera).alpha.any()
 
 
-def test_what_saturated_pixels_hide_has_no_gradient(device):
-    """Behind an opaque wall T is under 1e-4: hidden splats get exactly 0, those beside the wall do not."""
+def test_splats_behind_saturated_pixels_have_no_gradient(device):
+    """T is below 1e-4 behind an opaque wall: hidden splats get exactly 0, splats next to the wall do not."""
     camera = Camera(32, 16, 60.0, 60.0, 16.0, 8.0, np.eye(4))
     gaussians = make_gaussians(camera, 24, size_px=1.0)
     wall, hidden = slice(0, 8), slice(8, 14)
@@ -124,7 +124,7 @@ def test_what_saturated_pixels_hide_has_no_gradient(device):
 
 
 def test_depths_beyond_float32_are_culled(device):
-    """The depth of finite means may still overflow, which would leave infinity in the depth of the pixels."""
+    """The depth of finite means may still overflow, which would write infinity to the depth of the pixels."""
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 10)
     others = gaussians.select(torch.arange(10) != 7)
@@ -135,7 +135,7 @@ def test_depths_beyond_float32_are_culled(device):
     assert torch.equal(result.depth, expected.depth)
 
 
-def test_weight_zero_gives_exactly_no_gradient_and_weight_two_twice_that_of_one(device):
+def test_the_weight_scales_the_gradient_exactly(device):
     camera = make_camera(20, 18)
     gaussians = make_gaussians(camera, 12).to(device)
     target = torch.rand(18, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
@@ -211,10 +211,11 @@ def test_any_scene_equals_oracle(
 ):
     camera = make_camera(width, height, focal)
     gaussians = make_gaussians(camera, count, seed=seed, opacity=opacity, size_px=size_px, aspect=aspect)
-    # T = 1 - 0.999 is off by 2e-3 of itself where 2^x is by 2e-6, and may pass 1e-4 that much too early.
+    # A relative error of 2e-6 in 2^x becomes one of 2e-3 in T = 1 - 0.999, so T may pass 1e-4 too early.
     result = compare(gaussians, camera, sh_degree=degree, antialias=antialias, margin=2e-3)
-    # 2,000 more scenes gave at most 4e-6 and 1.1e-4; the latter where the largest gradient is itself what two
-    # larger terms leave. The rotations of spheres have no gradient but noise: theirs is held against scale's.
+    # 2,000 more scenes gave at most 4e-6 and 1.1e-4. In the latter case the largest gradient was itself a
+    # difference of two larger terms. The gradients by the rotations of spheres are only noise, so they are
+    # compared with the gradients by the scales.
     assert result.image < 1e-5
     assert result.depth < 1e-5
     sizes = result.gradient_sizes

@@ -69,7 +69,7 @@ def test_photometric_loss_equals_torch(size, masked, device):
 def test_flat_images_keep_their_precision():
     """Constant patches are the worst case of E[x²] - E[x]²: 6e-8 against C2 = 9e-4, amplified in the border.
 
-    Measured: 6e-3 of this gradient, whose largest entry is a seventh of what L1 gives to every pixel.
+    The measured error is 6e-3 of this gradient, whose largest entry is a seventh of the gradient of L1.
     """
     image, target = torch.full((40, 40, 3), 0.9), torch.full((40, 40, 3), 0.85)
     x = image.double().requires_grad_()
@@ -80,7 +80,7 @@ def test_flat_images_keep_their_precision():
     assert (result.grad_image + x.grad).abs().max() < 1.5e-2 * x.grad.abs().max()
 
 
-def test_weight_one_is_unweighted_and_weight_zero_is_nothing():
+def test_the_weight_scales_loss_and_gradient():
     image, target, _ = images(20, 30)
     plain = photometric_loss(image, target, ssim_lambda=0.2)
     weighted = photometric_loss(image, target, ssim_lambda=0.2, weight=1.0)
@@ -105,7 +105,7 @@ def test_masks():
     nothing = photometric_loss(image, target, ssim_lambda=0.2, mask=~everything)
     assert nothing.loss == 0.0
     assert not nothing.grad_image.any()
-    # What lies under the mask has no influence.
+    # Masked pixels have no influence.
     mask = everything.clone()
     mask[5:9, 3:20] = False
     changed = torch.where(mask[..., None], target, torch.zeros(()))
@@ -131,7 +131,7 @@ def test_psnr():
     assert psnr(image, target, mask) == pytest.approx(-10 * math.log10(error[mask].mean().item()), abs=1e-9)
 
 
-def test_psnr_refuses_what_does_not_fit():
+def test_psnr_refuses_images_that_do_not_match():
     image, target, _ = images(8, 9)
     with pytest.raises(InputError, match="compared"):
         psnr(image, target[:5])

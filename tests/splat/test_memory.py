@@ -1,4 +1,4 @@
-"""Memory: what is left in a container, and pairs that would not fit."""
+"""Memory that is left in a container, and pairs that would not fit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GB = 2**30
 
 
 def machine(root: Path, files: dict[str, str]) -> Path:
-    """A root folder with 8 GB of available memory and these files."""
+    """Write a root folder with 8 GB of available memory and these files."""
     given = {"proc/meminfo": f"MemTotal: {2**24} kB\nMemAvailable: {2**23} kB\n"} | files
     for name, text in given.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -46,9 +46,9 @@ VERSION_1 = {
     ("files", "expected"),
     [
         ({}, 8 * GB),
-        # The job has no limit, the slice it is in has; 1.5 GB of what that uses is a cache of files.
+        # The job has no limit, but its slice has. 1.5 GB of the slice's memory is a cache of files.
         (VERSION_2, 4 * GB - 3 * GB + 2 * GB - GB // 2),
-        # In a container the group is the mount point, though the path is the one outside.
+        # In a container the group is the mount point, while the path is the one outside.
         (VERSION_1, 3 * GB - 2 * GB + GB - GB // 4),
         (VERSION_1 | {"sys/fs/cgroup/memory/memory.limit_in_bytes": "9223372036854771712\n"}, 8 * GB),
     ],
@@ -58,11 +58,11 @@ def test_control_groups_limit_the_memory(files: dict[str, str], expected: int, t
     assert available_memory(machine(tmp_path, files)) == expected
 
 
-def test_without_proc_it_is_all_that_the_machine_has(tmp_path: Path) -> None:
+def test_without_proc_it_is_the_memory_of_the_machine(tmp_path: Path) -> None:
     assert available_memory(tmp_path) >= available_memory()
 
 
-def test_pairs_that_do_not_fit_are_refused_before_they_are_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_that_do_not_fit_are_not_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = make_camera()
     gaussians = make_gaussians(camera, 200)
     buffers = rasteriser.Buffers(torch.device("cpu"))
@@ -73,7 +73,7 @@ def test_pairs_that_do_not_fit_are_refused_before_they_are_allocated(monkeypatch
     with pytest.raises(StageError, match=r"pairs at 64x48, more than fit: they need another .* GB"):
         engine.forward(gaussians, camera)
     assert not any(name in buffers.memory for name in CpuRasteriser.pair_buffers)
-    # What the buffers hold already is no longer free, and need not be.
+    # Memory that the buffers already hold is not free, and need not be.
     monkeypatch.setattr(rasteriser, "available_memory", lambda device: 10**6)
     image = engine.forward(gaussians, camera).image
     engine.backward(image)

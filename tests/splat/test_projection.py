@@ -1,4 +1,4 @@
-"""Cameras, and finite differences of the whole rendering."""
+"""Cameras, tile lists, and finite differences of the whole rendering."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ PARAMETERS = ["means", "log_scales", "rotations", "logit_opacities", "sh"]
     + [(name, output) for name in PARAMETERS[:-1] for output in ("alpha", "depth")],  # colour is in neither
 )
 def test_gradient_equals_finite_differences(name, output, antialias):
-    """Central differences of the oracle along random directions, against the kernels' gradient.
+    """Compare central differences of the oracle along random directions with the kernels' gradient.
 
-    The image jumps where an alpha crosses 1/255, so only pixels well away from that count. With a step of
-    1e-6 in float64 the difference quotient is good to about 1e-8, the float32 gradient to some 1e-6.
+    The image jumps where an alpha crosses 1/255, so only pixels far from such a jump count. With a step of
+    1e-6, the float64 difference quotient is accurate to about 1e-8, and the float32 gradient to about 1e-6.
     """
     camera = make_camera(32, 24)
     gaussians = make_gaussians(camera, 25, size_px=3.0)
@@ -80,12 +80,12 @@ def project(gaussians, camera, antialias=False):
 
 @pytest.mark.parametrize("kind", ["round", "long", "needle"])
 def test_tiles_hold_every_touched_pixel_and_few_others(kind):
-    """The tile list against alpha >= 1/255 at every pixel, from the float64 projection."""
+    """Compare the tile list with alpha >= 1/255 at every pixel of the float64 projection."""
     if kind in ("round", "long"):
         camera = make_camera(150, 100)
         gaussians = make_gaussians(camera, 60, size_px=8.0, aspect=2.0 if kind == "round" else 30.0)
     else:
-        camera = make_camera(160, 96)  # whole tiles: where needles leave the image is not looked into
+        camera = make_camera(160, 96)  # whole tiles: the edge where needles leave the image is not tested
         gaussians = make_needles(camera, 100, length_px=1e7, aspect=1e6)
     splats, tiles, radii = project(gaussians, camera)
     offsets = np.concatenate([[0], np.cumsum(tiles)])
@@ -110,7 +110,7 @@ def test_tiles_hold_every_touched_pixel_and_few_others(kind):
         needed += len(touched)
         listed += len(mine)
     assert needed > 100
-    # A row of tiles is cut by the ellipse between its pixel centres, so next to nothing is listed in vain.
+    # The ellipse is cut at the outer pixel centres of each row of tiles, so almost no tile is listed in vain.
     assert listed <= 1.02 * needed + 2
 
 
@@ -141,7 +141,7 @@ def test_camera():
     rest = {"name": "a", "time_s": None, "n_points": 0, "split": "train", "placed": None, "mask": None}
     frame = Frame(frame_id=0, image="images/000000.png", registered=True, **pose, **lens, **rest)
     camera = view_of(frame, Path(), 1.0).camera
-    # A turn by 0.6 about y takes z to x = sin 0.6.
+    # A rotation by 0.6 rad about y moves z to x = sin 0.6.
     np.testing.assert_allclose(camera.world_to_camera[:3, 2], [np.sin(0.6), 0, np.cos(0.6)], atol=1e-15)
     np.testing.assert_allclose(camera.world_to_camera @ [*camera.centre, 1], [0, 0, 0, 1], atol=1e-15)
     half = camera.scaled(0.5)
@@ -154,7 +154,7 @@ def test_camera():
 
 
 def test_scaled_camera_sees_the_same():
-    """Twice the resolution, averaged 2 x 2, is close to the original for splats much larger than a pixel."""
+    """A render at twice the resolution, averaged 2 x 2, is close to the original if splats are large."""
     camera = make_camera(32, 24)
     gaussians = make_gaussians(camera, 20, size_px=8.0)
     fine = render(gaussians, camera.scaled(2.0)).image.reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))

@@ -33,7 +33,7 @@ from cleargs.splat.kernels.cpu.simd import LANES
 from cleargs.splat.render import render
 
 
-@pytest.mark.skipif(LANES == 8, reason="eight lanes are what the other tests use here")
+@pytest.mark.skipif(LANES == 8, reason="the other tests use eight lanes here")
 def test_vectors_of_eight_lanes_equal_oracle_too():
     program = (
         "import json; from helpers.splat_scenes import compare, make_camera, make_gaussians;"
@@ -72,7 +72,7 @@ def test_sh_degree_limits_colour_and_gradient(degree):
 @pytest.mark.parametrize("focal", [50.0, 50_000.0])
 def test_extreme_focal_lengths(focal):
     camera = make_camera(focal=focal)
-    # Pixel positions are focal * x / z: float32 parameters are exact here, float64 projection keeps them so.
+    # Pixel positions are focal * x / z: exact float32 parameters, projected in float64.
     assert_close(compare(make_gaussians(camera, 60), camera))
 
 
@@ -89,7 +89,7 @@ def test_huge_and_tiny_scales():
     gaussians.log_scales[0] = 30.0
     gaussians.log_scales[1] = -30.0
     gaussians.log_scales[2] = torch.tensor([10.0, -10.0, 0.0])
-    # An aspect of 5e8 leaves the float64 oracle itself, which does cancel, eight digits less.
+    # An aspect of 5e8 costs the float64 oracle itself eight digits, because its terms cancel.
     assert_close(compare(gaussians, camera), gradient=1e-4)
 
 
@@ -104,7 +104,7 @@ def test_zero_and_unnormalised_quaternions():
     render(live, camera).image.sum().backward()
     assert not live.rotations.grad[0].any()  # the identity, at which R is stationary
     assert live.rotations.grad.isfinite().all()
-    gaussians.rotations[3] *= 1e6  # its gradient of 1e6 times the others' would hide them
+    gaussians.rotations[3] *= 1e6  # its gradient, 1e6 times the others', would hide them
     assert_close(compare(gaussians, camera))
 
 
@@ -155,7 +155,7 @@ def test_engine_agrees_with_render_and_reuses_its_buffers():
 
 
 def test_one_splat_by_hand():
-    """A splat centred on a pixel: alpha is its opacity there, depth alpha z, colour over background."""
+    """At a splat's centre alpha is its opacity, the depth alpha z, and the colour is over the background."""
     camera = Camera(9, 9, 20.0, 20.0, 4.5, 4.5, np.eye(4))
     gaussians = Gaussians(
         torch.tensor([[0.0, 0.0, 2.0]]),
@@ -226,7 +226,7 @@ def test_behind_and_across_the_near_plane(device):
     depths = np.array([-3.0, -0.01, 0.0, 0.009, 0.011, 0.05, 0.3])
     local = np.stack([0.1 * depths, -0.2 * depths, depths], -1)
     gaussians.means[: len(depths)] = torch.tensor((local - translation) @ rotation)
-    # Splats centred 0.011 in front hide most of the image, as in the CPU's test.
+    # Splats at a depth of 0.011 hide most of the image.
     assert_close(compare(gaussians, camera, device=device), image=1e-5, gradient=3e-5)
     engine = rasteriser_for(device)
     engine.forward(gaussians.to(device), camera)
@@ -298,8 +298,8 @@ def test_a_splat_that_is_not_finite_is_culled(name, value, device):
     assert torch.equal(image, render(others, camera).image)
 
 
-def test_several_chunks_a_tile_and_the_stop(device):
-    """150 splats on one tile: three chunks, some pixels stop in the first, others never."""
+def test_several_chunks_per_tile_and_the_stop(device):
+    """150 splats on one tile are three chunks. Some pixels stop in the first, others never."""
     camera = make_camera(16, 14, focal=20.0)
     gaussians = make_gaussians(camera, 150, opacity=(0.3, 0.999), size_px=1.0)
     result = compare(gaussians, camera, device=device)
@@ -327,7 +327,7 @@ def test_splats_at_one_depth_are_ordered_by_index(device):
     )
 
 
-def test_two_runs_give_the_same_bits_and_buffers_are_used_again(device):
+def test_two_runs_give_the_same_bits_and_reuse_buffers(device):
     camera = make_camera(36, 27)
     gaussians = make_gaussians(camera, 20).to(device)
     engine = rasteriser_for(device)

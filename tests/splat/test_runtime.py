@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, and compiling ahead of use."""
+"""The cache of compiled kernels, the number of threads, and the imports of the core."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cleargs.splat.kernels.cpu import jit
 
 def test_the_cache_is_named_by_the_sources(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(config, "CACHE_DIR", config.CACHE_DIR)  # put back at the end
+    monkeypatch.setattr(config, "CACHE_DIR", config.CACHE_DIR)  # restored at the end
     jit.configure_numba()
     assert Path(config.CACHE_DIR) == tmp_path / f"kernels-{jit.kernel_digest()}"
     assert Path(config.CACHE_DIR).is_dir()
@@ -46,7 +46,7 @@ def test_set_threads():
         set_threads(before)
 
 
-def test_importing_the_core_imports_neither_numba_nor_media_libraries():
+def test_core_imports_neither_numba_nor_media_libraries():
     program = (
         "import sys, cleargs.splat.render, cleargs.splat.backend, cleargs.splat.types\n"
         "print([name for name in ('numba', 'pycolmap', 'OpenImageIO', 'cv2') if name in sys.modules])"

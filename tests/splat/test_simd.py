@@ -1,4 +1,4 @@
-"""The SIMD type against NumPy, and what the compiler makes of the hot loops."""
+"""The SIMD type against NumPy, and the machine code of the hot loops."""
 
 from __future__ import annotations
 

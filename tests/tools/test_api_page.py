@@ -1,4 +1,4 @@
-"""The page of the library is what its docstrings say."""
+"""docs/api.md is up to date with the docstrings."""
 
 from pathlib import Path
 
@@ -8,5 +8,5 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_page_is_current() -> None:
-    """Made by: python -m tools.api_page > docs/api.md"""
+    """The command ``python -m tools.api_page > docs/api.md`` updates it."""
     assert page() == (ROOT / "docs" / "api.md").read_text(encoding="utf-8")

@@ -1,7 +1,6 @@
-"""PyTorch checkpoints to ONNX: equality with torch on randomly initialised weights of the real architectures.
+"""Converted ONNX files equal PyTorch, for random weights of the real architectures.
 
-These need the packages of the environment for conversions (`make convert-env`); they run in
-``make test-convert``.
+Most tests need the environment of `make convert-env`; `make test-convert` runs them.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from cleargs.models.registry import find_model, read_receipt, verify
 from cleargs.models.scorer import LearnedScorer, MusiqScorer, patches
 from tools.convert_models import restorer, scorers
 from tools.convert_models.__main__ import install_checkpoint, main
-from tools.convert_models.torch_export import mend_torchvision, require
+from tools.convert_models.torch_export import declare_torchvision_operators, require
 
 SIZES = [(270, 480), (200, 90), (64, 300)]  # landscape, portrait, a strip
 
@@ -64,7 +63,7 @@ def nafnet() -> nn.Module:
 
     network = NAFNet(width=8, middle_blk_num=1, enc_blk_nums=[1, 1, 1, 2], dec_blk_nums=[1, 1, 1, 1])
     for name, weights in network.named_parameters():
-        if name.endswith(("beta", "gamma")):  # zero at the start, which would leave the image as it is
+        if name.endswith(("beta", "gamma")):  # initially zero, which would not change the image
             nn.init.normal_(weights)
     return network
 
@@ -72,22 +71,22 @@ def nafnet() -> nn.Module:
 @needs_spandrel
 @pytest.mark.parametrize(("build", "key"), [(restormer, "params"), (nafnet, None)])
 def test_restorers_equal_torch(build: Callable[[], nn.Module], key: str | None, tmp_path: Path) -> None:
-    mend_torchvision()
+    declare_torchvision_operators()
     torch.manual_seed(0)
     network = build().eval()
     restorer.convert(checkpoint(network, key), tmp_path / "restorer.onnx", tile=64)
     tile = image(64, 64)
     with torch.no_grad():
         expected = network(torch.from_numpy(tile).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy()
-    assert np.abs(expected - tile).max() > 0.05  # it does something
+    assert np.abs(expected - tile).max() > 0.05  # the network changes the image
     restored = OnnxExpert(tmp_path / "restorer.onnx").restore(tile)
-    # float32 in another order of operations: 2e-7 for Restormer
+    # float32 with another order of operations; 2e-7 measured for Restormer
     np.testing.assert_allclose(restored, expected.clip(0, 1), atol=1e-5)
 
 
 @needs_spandrel
 def test_restormer_installs_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mend_torchvision()
+    declare_torchvision_operators()
     monkeypatch.setenv("CLEARGS_MODELS", str(tmp_path / "models"))
     torch.manual_seed(0)
     file = tmp_path / "motion_deblurring.pth"
@@ -100,7 +99,7 @@ def test_restormer_installs_under_its_name(tmp_path: Path, monkeypatch: pytest.M
 
 
 @needs_spandrel
-def test_any_checkpoint_converts_to_a_file_of_its_own(tmp_path: Path) -> None:
+def test_any_checkpoint_converts_to_a_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
     (tmp_path / "own.pth").write_bytes(checkpoint(nafnet()))
     arguments = [str(tmp_path / "own.onnx"), str(tmp_path / "own.pth"), "--tile", "64"]
@@ -113,19 +112,19 @@ def test_any_checkpoint_converts_to_a_file_of_its_own(tmp_path: Path) -> None:
 @needs_spandrel
 @pytest.mark.parametrize("data", [b"", b"no checkpoint", checkpoint(nn.Linear(3, 4))])
 def test_other_files_are_refused(data: bytes, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no checkpoint of a known architecture") as caught:
+    with pytest.raises(InputError, match="not a checkpoint of a known architecture") as caught:
         restorer.convert(data, tmp_path / "restorer.onnx")
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_the_environment_lacks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="needs no_such_package") as caught:
         require("json", "no_such_package", purpose="converting")
     assert "make convert-env" in caught.value.hint
 
     monkeypatch.setattr("tools.convert_models.torch_export.find_spec", lambda name: None)
-    with pytest.raises(InputError, match="converting musiq needs pyiqa"):  # before the file is looked for
+    with pytest.raises(InputError, match="converting musiq needs pyiqa"):  # raised before the file is read
         install_checkpoint(find_model("musiq"), tmp_path, tmp_path / "none.pth", licence_accepted=True)
 
 
@@ -134,7 +133,7 @@ def test_what_the_environment_lacks_is_named(tmp_path: Path, monkeypatch: pytest
 
 @pytest.fixture
 def converted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Converters that need no package."""
+    """Replace the converter by one that needs no package."""
 
     def convert(data: bytes, path: Path, *_: object) -> None:
         path.write_bytes(b"converted " + data)
@@ -183,7 +182,7 @@ def test_receipt_holds_the_digests(tmp_path: Path, converted: None) -> None:
 
 @needs_pyiqa
 def test_musiq_equals_pyiqa(tmp_path: Path) -> None:
-    mend_torchvision()
+    declare_torchvision_operators()
     from pyiqa.archs.musiq_arch import MUSIQ
 
     torch.manual_seed(0)
@@ -195,19 +194,19 @@ def test_musiq_equals_pyiqa(tmp_path: Path) -> None:
         with torch.no_grad():
             expected = network(torch.from_numpy(image(*size)).permute(2, 0, 1)[None]).item()
         scores.append(expected)
-        assert scorer.score(image(*size)) == pytest.approx(expected, abs=1e-5)  # 6e-7 here
+        assert scorer.score(image(*size)) == pytest.approx(expected, abs=1e-5)  # 6e-7 measured
     assert np.ptp(scores) > 0.01  # the image matters
     assert scorer.score(image(64, 300), threads=2) == scorer.score(image(64, 300))
 
 
 @needs_pyiqa
 @pytest.mark.parametrize("size", [*SIZES, (333, 1000), (32, 32)])
-def test_patches_are_pyiqas(size: tuple[int, int]) -> None:
+def test_patches_equal_those_of_pyiqa(size: tuple[int, int]) -> None:
     from pyiqa.data.multiscale_trans_util import get_multiscale_patches
 
     planes = torch.from_numpy(image(*size)).permute(2, 0, 1)[None]
     tokens = get_multiscale_patches((planes - 0.5) * 2, 32, 32, 10, [224, 384], -1)[0].numpy()
-    tokens = tokens[tokens[:, -1] > 0]  # the rest only fills up to a fixed length
+    tokens = tokens[tokens[:, -1] > 0]  # the rest is padding to a fixed length
     pixels, places, scales = patches(image(*size))
     np.testing.assert_allclose(pixels.reshape(len(pixels), -1), tokens[:, :-3], atol=1e-6)
     np.testing.assert_array_equal(places, tokens[:, -3])
@@ -216,16 +215,16 @@ def test_patches_are_pyiqas(size: tuple[int, int]) -> None:
 
 @needs_pyiqa
 def test_clip_iqa_equals_pyiqa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mend_torchvision()
+    declare_torchvision_operators()
     from pyiqa.archs import clip_model, clipiqa_arch
 
     torch.manual_seed(0)
-    # RN50's and the text encoder's layers, fewer and narrower; all 49408 words of the tokenizer.
+    # RN50 and the text encoder with fewer and narrower layers; all 49,408 tokens.
     clip = clip_model.CLIP(64, 64, (1, 1, 1, 1), 16, 0, 77, 49408, 64, 1, 2).eval()
     for weights in clip.visual.parameters():
-        if not weights.any():  # normalisations that start at zero, which would cut branches off
+        if not weights.any():  # some normalisations are initially zero, which would disable branches
             nn.init.normal_(weights, std=0.3)
-    monkeypatch.setattr(clipiqa_arch, "load", lambda backbone, device: clip)  # it would download CLIP
+    monkeypatch.setattr(clipiqa_arch, "load", lambda backbone, device: clip)  # avoids a download of CLIP
     network = clipiqa_arch.CLIPIQA().eval()
     scorers.convert("clip-iqa", b"", tmp_path / "clip-iqa.onnx")
     scorer = LearnedScorer(tmp_path / "clip-iqa.onnx")
@@ -234,7 +233,9 @@ def test_clip_iqa_equals_pyiqa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         with torch.no_grad():
             expected = 100 * network(torch.from_numpy(image(*size)).permute(2, 0, 1)[None]).item()
         scores.append(expected)
-        assert scorer.score(image(*size)) == pytest.approx(expected, abs=1e-4)  # of 100; 1e-5 here
+        assert scorer.score(image(*size)) == pytest.approx(
+            expected, abs=1e-4
+        )  # scores are 0 to 100; 1e-5 measured
     assert np.ptp(scores) > 0.01
 
 

@@ -76,7 +76,7 @@ def run(count: int) -> str:
 '''
 
 
-def test_finds_in_docstrings_comments_and_messages_name_their_lines() -> None:
+def test_finds_name_lines_of_docstrings_and_messages() -> None:
     expected = [(3, "What"), (6, "Of"), (7, "Of"), (12, "beside"), (13, "N a M"), (16, "lie")]
     assert sorted(found(*python_passages(MODULE))) == expected
     assert sorted(found(*python_passages(MODULE, messages=False))) == expected[:-2]

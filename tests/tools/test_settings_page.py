@@ -1,10 +1,10 @@
-"""The page of the settings is made from their models."""
+"""docs/settings.md is up to date with the models of the settings."""
 
 from pathlib import Path
 
 from tools.settings_page import page
 
 
-def test_the_page_of_settings_is_current() -> None:
-    """Made by: python -m tools.settings_page > docs/settings.md"""
+def test_page_is_current() -> None:
+    """The command ``python -m tools.settings_page > docs/settings.md`` updates it."""
     assert page() == (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")

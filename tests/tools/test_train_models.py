@@ -1,4 +1,4 @@
-"""Degradations, artefacts, pairs, and the trainings of the networks that ship, in small."""
+"""Degradations, artefacts, pairs, and short trainings of the networks in the package."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def noise_image(height: int, width: int, seed: int = 0) -> Image:
 
 
 def coloured_texture(height: int, width: int, seed: int = 0) -> Image:
-    """Noise of several scales, in [0, 1]."""
+    """Return noise of several scales, in [0, 1]."""
     rng = np.random.default_rng(seed)
     scales = [rng.random((-(-height // s), -(-width // s), 3), np.float32) for s in (2, 8, 32)]
     layers = [cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC) for noise in scales]
@@ -54,7 +54,7 @@ def test_motion_kernels(length: float) -> None:
         assert kernel.min() >= 0
         assert kernel.sum() == pytest.approx(1.0, abs=1e-5)
         y, x = np.mgrid[: kernel.shape[0], : kernel.shape[0]] - kernel.shape[0] // 2
-        # Centred on its mass, so that blur does not shift the image.
+        # The centre of mass is at the centre, so that blur does not shift the image.
         assert np.hypot((kernel * x).sum(), (kernel * y).sum()) < 1e-3
         points = np.argwhere(kernel > 1e-6)
         extent = np.linalg.norm(points[:, None] - points[None], axis=-1).max()
@@ -62,7 +62,7 @@ def test_motion_kernels(length: float) -> None:
         assert length - 1 <= extent <= length + 2 * np.sqrt(2)
 
 
-def test_kernels_are_a_function_of_the_seed() -> None:
+def test_kernels_depend_only_on_the_seed() -> None:
     first, again, other = (motion_kernel(np.random.default_rng(seed), 15.0) for seed in (4, 4, 5))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or not np.array_equal(first, other)
@@ -76,7 +76,7 @@ def test_disc_kernel() -> None:
 
 
 def test_blur_keeps_light() -> None:
-    # Away from the borders all light of a bright window stays: the linear mean is kept, that of sRGB is not.
+    # No light of a bright window reaches the border, so the linear mean is kept; that of sRGB is not.
     image = np.full((96, 96, 3), 0.05, np.float32)
     image[40:56, 40:56] = 0.9
     kernel = motion_kernel(np.random.default_rng(1), 15.0)
@@ -97,7 +97,7 @@ def test_degradation_is_seeded_and_quantised() -> None:
     assert 0.9 < (first - image).std() * 255 < 1.2
 
 
-def test_blur_that_varies_goes_from_one_kernel_to_the_other() -> None:
+def test_varying_blur_blends_two_kernels() -> None:
     image = noise_image(64, 64)
     kernel = disc_kernel(3.0)
     out = degrade(image, Degradation(second=kernel, quantise=False), np.random.default_rng(0))
@@ -105,7 +105,7 @@ def test_blur_that_varies_goes_from_one_kernel_to_the_other() -> None:
     assert error[:4].mean() < 0.2 * error[-4:].mean()
 
 
-def test_jpeg_is_mild_but_not_nothing() -> None:
+def test_jpeg_changes_the_image_slightly() -> None:
     image = coloured_texture(64, 64)
     coded = jpeg(image, 90)
     assert coded.shape == image.shape
@@ -125,7 +125,7 @@ def test_artefacts_are_seeded_images(texture: Image, kind: str) -> None:
     assert np.array_equal(made[0], patch) == (kind == "clean")
 
 
-def test_fuse_is_the_paper_s_third_candidate(texture: Image) -> None:
+def test_fuse_equals_the_fused_candidate(texture: Image) -> None:
     soft = cv2.GaussianBlur(texture, (0, 0), 2.0)
     expected = np.clip(soft + texture - cv2.GaussianBlur(texture, (0, 0), 2.0), 0, 1)
     assert np.abs(artefacts.fuse(soft, texture, 2.0) - expected).max() < 1e-5
@@ -160,7 +160,7 @@ def test_ridge_fit_finds_a_quadratic() -> None:
     truth = 0.3 * figures[..., 0] - 0.2 * figures[..., 1] * figures[..., 2] + 0.1
     model = fit(figures, truth.astype(np.float32))
     found = np.apply_along_axis(model, -1, figures)
-    # The ridge shrinks a little, and features are cut at four deviations.
+    # The ridge shrinks weights slightly, and features are clipped at four deviations.
     assert np.abs(found - truth).mean() < 0.05 * np.abs(truth).mean()
 
 
@@ -172,9 +172,7 @@ def pairs_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed in range(2):
         photos.append(folder / f"texture_{seed}.png")
         cv2.imwrite(str(photos[-1]), (coloured_texture(240, 320, seed)[..., ::-1] * 255).astype(np.uint8))
-    network = LpipsNetwork(
-        "alex"
-    ).eval()  # random weights measure some distance, which is all that is needed here
+    network = LpipsNetwork("alex").eval()  # random weights are enough here: they give some distance
     for head in network.heads.parameters():
         head.data.abs_()
     make_pairs(photos, network, folder / "train", contents=4, versions=4, seed=0)
@@ -186,15 +184,15 @@ def test_pairs(pairs_folder: Path) -> None:
     assert pairs.images.shape == (8, 4, PATCH, PATCH, 3)
     assert (pairs.targets[:, 0] == 0.0).all() and (pairs.kinds[:, 0] == 0).all()
     assert (pairs.targets[:, 1:] > 0.0).all() and (pairs.kinds[:, 1:] > 0).all()
-    assert len({image.tobytes() for image in pairs.images[:, 0]}) == 8  # no content twice
+    assert len({image.tobytes() for image in pairs.images[:, 0]}) == 8  # all contents differ
 
 
-def test_training_steps_and_resumes_nothing_by_chance(pairs_folder: Path, tmp_path: Path) -> None:
+def test_training_is_reproducible_and_changes_weights(pairs_folder: Path, tmp_path: Path) -> None:
     pairs = load_pairs(pairs_folder / "train")
     nets = [train(pairs, seconds=600.0, epochs=2, seed=3, checkpoint=tmp_path / "net.pt") for _ in range(2)]
     first, second = (predict(net, pairs) for net in nets)
     assert first.shape == pairs.targets.shape and (first >= 0.0).all()
-    # Seeded; the rate follows the clock only where time runs out first.
+    # The learning rate depends on time only if the time limit comes first.
     assert np.allclose(first, second, atol=1e-3)
     untrained = QualityNet().eval()
     assert not np.allclose(first, predict(untrained, pairs), atol=1e-4)

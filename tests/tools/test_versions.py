@@ -13,24 +13,26 @@ from cleargs.pipeline.dag import Dag, installed
 from cleargs.pipeline.stage import Stage
 from tools.versions import (
     Sources,
-    complaints,
     current_lock,
     installed_sources,
     lock_path,
     read_lock,
     updated_lock,
+    violations,
 )
 
 
 def test_no_stage_changed_without_its_version() -> None:
     sources = installed_sources()
     locked, now = read_lock(lock_path(sources)), current_lock(installed(), sources)
-    assert complaints(locked, now) == [], "raise VERSION, or say why results stay the same; see the module"
+    assert violations(locked, now) == [], (
+        "increase VERSION, or give a reason why results stay the same (tools/versions.py)"
+    )
     digests = [{name: entry["digest"] for name, entry in lock.items()} for lock in (locked, now)]
-    assert digests[0] == digests[1], "refresh the lock: python -m tools.versions --update"
+    assert digests[0] == digests[1], "update the lock: python -m tools.versions --update"
 
 
-def test_real_stages_reach_their_rooms() -> None:
+def test_source_of_a_real_stage_has_its_imports() -> None:
     sources = installed_sources()
     modules = sources.closure("cleargs.stages.rva")
     assert "cleargs.rva.config" in modules, "imported at the top"
@@ -38,19 +40,19 @@ def test_real_stages_reach_their_rooms() -> None:
     assert not any(name.startswith("cleargs.cli") for name in modules)
 
 
-class House:
+class PackageTree:
     """A small package tree with one stage."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.version = 1
         self.write(
-            "stages/one.py", "VERSION = 1\ndef run(c):\n    from cleargs.room.work import go\n    go()\n"
+            "stages/one.py", "VERSION = 1\ndef run(c):\n    from cleargs.package.work import go\n    go()\n"
         )
         self.write("cleargs/__init__.py", '"""Top."""\n')
-        self.write("cleargs/room/__init__.py", "")
-        self.write("cleargs/room/work.py", 'from . import helper\nCHILD = "cleargs.child"\n')
-        self.write("cleargs/room/helper.py", '"""Help."""\nX = 1\n"""What X is."""\n')
+        self.write("cleargs/package/__init__.py", "")
+        self.write("cleargs/package/work.py", 'from . import helper\nCHILD = "cleargs.child"\n')
+        self.write("cleargs/package/helper.py", '"""Help."""\nX = 1\n"""What X is."""\n')
         self.write("cleargs/child.py", "from cleargs.cli.main import main\nY = 1\n")
         self.write("cleargs/cli/main.py", "Z = 1\n")
         self.write("cleargs/other.py", "W = 1\n")
@@ -67,17 +69,17 @@ class House:
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> House:
-    return House(tmp_path)
+def tree(tmp_path: Path) -> PackageTree:
+    return PackageTree(tmp_path)
 
 
-def test_source_is_all_that_is_imported(house: House) -> None:
-    assert set(house.lock()["one"]["modules"]) == {
+def test_source_is_all_that_is_imported(tree: PackageTree) -> None:
+    assert set(tree.lock()["one"]["modules"]) == {
         "cleargs",
         "cleargs.child",
-        "cleargs.room",
-        "cleargs.room.helper",
-        "cleargs.room.work",
+        "cleargs.package",
+        "cleargs.package.helper",
+        "cleargs.package.work",
         "cleargs.stages.one",
     }
 
@@ -85,32 +87,32 @@ def test_source_is_all_that_is_imported(house: House) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "counts"),
     [
-        ("cleargs/room/helper.py", "X = 2\n", True),
-        ("cleargs/room/helper.py", '"""Help!"""\n# why\nX   =   1\n"""What X really is."""\n', False),
+        ("cleargs/package/helper.py", "X = 2\n", True),
+        ("cleargs/package/helper.py", '"""Help!"""\n# why\nX   =   1\n"""What X really is."""\n', False),
         ("cleargs/child.py", "from cleargs.cli.main import main\nY = 2\n", True),
         ("cleargs/cli/main.py", "Z = 2\n", False),
         ("cleargs/other.py", "W = 2\n", False),
     ],
 )
-def test_what_counts_as_a_change(house: House, name: str, text: str, counts: bool) -> None:
-    before = house.lock()
-    house.write(name, text)
-    assert (house.lock()["one"]["digest"] != before["one"]["digest"]) == counts
+def test_what_counts_as_a_change(tree: PackageTree, name: str, text: str, counts: bool) -> None:
+    before = tree.lock()
+    tree.write(name, text)
+    assert (tree.lock()["one"]["digest"] != before["one"]["digest"]) == counts
 
 
-def test_lock_is_refreshed_only_with_a_version_or_a_reason(house: House) -> None:
-    before = updated_lock({}, house.lock(), None)
-    house.write("cleargs/room/helper.py", "X = 2\n")
+def test_lock_is_refreshed_only_with_a_version_or_a_reason(tree: PackageTree) -> None:
+    before = updated_lock({}, tree.lock(), None)
+    tree.write("cleargs/package/helper.py", "X = 2\n")
     with pytest.raises(
-        ValueError, match=r"one: VERSION is still 1, but these changed: cleargs\.room\.helper"
+        ValueError, match=r"one: VERSION is still 1, but these changed: cleargs\.package\.helper"
     ):
-        updated_lock(before, house.lock(), None)
-    reasoned = updated_lock(before, house.lock(), "X is not used")
+        updated_lock(before, tree.lock(), None)
+    reasoned = updated_lock(before, tree.lock(), "X is not used")
     assert reasoned["one"]["unchanged_because"] == "X is not used"
-    assert complaints(reasoned, house.lock()) == []
-    house.version = 2
-    assert updated_lock(before, house.lock(), None)["one"]["version"] == 2
-    later = house.lock()
-    house.version = 1
-    with pytest.raises(ValueError, match="VERSION fell from 2 to 1"):
-        updated_lock(later, house.lock(), "no reason is good enough")
+    assert violations(reasoned, tree.lock()) == []
+    tree.version = 2
+    assert updated_lock(before, tree.lock(), None)["one"]["version"] == 2
+    later = tree.lock()
+    tree.version = 1
+    with pytest.raises(ValueError, match="VERSION decreased from 2 to 1"):
+        updated_lock(later, tree.lock(), "not accepted")

@@ -1,1 +1,1 @@
-"""Networks of other people, from their PyTorch checkpoints to the ONNX files that ClearGS runs."""
+"""Convert published networks from PyTorch checkpoints to the ONNX files that ClearGS runs."""

@@ -1,7 +1,9 @@
-"""Install a model of the registry from its PyTorch checkpoint, or convert any restorer that spandrel reads::
+"""Install a model from its PyTorch checkpoint, or convert any restorer that spandrel reads.
 
-.venv-convert/bin/python -m tools.convert_models restormer-motion motion_deblurring.pth --accept-licence
-.venv-convert/bin/python -m tools.convert_models mine.onnx FILE.pth
+Run it in the environment of ``make convert-env``::
+
+    .venv-convert/bin/python -m tools.convert_models restormer-motion motion_deblurring.pth --accept-licence
+    .venv-convert/bin/python -m tools.convert_models mine.onnx FILE.pth
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ _PACKAGES = {
     "musiq": ("pyiqa", "clip", "onnxscript"),
     "clip-iqa": ("pyiqa", "clip", "onnxscript"),
 }
-"""What each converter imports."""
+"""Packages that each converter imports."""
 
 
 @click.command()
 @click.argument("target", metavar="NAME|OUTPUT.onnx")
 @click.argument("checkpoint", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--accept-licence", is_flag=True, help="Accept a licence that is not for commercial use.")
+@click.option("--accept-licence", is_flag=True, help="Accept a licence that forbids commercial use.")
 @click.option(
     "--dir",
     "directory",
@@ -45,11 +47,12 @@ _PACKAGES = {
     type=click.IntRange(64, 1024),
     default=256,
     show_default=True,
-    help="Side in pixels of the tiles that OUTPUT.onnx will run on.",
+    help="Tile size of OUTPUT.onnx, px.",
 )
 def main(target: str, checkpoint: Path, accept_licence: bool, directory: Path | None, tile: int) -> None:
-    """Install the model NAME from its published CHECKPOINT, or write the restoration network of a CHECKPOINT,
-    of any architecture that spandrel reads, as OUTPUT.onnx, for rivr.expert=OUTPUT.onnx.
+    """Install the model NAME from its published CHECKPOINT, or convert a restoration network to OUTPUT.onnx.
+
+    Any architecture that spandrel reads can be converted. Use the file with rivr.expert=OUTPUT.onnx.
     """
     if target.endswith(".onnx"):
         require(*_PACKAGES["spandrel"], purpose=f"converting {checkpoint.name}")
@@ -67,10 +70,20 @@ def main(target: str, checkpoint: Path, accept_licence: bool, directory: Path | 
 def install_checkpoint(
     model: RegistryEntry, directory: Path, checkpoint: Path, *, licence_accepted: bool = False
 ) -> list[Path]:
-    """Convert the checkpoint into ``directory``; returns the files written.
+    """Convert a checkpoint and install the model.
 
-    Raises InputError for a model that needs no conversion, a licence that must be accepted first, a file that
-    is not the published one, and a package that is missing from this environment.
+    Args:
+        model: Entry of the registry.
+        directory: Folder of installed models.
+        checkpoint: File from the publisher.
+        licence_accepted: True if the user accepted a licence that forbids commercial use.
+
+    Returns:
+        The written files.
+
+    Raises:
+        InputError: The model needs no conversion, its licence is not accepted, the file is not the published
+            one, or a package is missing.
     """
     source = model.source
     if source is None or source.spec != "file":
@@ -78,15 +91,15 @@ def install_checkpoint(
     require(*_PACKAGES.get(model.converter or "", ()), purpose=f"converting {model.name}")
     if not source.verified:
         click.echo(
-            f"warning: the publisher of {source.label} states no whole digest: nothing shows that the "
-            "file is the published one. The digest of this file is noted, and later checks compare with it",
+            f"warning: the publisher of {source.label} gives no full digest, so the file cannot be verified. "
+            "Later checks compare with the digest of this file",
             err=True,
         )
 
     if not (model.commercial or licence_accepted):
         raise InputError(
-            f"{model.name} is not for commercial use; its licence: {model.licence}",
-            hint="if you accept that licence, repeat the command with --accept-licence",
+            f"the licence of {model.name} forbids commercial use: {model.licence}",
+            hint="to accept it, repeat the command with --accept-licence",
         )
     data = read_checked(checkpoint, source)
 

@@ -1,13 +1,13 @@
-"""The conversions at the published architectures' full size, with random weights: time, memory, and the
-largest difference to PyTorch. And what each model that can be had costs to run.
+"""Measure the conversions at full size, and the cost of all available models.
 
-Converted here, and as installed::
+A conversion is measured with the published architecture and random weights: time, memory, and the largest
+difference to PyTorch. Conversions and installed models::
 
   .venv-convert/bin/python -m tools.convert_models.full_size restormer nafnet musiq clip-iqa
   .venv/bin/python -m tools.convert_models.full_size embedded clarity-net lpips ...
 
-Each is measured in a process of its own on one thread, in seconds of the processor. docs/models.md has the
-figures.
+Each model is measured in a separate process on one thread. Times are processor seconds. docs/models.md shows
+the results.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ import torch
 from torch import nn
 
 SIZE = (540, 960)
-"""Of the image that times and memory are measured on, rows and columns."""
+"""Rows and columns of the image for times and memory."""
 
 
 def image(height: int, width: int) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Smooth noise of several scales, sRGB in [0, 1]."""
+    """Return smooth noise of several scales [H, W, 3], sRGB in [0, 1]."""
     rng = np.random.default_rng([height, width])
     planes = [
         nn.functional.interpolate(
@@ -46,26 +46,27 @@ def image(height: int, width: int) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def peak_gb() -> float:
-    """Most memory that this process has held."""
+    """Return the peak memory of this process, GB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 def checkpoint(network: nn.Module) -> bytes:
+    """Return the weights of a network as a checkpoint file."""
     buffer = io.BytesIO()
     torch.save(network.state_dict(), buffer)
     return buffer.getvalue()
 
 
-def published(name: str) -> Any:
-    """The published architecture with random weights, none of which leaves the image as it is."""
-    from tools.convert_models.torch_export import mend_torchvision
+def random_network(name: str) -> Any:
+    """Return the published architecture with random weights, such that the network changes the image."""
+    from tools.convert_models.torch_export import declare_torchvision_operators
 
-    mend_torchvision()
+    declare_torchvision_operators()
     torch.manual_seed(0)
     if name == "restormer":
         from spandrel_extra_arches.architectures.Restormer.__arch.restormer_arch import Restormer
 
-        return Restormer().eval()  # dim 48, blocks 4 6 6 8, 4 of refinement: the motion deblurring one
+        return Restormer().eval()  # the motion deblurring model: dim 48, blocks 4 6 6 8, 4 of refinement
     if name == "nafnet":
         from spandrel.architectures.NAFNet.__arch.NAFNet_arch import NAFNet
 
@@ -89,12 +90,12 @@ def published(name: str) -> Any:
 
 
 def convert(name: str, path: Path) -> dict[str, Any]:
-    """Convert the random network and compare it with PyTorch."""
+    """Convert the random network to ``path`` and compare it with PyTorch."""
     from cleargs.models.expert import OnnxExpert
     from cleargs.models.scorer import LearnedScorer, MusiqScorer, Scorer
     from tools.convert_models import restorer, scorers
 
-    network, start = published(name), time.process_time()
+    network, start = random_network(name), time.process_time()
     tile = image(256, 256)
     if name in ("restormer", "nafnet"):
         restorer.convert(checkpoint(network), path)
@@ -110,7 +111,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
         else:
             from pyiqa.archs import clipiqa_arch
 
-            clipiqa_arch.load = lambda backbone, device: network  # else it would download CLIP
+            clipiqa_arch.load = lambda backbone, device: network  # avoids a download of CLIP
             scorers.convert("clip-iqa", b"", path)
             reference, scorer, factor = clipiqa_arch.CLIPIQA().eval(), LearnedScorer(path), 100.0
         took, held = time.process_time() - start, peak_gb()
@@ -135,7 +136,7 @@ def convert(name: str, path: Path) -> dict[str, Any]:
 
 
 def cost(name: str, path: Path | None) -> dict[str, Any]:
-    """Seconds a megapixel and memory of the model on one thread; ``path``: of a network converted here."""
+    """Return seconds per megapixel and memory of a model on one thread; ``path`` is a converted network."""
     from cleargs.models.expert import OnnxExpert, load_expert
     from cleargs.models.lpips import load_lpips
     from cleargs.models.scorer import LearnedScorer, MusiqScorer, load_scorer
@@ -164,6 +165,7 @@ def cost(name: str, path: Path | None) -> dict[str, Any]:
 
 
 def main(names: list[str]) -> None:
+    """Measure each model in a child process and print a line of JSON."""
     if len(names) == 3 and names[0] in ("--convert", "--cost"):
         torch.set_num_threads(1)
         path = Path(names[2])

@@ -1,6 +1,6 @@
-"""MUSIQ and CLIP-IQA from their published weights, by pyiqa's implementations.
+"""Convert MUSIQ and CLIP-IQA from their published weights, with the implementations of pyiqa.
 
-pyiqa is imported module by module: the package as a whole imports what only its training needs.
+Modules of pyiqa are imported individually: the whole package also imports dependencies of its training.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from torch.export import Dim
 
 from cleargs.errors import InputError
 from cleargs.models.scorer import PATCH
-from tools.convert_models.torch_export import export, first_line, mend_torchvision
+from tools.convert_models.torch_export import declare_torchvision_operators, export, first_line
 
 
 def convert(kind: str, checkpoint: bytes, path: Path) -> None:
-    """Write the scorer ``musiq`` or ``clip-iqa`` as ONNX. Raises InputError if the weights do not fit."""
-    mend_torchvision()
+    """Write the scorer ``musiq`` or ``clip-iqa`` as ONNX; raise InputError if the weights do not fit."""
+    declare_torchvision_operators()
     try:
         _CONVERTERS[kind](checkpoint, path)
     except (pickle.UnpicklingError, RuntimeError, KeyError, EOFError) as error:
         raise InputError(
             f"these are not the weights of {kind}: {first_line(error)}",
-            hint="give the file as its authors publish it",
+            hint="give the unchanged file from its authors",
         ) from error
 
 
 class MusiqNetwork(nn.Module):
-    """pyiqa's MUSIQ without its preprocessing: patches of one image in, the mean opinion score out."""
+    """pyiqa's MUSIQ without preprocessing: patches of one image -> mean opinion score."""
 
     def __init__(self, musiq: Any) -> None:
         super().__init__()
@@ -48,9 +48,9 @@ class MusiqNetwork(nn.Module):
         self,
         patches: Tensor,  # [N, 3, 32, 32] in [-1, 1]
         places: Tensor,  # [N] cells of the position grid
-        scales: Tensor,  # [N] numbers of the image's sizes
+        scales: Tensor,  # [N] indices of the image sizes
     ) -> Tensor:
-        """The score. [1, 1]"""
+        """Return the score [1, 1]."""
         tokens = self.embedding(self.stem(patches).permute(0, 2, 3, 1).flatten(1))[None]
         every = torch.ones_like(places, dtype=tokens.dtype)[None]
         score: Tensor = self.head(self.encoder(tokens, places[None], scales[None], every)[:, 0])
@@ -58,7 +58,7 @@ class MusiqNetwork(nn.Module):
 
 
 class ClipIqaNetwork(nn.Module):
-    """pyiqa's CLIP-IQA with the features of its prompts, which are always the same, computed once."""
+    """pyiqa's CLIP-IQA with precomputed features of its constant prompts."""
 
     mean: Tensor
     deviation: Tensor
@@ -79,7 +79,7 @@ class ClipIqaNetwork(nn.Module):
         self,
         image: Tensor,  # [1, 3, H, W] sRGB in [0, 1]
     ) -> Tensor:
-        """100 x the mean probability of the better prompt of each pair. [1, 1]"""
+        """Return 100 x the mean probability of the positive prompt of each pair [1, 1]."""
         features = self.visual((image - self.mean) / self.deviation, pos_embedding=False)
         features = features / features.norm(dim=-1, keepdim=True)
         pairs = (features @ self.prompts.t()).reshape(1, -1, 2).softmax(dim=-1)
@@ -113,7 +113,7 @@ def _clip_iqa(checkpoint: bytes, path: Path) -> None:
     with tempfile.NamedTemporaryFile(suffix=".pt") as file:
         file.write(checkpoint)
         file.flush()
-        clip_iqa = CLIPIQA(backbone=file.name)  # a path is loaded, a name would be downloaded
+        clip_iqa = CLIPIQA(backbone=file.name)  # a file is loaded; a name would be downloaded
     network = ClipIqaNetwork(clip_iqa).eval().requires_grad_(False)
     free = {2: Dim("height", min=32), 3: Dim("width", min=32)}
     export(network, (torch.rand(1, 3, 160, 224),), path, inputs=("image",), output="score", free=(free,))

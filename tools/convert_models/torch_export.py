@@ -1,4 +1,4 @@
-"""What the conversions share: their environment, and the export of torch modules to ONNX."""
+"""Shared parts of the conversions: the check of the environment and the export to ONNX."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OPSET = 18
 
 
 def require(*packages: str, purpose: str) -> None:
-    """Raise InputError if one of the packages cannot be imported here."""
+    """Raise InputError if a package is not installed; ``purpose`` begins the message."""
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
         raise InputError(
@@ -26,15 +26,15 @@ def require(*packages: str, purpose: str) -> None:
 
 
 def first_line(error: Exception) -> str:
-    """What an error of another package says, in one line."""
+    """Return the first line of an error's message, or the name of its type."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def mend_torchvision() -> None:
-    """Let torchvision be imported beside a CPU build of torch.
+def declare_torchvision_operators() -> None:
+    """Declare two operators that torchvision needs for its import with a CPU build of torch.
 
-    Its released build registers shapes for two detection operators that its library, which does not load
-    there, would define. Declared here, they can be imported; nothing converted calls them.
+    Its released build registers shapes for two detection operators. Its library defines them, but does not
+    load with such a torch. No converted network calls them.
     """
     for name in ("nms", "qnms"):
         if not hasattr(torch.ops.torchvision, name):
@@ -54,7 +54,13 @@ def export(
 ) -> None:
     """Write a network in evaluation mode as one ONNX file.
 
-    free: for each input, which of its axes may have any extent, as ``torch.export`` names them.
+    Args:
+        network: The network.
+        example: Example inputs.
+        path: File to write.
+        inputs: Names of the inputs.
+        output: Name of the output.
+        free: Axes of variable size for each input, in the form of ``torch.export``.
     """
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")

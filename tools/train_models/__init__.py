@@ -1,1 +1,1 @@
-"""Recipes that train the two networks ClearGS ships: the restoration expert and the scorer."""
+"""Training of the networks in the package: the restoration expert and the scorers."""

@@ -1,10 +1,9 @@
-"""Artefacts of sharpening, restoration and splatting, imitated on photographs.
+"""Simulated artefacts of sharpening, restoration and splatting on photos.
 
-They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer: what it is asked
-to tell apart are renders of a Gaussian scene, restored frames and fusions of the two.
+They complement the blur, noise and JPEG of ``degrade`` for training the no-reference scorer. RIVR uses it to
+rank renders of a Gaussian scene, restored frames and fusions of the two.
 
-Images are [H, W, 3] float32 sRGB in [0, 1], in and out; every random choice comes from the generator passed
-in.
+Inputs and outputs are images [H, W, 3], float32 sRGB in [0, 1]. All random choices come from ``rng``.
 """
 
 from __future__ import annotations
@@ -22,21 +21,32 @@ from tools.train_models.degrade import Degradation, Kernel, degrade, disc_kernel
 
 
 def unsharp(image: ImageF32, sigma: float, amount: float) -> ImageF32:
-    """Unsharp masking: I + amount (I - blur_sigma(I)). Over-sharpening from an amount of about 1."""
+    """Apply unsharp masking: I + amount (I - blur_sigma(I)). Amounts above about 1 oversharpen."""
     return _clip(image + amount * (image - _gaussian(image, sigma)))
 
 
 def gibbs(image: ImageF32, cutoff: float, gain: float) -> ImageF32:
-    """Ringing: an abrupt low pass at ``cutoff`` cycles a pixel (0..0.5) with ``gain`` >= 1 just below it."""
+    """Add ringing by an abrupt low-pass filter.
+
+    Args:
+        image: The image.
+        cutoff: Cut-off frequency, cycles per pixel (0 to 0.5).
+        gain: Gain just below the cut-off, at least 1.
+    """
     f = _frequency(image.shape[0] * 2, image.shape[1] * 2)
     response = np.where(f <= cutoff, 1.0 + (gain - 1.0) * (f / cutoff) ** 2, 0.0)
     return _filter(image, response)
 
 
 def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
-    """Wiener deconvolution by ``kernel`` (odd, at most the size of the image) on the encoded values.
+    """Apply Wiener deconvolution to the sRGB values.
 
-    With a wrong kernel or too small a ``noise_to_signal`` it rings, as over-eager restorers do.
+    With a wrong kernel or a small ``noise_to_signal`` it adds ringing, as strong restorers do.
+
+    Args:
+        image: The image.
+        kernel: Blur kernel with odd sides, not larger than the image.
+        noise_to_signal: Ratio of the power of noise and signal.
     """
     padded = np.zeros((image.shape[0] * 2, image.shape[1] * 2), np.float64)
     radius = kernel.shape[0] // 2
@@ -46,7 +56,7 @@ def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
 
 
 def ghost(image: ImageF32, dx: float, dy: float, share: float) -> ImageF32:
-    """A second exposure, shifted by (dx, dy) pixels, that takes ``share`` of the (linear) light."""
+    """Blend the image with a copy shifted by (dx, dy) px that has ``share`` of the linear light."""
     linear = linear_from_srgb(image)
     shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
     size = (image.shape[1], image.shape[0])
@@ -55,11 +65,16 @@ def ghost(image: ImageF32, dx: float, dy: float, share: float) -> ImageF32:
 
 
 def splat(image: ImageF32, rng: np.random.Generator, spacing: float, stretch: float) -> ImageF32:
-    """The image as about one anisotropic Gaussian per ``spacing``² pixels can show it.
+    """Approximate the image by about one anisotropic Gaussian per ``spacing``² pixels.
 
-    Gaussians lie along local edges, elongated by up to ``stretch``, with random footprints; a second pass
-    splats what the first one left over, as optimisation would. High frequencies are lost unevenly, edges
-    become brush strokes.
+    Gaussians follow local edges and have random sizes. A second pass splats the residual of the first, like
+    an optimisation. High frequencies are lost unevenly, and edges look like brush strokes.
+
+    Args:
+        image: The image.
+        rng: Random generator.
+        spacing: Mean distance between Gaussians, px.
+        stretch: Maximum elongation.
     """
     tensor = [_gaussian(t, 1.5) for t in _structure(image)]
     height, width = image.shape[:2]
@@ -82,7 +97,7 @@ def splat(image: ImageF32, rng: np.random.Generator, spacing: float, stretch: fl
 
 
 def floaters(image: ImageF32, rng: np.random.Generator, count: int, needle_share: float) -> ImageF32:
-    """``count`` stray Gaussians in front of the image: soft blobs, and needles for a share of them."""
+    """Draw ``count`` stray Gaussians over the image: soft blobs, and needles for ``needle_share`` of them."""
     out = image.copy()
     height, width = image.shape[:2]
     for _ in range(count):
@@ -103,18 +118,18 @@ def floaters(image: ImageF32, rng: np.random.Generator, count: int, needle_share
 
 
 def fuse(render: ImageF32, restored: ImageF32, sigma: float) -> ImageF32:
-    """RIVR's third candidate: clip(R + D - blur_sigma(D))."""
+    """Return RIVR's fused candidate: clip(R + D - blur_sigma(D)), with render R and restored frame D."""
     return _clip(render + restored - _gaussian(restored, sigma))
 
 
 def motion(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Motion blur of 1.5-20 px with sensor noise of at most 1/255."""
+    """Add motion blur of 1.5-20 px and sensor noise of at most 1/255."""
     kernel = motion_kernel(rng, _log_uniform(rng, 1.5, 20.0))
     return degrade(image, Degradation(kernel, noise=rng.uniform(0.0, 1.0 / 255.0)), rng)
 
 
 def defocus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Disc or Gaussian-like blur with radius 0.6-6 px."""
+    """Add disc or Gaussian blur with a radius of 0.6-6 px."""
     radius = _log_uniform(rng, 0.6, 6.0)
     if rng.random() < 0.5:
         return _gaussian(image, 0.6 * radius)
@@ -122,7 +137,7 @@ def defocus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def noise(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """White or slightly smoothed (demosaicked) noise of 2-32/255."""
+    """Add white or slightly smoothed (demosaicked) noise of 2-32/255."""
     level = _log_uniform(rng, 2.0, 32.0) / 255.0
     grain = rng.standard_normal(image.shape, np.float32)
     if rng.random() < 0.4:
@@ -132,7 +147,7 @@ def noise(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def ringing(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Gibbs ringing, or deconvolution of a sharp image by a kernel that never blurred it."""
+    """Add Gibbs ringing, or deconvolve a sharp image by a kernel that did not blur it."""
     if rng.random() < 0.5:
         return gibbs(image, rng.uniform(0.12, 0.4), rng.uniform(1.0, 2.5))
     kernel = (
@@ -144,12 +159,12 @@ def ringing(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def oversharp(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Unsharp masking from barely visible to harsh."""
+    """Apply unsharp masking, from barely visible to harsh."""
     return unsharp(image, _log_uniform(rng, 0.6, 4.0), _log_uniform(rng, 0.4, 5.0))
 
 
 def ghosting(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """One or two faint shifted copies, 2-16 px away."""
+    """Add one or two faint copies, shifted by 2-16 px."""
     for _ in range(int(rng.integers(1, 3))):
         angle, distance = rng.uniform(0, 2 * np.pi), _log_uniform(rng, 2.0, 16.0)
         image = ghost(image, distance * np.cos(angle), distance * np.sin(angle), rng.uniform(0.12, 0.5))
@@ -157,14 +172,12 @@ def ghosting(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def blocks(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """JPEG at quality 8-80."""
+    """Apply JPEG compression of quality 8-80."""
     return jpeg(image, int(_log_uniform(rng, 8.0, 80.0)))
 
 
 def rendered(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """What a splat render may look like: too few Gaussians, patches of different density, stray ones in
-    front.
-    """
+    """Imitate a splat render: too few Gaussians, uneven density, stray Gaussians in front."""
     out = splat(image, rng, _log_uniform(rng, 2.2, 7.0), rng.uniform(1.5, 8.0))
     if rng.random() < 0.5:
         share = patches(image.shape[0], image.shape[1], rng)
@@ -175,13 +188,13 @@ def rendered(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def stray(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Floaters and needles over a sharp or slightly soft image."""
+    """Add floaters and needles to a sharp or slightly soft image."""
     soft = _gaussian(image, rng.uniform(0.2, 1.2)) if rng.random() < 0.6 else image
     return floaters(soft, rng, int(_log_uniform(rng, 2.0, 40.0)), rng.random())
 
 
 def restored(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """A blurred image after restoration: too timid, about right, or ringing."""
+    """Blur the image and restore it: too weakly, about right, or with ringing."""
     length = rng.uniform(2.0, 14.0)
     kernel = motion_kernel(rng, length) if rng.random() < 0.7 else disc_kernel(length / 4)
     blurred = degrade(image, Degradation(kernel, noise=rng.uniform(0.0, 1.0 / 255.0)), rng)
@@ -191,7 +204,7 @@ def restored(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def fused(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """A splat-like render with the detail of a restored frame added; now and then slightly misaligned."""
+    """Fuse a splat-like render with the detail of a restored frame, sometimes slightly misaligned."""
     detail = restored(image, rng)
     if rng.random() < 0.4:
         shift = np.array([[1, 0, rng.normal(0, 1.5)], [0, 1, rng.normal(0, 1.5)]], np.float32)
@@ -202,7 +215,7 @@ def fused(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def mixed(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Two or three of the other artefacts in a random order."""
+    """Apply two or three of the other artefacts in random order."""
     names = rng.choice(len(_SIMPLE), size=int(rng.integers(2, 4)), replace=False)
     for index in names:
         image = _SIMPLE[int(index)](image, rng)
@@ -247,7 +260,7 @@ def _frequency(height: int, width: int) -> NDArray[np.float64]:
 
 
 def _filter(image: ImageF32, response: NDArray[np.floating] | NDArray[np.complexfloating]) -> ImageF32:
-    """Filter in the Fourier domain of the mirrored image, so that its borders do not wrap around."""
+    """Filter the mirrored image in the Fourier domain, so that its borders do not wrap around."""
     height, width = image.shape[:2]
     mirrored = np.pad(image, ((0, height), (0, width), (0, 0)), mode="symmetric")
     spectrum = np.fft.rfft2(mirrored, axes=(0, 1)) * response[..., None]
@@ -261,22 +274,18 @@ def _structure(image: ImageF32) -> tuple[ImageF32, ImageF32, ImageF32]:
 
 
 def patches(height: int, width: int, rng: np.random.Generator) -> ImageF32:
-    """A smooth random mask with values from 0 to 1. [H, W, 1]"""
+    """Return a smooth random mask [H, W, 1] with values from 0 to 1."""
     coarse = rng.standard_normal((height, width), np.float32)
     field = _gaussian(coarse, rng.uniform(8.0, 32.0))
     return _clip(0.5 + field / (field.std() + 1e-9))[..., None]
 
 
 def _footprint(
-    gaussian: NDArray[
-        np.float64
-    ],  # [5] x, y, angle of the major axis, its deviation, the minor axis' deviation
+    gaussian: NDArray[np.float64],  # [5] x, y, angle of the major axis, deviations along major and minor axis
     height: int,
     width: int,
 ) -> tuple[tuple[slice, slice], NDArray[np.float64]]:
-    """The window (rows, columns) that a Gaussian touches (2.5 deviations) and its weights there, 1 at the
-    centre.
-    """
+    """Return the window (rows, columns) of a Gaussian, 2.5 deviations, and its weights (1 at the centre)."""
     x, y, angle, major, minor = gaussian
     c, s = np.cos(angle), np.sin(angle)
     reach_x, reach_y = 2.5 * np.hypot(major * c, minor * s), 2.5 * np.hypot(major * s, minor * c)
@@ -288,14 +297,14 @@ def _footprint(
     return (rows, columns), np.exp(-0.5 * (u * u + v * v))
 
 
-@njit(cache=True)  # numpy takes half a second a patch
+@njit(cache=True)  # NumPy needs half a second per patch
 def _splat_mean(
     gaussians: NDArray[np.float64],  # [N, 5] as in _footprint
     colours: ImageF32,  # [N, 3]
     height: int,
     width: int,
 ) -> ImageF32:
-    """The weighted mean of the colours of all Gaussians at every pixel. [H, W, 3]"""
+    """Return the weighted mean of the Gaussians' colours at each pixel [H, W, 3]."""
     total = np.zeros((height, width, 3), np.float64)
     weights = np.full((height, width, 1), 1e-6)
     for n in range(gaussians.shape[0]):

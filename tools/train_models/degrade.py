@@ -1,13 +1,13 @@
-"""Synthetic degradations of sharp photographs: motion blur, defocus, noise, JPEG.
+"""Synthetic degradations of sharp photos: motion blur, defocus, noise, JPEG.
 
-Light adds up before a camera encodes it, so blur acts on scene-linear values:
+Light adds up before a camera encodes it, so blur is applied to linear values:
 
     sRGB -> linear -> convolve -> sRGB -> noise -> 8 bits -> (JPEG)
 
-Noise is added to the *encoded* values: its level then means the same in shadows and highlights, and "at most
-1/255" really is one code value (in linear light it would be thirteen of them in the shadows).
+Noise is added to the sRGB values, so that a level has the same effect in shadows and highlights, and 1/255 is
+one code value. In linear light it would be thirteen code values in the shadows.
 
-Images are [H, W, 3] float32 sRGB in [0, 1]. Everything random takes a ``numpy.random.Generator``.
+Images are [H, W, 3] float32 sRGB in [0, 1]. All random choices come from ``rng``.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ IDENTITY: Kernel = np.ones((1, 1), np.float32)
 
 
 def line_path(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A straight stroke at constant speed in a random direction: points [N, 2] evenly spaced in time."""
+    """Return a straight path in a random direction: points [N, 2], evenly spaced in time."""
     angle = rng.uniform(0.0, np.pi)
     t = np.linspace(-0.5, 0.5, 257)
     return np.outer(t, [np.cos(angle), np.sin(angle)])
 
 
 def handheld_path(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A smooth trajectory of a shaking hand: points [N, 2] evenly spaced in time.
+    """Return the smooth path of a shaking hand: points [N, 2], evenly spaced in time.
 
-    A drift (constant velocity) plus three harmonics of tremor with falling amplitude; speed varies along the
-    path, so the kernel is denser where the hand turns, as in Boracchi & Foi, "Modeling the performance of
-    image restoration from motion blur" (2012).
+    It is a drift at constant velocity plus three harmonics of tremor with decreasing amplitude. The speed
+    varies along the path, so the kernel is denser at turns, as in Boracchi & Foi, "Modeling the performance
+    of image restoration from motion blur" (2012).
     """
     t = np.linspace(0.0, 1.0, 257)[:, None]
     path = t * rng.normal(size=2)
@@ -52,10 +52,10 @@ def handheld_path(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
-    """The blur kernel of a path [N, 2] scaled so that its two farthest points lie ``length`` pixels apart.
+    """Return the blur kernel of a path [N, 2], scaled to ``length`` px between its farthest points.
 
-    The kernel is odd, square, sums to one, and has its centre of mass at its centre, so that blurring does
-    not shift the image. Points are splatted bilinearly.
+    The kernel is square with odd sides and sums to one. Its centre of mass is at its centre, so that blurring
+    does not shift the image. Points are splatted bilinearly.
     """
     coarse = path[::4]
     diameter = float(np.linalg.norm(coarse[:, None] - coarse[None], axis=-1).max())
@@ -73,16 +73,16 @@ def rasterise_path(path: NDArray[np.float64], length: float) -> Kernel:
 
 
 def motion_kernel(rng: np.random.Generator, length: float, line_share: float = 0.4) -> Kernel:
-    """A motion kernel of the given length in pixels (largest distance between two of its points).
+    """Return a random motion kernel of ``length`` px (largest distance between two of its points).
 
-    Straight with probability ``line_share``, otherwise handheld.
+    It is straight with probability ``line_share``, else that of a shaking hand.
     """
     path = line_path(rng) if rng.random() < line_share else handheld_path(rng)
     return rasterise_path(path, length)
 
 
 def disc_kernel(radius: float) -> Kernel:
-    """A defocus disc of the given radius in pixels with anti-aliased rim; sums to one."""
+    """Return the kernel of a defocus disc of ``radius`` px with an anti-aliased rim; it sums to one."""
     reach = int(np.ceil(radius)) + 1
     sub = 8
     axis = (np.arange((2 * reach + 1) * sub) + 0.5) / sub - reach - 0.5
@@ -93,7 +93,7 @@ def disc_kernel(radius: float) -> Kernel:
 
 
 def convolve(linear: ImageF32, kernel: Kernel) -> ImageF32:
-    """Convolution of an image [H, W, 3] with a kernel, borders reflected."""
+    """Convolve an image [H, W, 3] with a kernel, with reflected borders."""
     if kernel.shape == (1, 1):
         return linear
     flipped = np.ascontiguousarray(kernel[::-1, ::-1])  # filter2D correlates
@@ -101,7 +101,7 @@ def convolve(linear: ImageF32, kernel: Kernel) -> ImageF32:
 
 
 def jpeg(image: ImageF32, quality: int) -> ImageF32:
-    """The image after one JPEG round trip at the given quality (4:2:0 chroma, OpenCV's default)."""
+    """Return the image after JPEG compression (4:2:0 chroma, OpenCV's default)."""
     code = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     _, data = cv2.imencode(".jpg", code[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.float32)
@@ -110,15 +110,16 @@ def jpeg(image: ImageF32, quality: int) -> ImageF32:
 
 @dataclass(frozen=True)
 class Degradation:
-    """One degradation of one image.
+    """A degradation of an image.
 
-    kernel: blur kernel; the identity leaves the image sharp.
-    second: where given, blur changes across the image from ``kernel`` to ``second`` along ``direction``, as
-        under camera rotation or depth.
-    direction: angle in radians of that change.
-    noise: standard deviation of Gaussian noise on encoded values in [0, 1].
-    quantise: round to 8 bits.
-    jpeg_quality: None for no JPEG.
+    Attributes:
+        kernel: Blur kernel; the identity leaves the image sharp.
+        second: If given, the blur changes across the image from ``kernel`` to ``second``, as with camera
+            rotation or depth.
+        direction: Direction of that change, radians.
+        noise: Standard deviation of Gaussian noise on sRGB values in [0, 1].
+        quantise: True to round to 8 bits.
+        jpeg_quality: Quality of JPEG compression; None for no JPEG.
     """
 
     kernel: Kernel = field(default_factory=lambda: IDENTITY)
@@ -130,7 +131,7 @@ class Degradation:
 
 
 def degrade(image: ImageF32, degradation: Degradation, rng: np.random.Generator) -> ImageF32:
-    """The degraded image: [H, W, 3] float32 sRGB in [0, 1] in and out. ``rng`` draws the noise."""
+    """Return the degraded image [H, W, 3], float32 sRGB in [0, 1]; ``rng`` draws the noise."""
     if degradation.kernel.shape == (1, 1) and degradation.second is None:
         out = image
     else:
@@ -151,7 +152,7 @@ def degrade(image: ImageF32, degradation: Degradation, rng: np.random.Generator)
 
 
 def _ramp(height: int, width: int, direction: float) -> ImageF32:
-    """Values from 0 to 1 across the image along a direction: [H, W]."""
+    """Return values [H, W] that rise from 0 to 1 along ``direction``."""
     y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
     x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
     reach = abs(np.cos(direction)) + abs(np.sin(direction))
@@ -160,11 +161,11 @@ def _ramp(height: int, width: int, direction: float) -> ImageF32:
 
 
 def shallow_focus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """The photograph as a lens of little depth of field takes it: [H, W, 3] float32 sRGB in [0, 1].
+    """Return the photo with a shallow depth of field: [H, W, 3] float32 sRGB in [0, 1].
 
-    Out of focus everywhere or, half of the time, through a random mask whose edges range from a slow change
-    of depth to the outline of an object. Two discs in sequence, the first of 1-10 px radius and the second
-    smaller, give profiles from a hard disc to a soft one.
+    It is out of focus everywhere or, half of the time, in a random mask with edges from a slow change of
+    depth to the outline of an object. Two discs in sequence, of 1-10 px radius and a smaller one, give
+    profiles from hard to soft.
     """
     linear = linear_from_srgb(image)
     radius = np.exp(rng.uniform(0.0, np.log(10.0)))
@@ -179,12 +180,12 @@ def shallow_focus(image: ImageF32, rng: np.random.Generator) -> ImageF32:
 
 
 def handheld_degradation(rng: np.random.Generator) -> Degradation:
-    """What a frame of a handheld video may look like: what the restoration expert is trained on.
+    """Return a random degradation of a handheld video frame, for training the restoration expert.
 
-    Sharp 15 %, motion shorter than 7 px 15 %, motion of 7-22 px 70 %, of which a fifth vary across the image.
-    Noise up to 1/255 in most, up to 3/255 in a quarter; JPEG of quality 60-95 in a quarter.
+    15 % are sharp, 15 % have motion blur below 7 px and 70 % have blur of 7-22 px, a fifth of which varies
+    across the image. Noise is at most 1/255, or 3/255 in a quarter; a quarter has JPEG of quality 60-95.
 
-    No defocus: it mostly is the photographer's choice, and stays (see `shallow_focus`).
+    There is no defocus: it mostly is the photographer's choice, so the expert must keep it (`shallow_focus`).
     """
     kind = rng.random()
     second = None

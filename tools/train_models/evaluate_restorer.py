@@ -1,15 +1,14 @@
-"""The table of the restoration expert on photo sources that its training never saw.
+"""Evaluate restoration experts on held-out photo sources.
 
     python -m tools.train_models.evaluate_restorer --photos DIR [--expert FILE.onnx] [--crop 256]
 
-prints markdown: mean PSNR over the held-out photographs for each band of motion lengths, beside the blurred
-image itself, unsharp masking and Wiener deconvolution. Noise is at most 1/255,
-so that no gain comes from denoising.
+prints a Markdown table of the mean PSNR over the held-out photos for each band of blur lengths: the blurred
+image, unsharp masking, Wiener deconvolution and the expert. Noise is at most 1/255, so that no gain comes
+from denoising.
 
-What the baselines know: unsharp masking and the blind Wiener filter are tuned for each band on photographs of
-the training sources, which tells them the band; the expert is told nothing. The blind Wiener filter
-deconvolves the mean kernel of the band, since the direction is unknown; the other one is given the true
-kernel and is no rival but a reference.
+Unsharp masking and the blind Wiener filter are tuned per band on photos of the training sources, so they know
+the band; the expert does not. The blind Wiener filter deconvolves by the mean kernel of the band, because the
+direction is unknown. The other Wiener filter knows the true kernel and serves only as a reference.
 """
 
 from __future__ import annotations
@@ -32,13 +31,15 @@ from tools.train_models.degrade import IDENTITY, Degradation, Kernel, degrade, m
 from tools.train_models.train_restorer import list_photos, read_photo, source_of
 
 BANDS = ((7, 11), (12, 16), (17, 21))
-"""Shortest and longest motion in pixels of each band."""
+"""Shortest and longest blur of each band, px."""
 
 MARGIN = 24
-"""Pixels at the border that do not count: what lies beyond the image has blurred into them."""
+"""Border that does not count, px: pixels from outside the image have blurred into it."""
 
 TUNING_CROP = 384
+"""Side of the crops for tuning baselines, px."""
 TUNING_PHOTOS = 12
+"""Number of photos for tuning baselines."""
 
 _PURPOSE_EVALUATION = 2
 _PURPOSE_TUNING = 3
@@ -47,7 +48,7 @@ _PURPOSE_MEAN_KERNEL = 4
 
 @dataclass(frozen=True)
 class RestorationCase:
-    """A photograph (sRGB [H, W, 3] in [0, 1]), its blurred version and the kernel that made it."""
+    """A photo (sRGB [H, W, 3] in [0, 1]), its blurred version and the blur kernel."""
 
     source: str
     sharp: ImageF32
@@ -59,7 +60,7 @@ Method = Callable[[RestorationCase], ImageF32]
 
 
 def psnr(image: ImageF32, reference: ImageF32) -> float:
-    """PSNR in dB of sRGB values in [0, 1] without a border of `MARGIN` pixels; infinite for equal images."""
+    """Return the PSNR in dB of sRGB images in [0, 1], without the border; infinite for equal images."""
     inner = slice(MARGIN, -MARGIN)
     error = image[inner, inner].astype(np.float64) - reference[inner, inner]
     mean = float(np.mean(np.square(error)))
@@ -67,13 +68,13 @@ def psnr(image: ImageF32, reference: ImageF32) -> float:
 
 
 def unsharp_mask(image: ImageF32, sigma: float, amount: float) -> ImageF32:
-    """Sharpening by ``amount`` times the difference to a Gaussian blur of ``sigma`` pixels."""
+    """Add ``amount`` times the difference to a Gaussian blur of ``sigma`` px."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     return np.clip(image + np.float32(amount) * (image - smooth), 0.0, 1.0)
 
 
 def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
-    """Wiener deconvolution in linear light: spectrum times conj(K) / (|K|² + noise_to_signal)."""
+    """Apply Wiener deconvolution in linear light: spectrum * conj(K) / (|K|² + noise_to_signal)."""
     reach = 2 * kernel.shape[0]
     padded = np.pad(linear_from_srgb(image), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
     shape = padded.shape[:2]
@@ -88,7 +89,7 @@ def wiener(image: ImageF32, kernel: Kernel, noise_to_signal: float) -> ImageF32:
 
 
 def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:
-    """The mean of 400 random motion kernels of a band."""
+    """Return the mean of 400 random motion kernels of a band."""
     rng = np.random.default_rng([seed, _PURPOSE_MEAN_KERNEL, band[0]])
     side = 4 * band[1] + 1
     total = np.zeros((side, side))
@@ -105,9 +106,14 @@ def mean_kernel(band: tuple[int, int], seed: int) -> Kernel:
 def make_cases(
     photos: Sequence[Path], band: tuple[int, int] | None, *, crop: int | None, seed: int, purpose: int
 ) -> list[RestorationCase]:
-    """One case a photograph: blurred by a motion of the band, with noise, or sharp without a band.
+    """Make one case per photo.
 
-    crop: side of the central square to take; None for the whole photograph.
+    Args:
+        photos: Photo files.
+        band: Shortest and longest blur, px; None for sharp cases.
+        crop: Side of the central square to use, px; None for the whole photo.
+        seed: Seed of blur and noise.
+        purpose: Second seed, so that uses of one seed differ.
     """
     cases = []
     for index, path in enumerate(photos):
@@ -127,7 +133,7 @@ def make_cases(
 
 
 def score(method: Method, cases: Iterable[RestorationCase]) -> NDArray[np.float64]:
-    """PSNR in dB of the method's result on each case."""
+    """Return the PSNR in dB of the method's result on each case."""
     return np.array([psnr(method(case), case.sharp) for case in cases])
 
 
@@ -136,7 +142,7 @@ def _best(candidates: Sequence[Method], cases: Sequence[RestorationCase]) -> Met
 
 
 def tuned_baselines(photos: Sequence[Path], band: tuple[int, int], seed: int) -> dict[str, Method]:
-    """Unsharp masking and both Wiener filters with the settings that do best on training photographs."""
+    """Return unsharp masking and both Wiener filters with the best settings on training photos."""
     chosen = photos[:: max(1, len(photos) // TUNING_PHOTOS)][:TUNING_PHOTOS]
     cases = make_cases(chosen, band, crop=TUNING_CROP, seed=seed, purpose=_PURPOSE_TUNING)
     average = mean_kernel(band, seed)
@@ -161,13 +167,13 @@ def tuned_baselines(photos: Sequence[Path], band: tuple[int, int], seed: int) ->
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="Measure restoration experts on the held-out photo sources.")
+    parser = argparse.ArgumentParser(description="Measure restoration experts on held-out photo sources.")
     parser.add_argument("--photos", type=Path, required=True)
     parser.add_argument(
         "--expert", action="append", help="embedded (default) or an ONNX file; may be repeated"
     )
-    parser.add_argument("--crop", type=int, help="side of a central square crop; default: whole photographs")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th photograph")
+    parser.add_argument("--crop", type=int, help="side of a central square crop, px; default: whole photos")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th photo")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args(arguments)
@@ -207,13 +213,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 gain = after - before
                 sources = np.array([case.source for case in cases])
                 parts = ", ".join(f"{s} {gain[sources == s].mean():+.2f}" for s in sorted(set(sources)))
-                count = f"{int((gain > 0).sum())} of {len(gain)} photographs"
+                count = f"{int((gain > 0).sum())} of {len(gain)} photos"
                 details.append(f"* {name}, {title}: better on {count}, worst {gain.min():+.2f} dB; {parts}")
     for name, method in experts.items():
         left = score(method, sharp)
         rows[name].append(f"{left.mean():.2f} (worst {left.min():.2f})")
 
-    print(f"PSNR in dB (gain), mean over {len(held_out)} photographs\n")
+    print(f"PSNR in dB (gain), mean over {len(held_out)} photos\n")
     print("| | " + " | ".join(title for title, _, _ in columns) + " | sharp input |")
     print("|---|" + "---|" * (len(columns) + 1))
     for name, cells in rows.items():

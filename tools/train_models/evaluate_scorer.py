@@ -1,9 +1,9 @@
-"""How well the embedded scorers agree with LPIPS on photo sources that they have not seen.
+"""Agreement of the embedded scorers with LPIPS on held-out photo sources.
 
     python -m tools.train_models.evaluate_scorer --photos DIR
 
-Whole photographs, reduced by a third, each with every artefact once. LPIPS is needed (`cleargs models install
-lpips`).
+It uses whole photos, reduced by a third, with each artefact once. It needs the LPIPS weights (`cleargs
+models install lpips`).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tools.train_models.degrade import Degradation, degrade, motion_kernel
 from tools.train_models.train_restorer import list_photos, read_photo
 from tools.train_models.train_scorer import spearman
 
-_VISIBLE = 0.02  # LPIPS from which on a fault is called visible
+_VISIBLE = 0.02  # LPIPS above which an artefact counts as visible
 _REDUCTION = 0.67
 
 
 def candidates(image: ImageF32, rng: np.random.Generator) -> dict[str, ImageF32]:
-    """What RIVR chooses among, and the clean image: blur of 4-12 px, sharpening, deconvolution, splats."""
+    """Return the clean image and candidates like those of RIVR: blurred, sharpened, deconvolved, splatted."""
     kernel = motion_kernel(rng, rng.uniform(4.0, 12.0))
     blurred = degrade(image, Degradation(kernel, noise=0.5 / 255.0), rng)
     return {
@@ -43,13 +43,11 @@ def candidates(image: ImageF32, rng: np.random.Generator) -> dict[str, ImageF32]
 
 
 def agreement(
-    scores: NDArray[np.float64],  # [P, K] of one photo a row, version 0 clean
+    scores: NDArray[np.float64],  # [P, K] one photo per row, version 0 clean
     distances: NDArray[np.float64],  # [P, K] LPIPS to version 0
     names: list[str],  # [K]
 ) -> list[str]:
-    """A Markdown table by artefact: rank agreement with -LPIPS, and how often the clean photo scores
-    higher.
-    """
+    """Return a Markdown table by artefact: agreement with -LPIPS, share of clean photos that score higher."""
     within = [spearman(s, -d) for s, d in zip(scores, distances, strict=True)]
     lines = [
         f"Spearman with -LPIPS: {spearman(scores, -distances):.3f} over all images, "
@@ -69,7 +67,7 @@ def agreement(
 
 
 def choices(scores: NDArray[np.float64], names: list[str]) -> list[str]:
-    """A Markdown table: mean score of each candidate [P, K], how often clean and blurred are worse."""
+    """Return a Markdown table of scores [P, K]: mean, share below clean, share above blurred."""
     lines = ["| candidate | mean score | below clean | above blurred |", "|---|---|---|---|"]
     blurred = scores[:, names.index("blurred")]
     for k, name in enumerate(names):
@@ -87,9 +85,7 @@ def _photo(path: Path) -> ImageF32:
 
 @click.command()
 @click.option("--photos", type=click.Path(exists=True, file_okay=False, path_type=Path), required=True)
-@click.option(
-    "--models", type=click.Path(path_type=Path), default=None, help="Model folder with the LPIPS weights."
-)
+@click.option("--models", type=click.Path(path_type=Path), default=None, help="Folder of installed models.")
 @click.option("--seed", default=2001, show_default=True)
 def main(photos: Path, models: Path | None, seed: int) -> None:
     """Print the tables of both embedded scorers."""

@@ -1,7 +1,7 @@
-"""Drawn training contents: colour gradients and layered shapes, sharp and soft.
+"""Drawn training images: colour gradients and layered shapes, sharp and soft.
 
-A few photo sources hold little that is smooth by nature (plain walls, skies, graphics); without such contents
-the scorer takes smoothness for blur, and does not learn what sharpening and ringing look like there.
+The photo sources contain few smooth areas (plain walls, skies, graphics). Without drawn images, the scorer
+mistakes smoothness for blur and does not learn sharpening and ringing artefacts there.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from cleargs.types import ImageF32
 
-_OVERSAMPLING = 2  # drawn larger and reduced, so that edges are as soft as a camera's
+_OVERSAMPLING = 2  # images are drawn larger and reduced, so that edges are as soft as those of a camera
 
 
 def graphic(side: int, rng: np.random.Generator) -> ImageF32:
-    """A square of ``side`` pixels: a gradient behind up to 40 shapes, half of the time with faint texture."""
+    """Draw a square image of ``side`` px: a gradient behind up to 40 shapes, and texture half of the time."""
     n = side * _OVERSAMPLING
     out = _shade(n, rng)
     for _ in range(int(rng.integers(1, 40))):
@@ -32,14 +32,14 @@ def graphic(side: int, rng: np.random.Generator) -> ImageF32:
 
 
 def _shade(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """A linear gradient between random colours. [n, n, 3]"""
+    """Return a linear gradient between random colours [n, n, 3]."""
     y, x = np.mgrid[0:n, 0:n].astype(np.float32)[..., None] / n
     colour, slope = rng.random(3), rng.normal(0.0, 0.25, (2, 3))
     return np.asarray(colour + x * slope[0] + y * slope[1], np.float32)
 
 
 def _shape(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The opacity of an ellipse or a polygon, its rim often soft. [n, n, 1]"""
+    """Return the opacity [n, n, 1] of an ellipse or polygon, often with a soft rim."""
     mask = np.zeros((n, n), np.float32)
     centre = rng.uniform(0, n, 2)
     radius = n * float(np.exp(rng.uniform(np.log(0.01), np.log(0.5))))

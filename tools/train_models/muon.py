@@ -1,8 +1,8 @@
-"""Muon: momentum whose matrix updates are orthogonalised before they are applied.
+"""Muon: gradient descent with momentum and orthogonalised matrix updates.
 
-Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024), with the update
-scaled to the size of an Adam update as in Liu et al., "Muon is scalable for LLM training" (2025). A
-convolution's weight [out, in, h, w] counts as the matrix [out, in h w].
+Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024). Updates are scaled to
+the size of Adam updates as in Liu et al., "Muon is scalable for LLM training" (2025). The weight of a
+convolution [out, in, h, w] is treated as a matrix [out, in h w].
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
-"""Coefficients of the quintic iteration that pulls all singular values towards one."""
+"""Coefficients of the quintic iteration that moves all singular values towards one (Jordan et al.)."""
 
 
 def orthogonalise(matrix: Tensor, iterations: int = 5) -> Tensor:
-    """The nearest matrix with singular values of about one, by Newton-Schulz iterations: [rows, columns]."""
+    """Return the nearest matrix with singular values of about one, by Newton-Schulz iterations."""
     a, b, c = NEWTON_SCHULZ
     tall = matrix.shape[0] > matrix.shape[1]
     x: Tensor = matrix.T if tall else matrix
@@ -31,7 +31,10 @@ def orthogonalise(matrix: Tensor, iterations: int = 5) -> Tensor:
 class Muon(torch.optim.Optimizer):
     """Muon for weights of two or more dimensions.
 
-    lr: comparable to a learning rate of Adam. momentum: decay of the running gradient.
+    Args:
+        parameters: The weights.
+        lr: Learning rate, comparable to one of Adam.
+        momentum: Decay of the running mean of gradients.
     """
 
     def __init__(self, parameters: Iterable[Tensor], lr: float, momentum: float = 0.95) -> None:

@@ -1,10 +1,10 @@
-"""Fit the statistics scorer on the pairs that ``train_scorer`` has made.
+"""Fit the statistics scorer to the pairs of ``train_scorer``.
 
     python -m tools.train_models.naturalness --work DIR --out cleargs/models/naturalness.toml
 
-Ridge regression of LPIPS on the quadratic's terms, where the differences to the clean version of the same
-content count beside the values: RIVR compares versions of one content only. Takes minutes (the features),
-then seconds.
+Ridge regression of LPIPS on the terms of the quadratic. Differences to the clean version of the same content
+count in addition to the values, because RIVR only compares versions of one content. The features take
+minutes, the fit seconds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DIFFERENCES = 1.0  # weight of the differences to the clean version
 
 
 def pair_features(pairs: Pairs) -> NDArray[np.float64]:
-    """The features of every version. [G, V, F]"""
+    """Return the features of every version [G, V, F]."""
     return np.stack([[features(v.astype(np.float32) / np.float32(255.0)) for v in g] for g in pairs.images])
 
 
@@ -34,7 +34,7 @@ def fit(
     figures: NDArray[np.float64],  # [G, V, F]
     targets: NDArray[np.float32],  # [G, V] LPIPS to version 0
 ) -> Quadratic:
-    """The ridge solution, rounded to seven digits."""
+    """Return the ridge solution, rounded to seven digits."""
     mean, deviation = figures.mean(axis=(0, 1)), figures.std(axis=(0, 1))
     design = terms(figures, mean, deviation)
     steps = (design[:, 1:] - design[:, :1]).reshape(-1, design.shape[-1])
@@ -53,7 +53,7 @@ def _rounded(values: NDArray[np.floating]) -> tuple[float, ...]:
 @click.option("--work", type=click.Path(exists=True, file_okay=False, path_type=Path), required=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
 def main(work: Path, out: Path) -> None:
-    """Fit, report on the held-out photo sources, write the coefficients."""
+    """Fit, print a report on the held-out photo sources, and write the coefficients."""
     cv2.setNumThreads(1)
     pairs, test = load_pairs(work / "train"), load_pairs(work / "held")
     model = fit(pair_features(pairs), pairs.targets)

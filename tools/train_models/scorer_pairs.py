@@ -1,6 +1,6 @@
-"""Training pairs for the learned scorer: versions of one content, and the LPIPS of each to the clean one.
+"""Training pairs for the learned scorer: versions of one content, with LPIPS to the clean version.
 
-They are made once and kept on disk, because the distances cost more than a training step does.
+They are made once and stored on disk, because LPIPS takes longer than a training step.
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from tools.train_models.artefacts import KINDS, patches
 from tools.train_models.degrade import convolve, disc_kernel
 from tools.train_models.graphics import graphic
 
-PATCH = 128  # side of a training patch, and of the tiles that the scorer averages over
-_MARGIN = 24  # degraded with the patch and cut away, so that no filter shows its border
+PATCH = 128  # side of a training patch and of the tiles over which the scorer averages, px
+_MARGIN = 24  # border that is degraded with the patch and then cut off, so that no filter shows its border
 KIND_NAMES: tuple[str, ...] = tuple(KINDS)
-_OFTEN = {"oversharp": 5.0, "ringing": 4.0}  # the hardest to tell: they look sharper than the clean version
+_KIND_WEIGHTS = {
+    "oversharp": 5.0,
+    "ringing": 4.0,
+}  # hard kinds are more frequent: they look sharper than the clean version
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Groups of versions of one content; version 0 is the clean one."""
+    """G groups of V versions of one content; version 0 is the clean one."""
 
     images: NDArray[np.uint8]  # [G, V, PATCH, PATCH, 3] sRGB
     targets: NDArray[np.float32]  # [G, V] LPIPS to version 0
@@ -46,12 +49,20 @@ def make_pairs(
     seed: int,
     graphics: float = 0.0,
 ) -> Pairs:
-    """Cut ``contents`` random patches from every photo and degrade each; the arrays lie in ``folder``.
+    """Cut random patches from photos and degrade each of them.
 
-    For training, ``versions`` (the clean one included) draws that many kinds with repetition and varies the
-    look of the content; a share ``graphics`` of the contents is drawn instead of photographed. For testing,
-    None makes every kind once, of the content as it is. Groups that are there already are kept, so that an
-    interrupted preparation resumes where it stopped.
+    Finished groups in ``folder`` are kept, so that an interrupted call can be resumed.
+
+    Args:
+        photos: Photo files.
+        lpips: The metric of the targets.
+        folder: Folder of the arrays.
+        contents: Patches per photo.
+        versions: For training, number of versions per patch, the clean one included. Kinds are drawn with
+            repetition, and the look of the content varies. None, for tests, makes every kind once and keeps
+            the look.
+        seed: Seed of all random choices.
+        graphics: Share of contents that are drawn instead of cut from photos.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = [p for _ in range(contents) for p in photos]
@@ -78,7 +89,7 @@ def make_pairs(
 
 
 def load_pairs(folder: Path) -> Pairs:
-    """The pairs that ``make_pairs`` has left in ``folder``, memory-mapped."""
+    """Return the pairs in ``folder`` from `make_pairs`, memory-mapped."""
     images, targets, kinds = (
         np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("images", "targets", "kinds")
     )
@@ -88,13 +99,13 @@ def load_pairs(folder: Path) -> Pairs:
 def _choose(rng: np.random.Generator, versions: int | None) -> NDArray[np.int64]:
     if versions is None:
         return np.arange(len(KIND_NAMES))
-    weights = np.array([_OFTEN.get(name, 1.0) for name in KIND_NAMES[1:]])
+    weights = np.array([_KIND_WEIGHTS.get(name, 1.0) for name in KIND_NAMES[1:]])
     drawn = rng.choice(len(weights), versions - 1, p=weights / weights.sum())
     return np.concatenate([[0], 1 + drawn])
 
 
 def _content(photo: Path, rng: np.random.Generator) -> ImageF32:
-    """A patch with margin, from the photo reduced by a random factor (which also hides its JPEG grid)."""
+    """Cut a patch with margin from a photo, reduced by a random factor, which also hides its JPEG grid."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     assert image is not None, photo
     side = PATCH + 2 * _MARGIN
@@ -102,7 +113,7 @@ def _content(photo: Path, rng: np.random.Generator) -> ImageF32:
     factor = float(np.exp(rng.uniform(np.log(max(0.33, smallest)), np.log(0.95))))
     image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     patch = image[:side, :side]
-    for _ in range(8):  # rather not a patch of plain sky
+    for _ in range(8):  # avoids patches without texture, such as sky
         top, left = (int(rng.integers(0, n - side + 1)) for n in image.shape[:2])
         patch = image[top : top + side, left : left + side]
         if patch.std() > 12.0:
@@ -111,10 +122,10 @@ def _content(photo: Path, rng: np.random.Generator) -> ImageF32:
 
 
 def _vary(image: ImageF32, rng: np.random.Generator) -> ImageF32:
-    """Another photo of the same thing: other colours, exposure and contrast, often with a part out of focus.
+    """Vary colours, exposure and contrast of an image, and often defocus a part of it.
 
-    A handful of photo sources look alike in these respects; without this the network learns the look of a
-    source, and takes the soft background of a close-up, a sky or a plain wall for a fault.
+    The few photo sources are similar in these respects. Without this, the network learns the look of a source
+    and mistakes the soft background of a close-up, a sky or a plain wall for an artefact.
     """
     out = image[..., rng.permutation(3)]
     grey = out.mean(axis=2, keepdims=True)

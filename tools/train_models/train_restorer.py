@@ -1,13 +1,13 @@
-"""The restoration expert ClearGS ships: its network, its training and its export.
+"""Train the restoration expert of ClearGS: its network, its training and its export.
 
     python -m tools.train_models.train_restorer --photos DIR --renders DIR --out restorer.onnx
 
-trains on the photographs DIR/*.jpg whose source (file name up to the first ``_``) is not held out, on sharp
-renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes, and writes the ONNX model. A
-killed run resumes from its checkpoint; a finished one only exports. The export needs the ``onnx`` package.
-`evaluate_restorer` prints the table of the held-out sources.
+trains on the photos DIR/*.jpg without held-out sources (a source is the file name up to the first ``_``), on
+sharp renders (DIR/*/truth/observed/images of `cleargs synth`) and on drawn shapes. Then it writes the ONNX
+model. An interrupted training resumes from its checkpoint; a finished one is only exported. The export needs
+the package ``onnx``. `evaluate_restorer` prints the table for the held-out sources.
 
-Cost of the default recipe: see ``cleargs/models/weights/README.md``.
+The time of the default recipe is in ``cleargs/models/weights/README.md``.
 """
 
 from __future__ import annotations
@@ -34,43 +34,47 @@ from tools.train_models.graphics import graphic
 from tools.train_models.muon import Muon
 
 HELD_OUT = ("budgie", "elementary", "mate")
-"""Photo sources that training never sees."""
+"""Photo sources that no training uses."""
 
 STRIDE = 8
 """Image sides must be multiples of this."""
 
 PATCH = 128
+"""Side of a training patch, px."""
 MARGIN = 20
-"""Pixels around a patch that only the blur sees: its borders are then true neighbours, not reflections."""
+"""Border around a patch, px. It provides true neighbours for the blur, instead of reflections."""
 
 RENDERED_SHARE, DRAWN_SHARE = 0.3, 0.1
-"""Shares of the patches that are not photographs but renders, and drawn shapes: their edges are as sharp as
-the pixels allow, which those of photographs rarely are."""
+"""Shares of renders and of drawn shapes among the patches. Their edges are perfectly sharp, unlike those of
+most photos."""
 SHRUNK_SHARE, MAX_SHRINK = 0.6, 3.0
-"""Share of the photographs' patches that are shrunk, and the largest factor: it makes them crisper."""
+"""Share of photo patches that are shrunk to make them sharper, and the largest factor."""
 
 SHALLOW_SHARE = 0.25
-"""Share of the patches that are put out of focus before they count as the truth: the photographs hardly have
-any shallow depth of field, and a network that never saw it takes it for blur."""
+"""Share of the patches whose truth is partly out of focus. The photos rarely have a shallow depth of field,
+and without examples the network mistakes it for blur."""
 
 BATCH = 8
 LEARNING_RATE = 1e-3
 WARM_UP = 300
 DECAY_SHARE = 0.4
-"""The last part of the steps over which the learning rate falls to zero along a half cosine."""
+"""Last share of the steps, in which the learning rate falls to zero along a half cosine."""
 
 CLIP_NORM = 0.2
+"""Maximum norm of the gradient."""
 EMA_DECAY = 0.999
+"""Decay of the running average of the weights."""
 SPECTRUM_WEIGHT = 0.1
+"""Weight of the spectra in the loss."""
 CHECKPOINT_EVERY = 100
 
 _PURPOSE_SAMPLES = 1
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions around a leaky ReLU, added to the input.
+    """Two 3x3 convolutions with a leaky ReLU between them, added to the input.
 
-    No normalisation: it would make a pixel depend on its whole tile.
+    It has no normalisation, which would make a pixel depend on its whole tile.
     """
 
     def __init__(self, channels: int) -> None:
@@ -90,11 +94,10 @@ def _blocks(channels: int, count: int) -> nn.Sequential:
 
 
 class Restorer(nn.Module):
-    """Blurred sRGB image to sharp one, [N, 3, H, W] in [0, 1], sides multiples of `STRIDE`.
+    """Network from blurred to sharp sRGB images, [N, 3, H, W] in [0, 1], with sides divisible by `STRIDE`.
 
-    A residual U-Net on pixel-unshuffled input at 1/2, 1/4 and 1/8 of the size, every level at similar cost;
-    it predicts the difference to its input. It sees only a neighbourhood
-    (no global pooling), so that tiles agree.
+    A residual U-Net on pixel-unshuffled input at 1/2, 1/4 and 1/8 of the size, with similar cost per level.
+    It predicts the difference to its input. It has no global pooling, so that neighbouring tiles agree.
     """
 
     def __init__(self, widths: Sequence[int] = (32, 64, 128), blocks: Sequence[int] = (1, 2, 4)) -> None:
@@ -123,36 +126,38 @@ class Restorer(nn.Module):
 
 
 def source_of(photo: Path) -> str:
-    """The source of a photograph: its file name up to the first underscore."""
+    """Return the source of a photo: its file name up to the first underscore."""
     return photo.stem.split("_")[0]
 
 
 def list_photos(folder: Path, *, held_out: bool) -> list[Path]:
-    """The photographs of a folder, sorted: those of the held-out sources, or all others.
+    """Return the sorted photos of a folder that belong to held-out sources, or all others.
 
-    Raises InputError when there is none.
+    Raises:
+        InputError: There is no such photo.
     """
     photos = [p for p in sorted(folder.glob("*.jpg")) if (source_of(p) in HELD_OUT) == held_out]
     if not photos:
         raise InputError(
-            f"no {'held-out ' if held_out else ''}photographs in {folder}",
-            hint=f"--photos names a folder of SOURCE_NNN.jpg; held-out sources are {', '.join(HELD_OUT)}",
+            f"no {'held-out ' if held_out else ''}photos in {folder}",
+            hint=f"give --photos a folder of SOURCE_NNN.jpg; held-out sources are {', '.join(HELD_OUT)}",
         )
     return photos
 
 
 def read_photo(path: Path) -> ImageU8:
-    """A photograph as [H, W, 3] RGB uint8. Raises InputError when it cannot be decoded."""
+    """Read a photo as RGB uint8 [H, W, 3]; raise InputError if it cannot be decoded."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise InputError(f"cannot decode {path}", hint="replace the file or take it out of the folder")
+        raise InputError(f"cannot decode {path}", hint="replace the file or remove it from the folder")
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
 def list_renders(folder: Path) -> list[Path]:
-    """The sharp views of the captures made by `cleargs synth` in a folder, sorted.
+    """Return the sorted sharp views of all captures by `cleargs synth` in a folder.
 
-    Raises InputError when there is none.
+    Raises:
+        InputError: There is no such capture.
     """
     renders = sorted(folder.glob("*/truth/observed/images/*.png"))
     if not renders:
@@ -162,15 +167,16 @@ def list_renders(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Contents:
-    """What the patches are cut from: photographs and renders, each [H, W, 3] RGB uint8."""
+    """Images from which patches are cut: photos and renders, each RGB uint8 [H, W, 3]."""
 
     photos: Sequence[ImageU8]
     renders: Sequence[ImageU8]
 
 
 def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[ImageF32, ImageF32]:
-    """One degraded patch and its sharp truth: [PATCH, PATCH, 3] each. Defocus is part of the truth
-    (`SHALLOW_SHARE`).
+    """Return a degraded patch and its sharp truth, float32 sRGB [PATCH, PATCH, 3].
+
+    Defocus is part of the truth (`SHALLOW_SHARE`).
     """
     kind = rng.random()
     if kind < DRAWN_SHARE:
@@ -188,8 +194,9 @@ def draw_sample(contents: Contents, rng: np.random.Generator) -> tuple[ImageF32,
 
 
 def _cut(images: Sequence[ImageU8], scale: float, rng: np.random.Generator) -> ImageF32:
-    """A patch with its margin, shrunk by ``scale``, turned and mirrored; of two random places that with more
-    detail.
+    """Return a patch with margin, shrunk by ``scale``, rotated and mirrored at random.
+
+    It is the one with more detail at two random places.
     """
     image = images[int(rng.integers(len(images)))]
     size = PATCH + 2 * MARGIN
@@ -208,7 +215,7 @@ def _cut(images: Sequence[ImageU8], scale: float, rng: np.random.Generator) -> I
 
 
 def draw_batch(contents: Contents, seed: int, step: int) -> tuple[Tensor, Tensor]:
-    """The degraded and sharp batch [BATCH, 3, PATCH, PATCH] of a step, a function of seed and step alone."""
+    """Return the degraded and sharp batch [BATCH, 3, PATCH, PATCH]; it depends only on seed and step."""
     pairs = [
         draw_sample(contents, np.random.default_rng([seed, _PURPOSE_SAMPLES, step, index]))
         for index in range(BATCH)
@@ -220,7 +227,7 @@ def draw_batch(contents: Contents, seed: int, step: int) -> tuple[Tensor, Tensor
 
 
 def restoration_loss(restored: Tensor, sharp: Tensor) -> Tensor:
-    """Charbonnier distance in sRGB plus a weighted L1 distance of the spectra, which asks for detail."""
+    """Return the Charbonnier distance in sRGB plus a weighted L1 distance of spectra, to favour detail."""
     difference = restored - sharp
     pixels = torch.sqrt(difference.square() + 1e-6).mean()
     spectrum = torch.fft.rfft2(difference, norm="ortho").abs().mean()
@@ -229,7 +236,7 @@ def restoration_loss(restored: Tensor, sharp: Tensor) -> Tensor:
 
 
 def learning_rate(step: int, steps: int) -> float:
-    """Linear warm-up, a plateau, and a half cosine down to zero over the last `DECAY_SHARE` of the steps."""
+    """Return the learning rate: linear warm-up, plateau, then a half cosine over the last `DECAY_SHARE`."""
     if step < WARM_UP:
         return LEARNING_RATE * (step + 1) / WARM_UP
     done = (step - (1.0 - DECAY_SHARE) * steps) / (DECAY_SHARE * steps)
@@ -239,9 +246,18 @@ def learning_rate(step: int, steps: int) -> float:
 def train(
     contents: Contents, checkpoint: Path, *, steps: int, seed: int, bfloat16: bool, start: Path | None = None
 ) -> Restorer:
-    """Train from the checkpoint, where there is one, up to ``steps``; return the averaged network.
+    """Train a restorer.
 
-    ``start``: the checkpoint of an earlier training whose averaged weights are the first ones of this.
+    Args:
+        contents: Training images.
+        checkpoint: File of the state; if it exists, the training resumes from it.
+        steps: Total number of steps.
+        seed: Seed of initial weights and patches.
+        bfloat16: True to compute the network in bfloat16.
+        start: Checkpoint of an earlier training whose averaged weights are the initial ones.
+
+    Returns:
+        The network with averaged weights, in evaluation mode.
     """
     torch.manual_seed(seed)
     model = Restorer()
@@ -292,7 +308,7 @@ def train(
 
 
 def _optimisers(model: Restorer) -> list[torch.optim.Optimizer]:
-    """Muon for the weights between the hidden layers, Adam for the first and last layer and all biases."""
+    """Return Muon for the weights of hidden layers, and Adam for the first and last layer and all biases."""
     edge = {id(model.stem.weight), id(model.head.weight)}
     hidden = [p for p in model.parameters() if p.ndim == 4 and id(p) not in edge]
     others = [p for p in model.parameters() if p.ndim != 4 or id(p) in edge]
@@ -316,7 +332,7 @@ def _save(
 
 
 def export_onnx(model: Restorer, path: Path) -> None:
-    """Write the network as ONNX: ``image`` in, ``restored`` out, [N, 3, H, W] float32, sizes free."""
+    """Write the network as ONNX: input ``image``, output ``restored``, float32 [N, 3, H, W] of any size."""
     axes = {0: "n", 2: "height", 3: "width"}
     torch.onnx.export(
         model,
@@ -331,22 +347,20 @@ def export_onnx(model: Restorer, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line of the recipe."""
+    """Train and export from the command line."""
     parser = argparse.ArgumentParser(description="Train and export the restoration expert.")
-    parser.add_argument(
-        "--photos", type=Path, required=True, help="folder of sharp photographs SOURCE_NNN.jpg"
-    )
+    parser.add_argument("--photos", type=Path, required=True, help="folder of sharp photos SOURCE_NNN.jpg")
     parser.add_argument(
         "--renders", type=Path, required=True, help="folder of captures made by `cleargs synth`"
     )
-    parser.add_argument("--start", type=Path, help="checkpoint of a training whose weights come first")
+    parser.add_argument("--start", type=Path, help="checkpoint of a training with the initial weights")
     parser.add_argument("--out", type=Path, required=True, help="the ONNX file to write")
-    parser.add_argument("--checkpoint", type=Path, help="default: the ONNX file's name with .pt")
+    parser.add_argument("--checkpoint", type=Path, help="default: name of the ONNX file with .pt")
     parser.add_argument("--steps", type=int, default=6400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
-        "--float32", action="store_true", help="no bfloat16 arithmetic (for CPUs without AVX512-BF16)"
+        "--float32", action="store_true", help="do not use bfloat16 (for CPUs without AVX512-BF16)"
     )
     options = parser.parse_args(arguments)
     if importlib.util.find_spec("onnx") is None:

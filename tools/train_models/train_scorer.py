@@ -1,12 +1,11 @@
-"""Train the learned no-reference scorer: LPIPS to the unseen clean image, predicted from the degraded one
-alone.
+"""Train the learned no-reference scorer, which predicts LPIPS to the clean image from the degraded one.
 
     python -m tools.train_models.train_scorer --photos DIR --work DIR --out scorer.onnx
 
-The target is LPIPS v0.1 with AlexNet (the variant its authors recommend as a metric; VGG costs fifteen times
-as much and is the harsher judge of tone, not of detail). The script needs the LPIPS weights (`cleargs models
-install lpips`) and the packages onnx and onnxscript for the export, which ClearGS itself does not need. It is
-seeded and runs on one thread by default.
+The target is LPIPS v0.1 with AlexNet, the variant that its authors recommend as a metric. VGG takes fifteen
+times as long and is more sensitive to tone, but not to detail. The script needs the LPIPS weights (`cleargs
+models install lpips`), and the packages onnx and onnxscript for the export. It is seeded and uses one thread
+by default.
 """
 
 from __future__ import annotations
@@ -30,20 +29,23 @@ from tools.train_models.scorer_pairs import KIND_NAMES, PATCH, Pairs, make_pairs
 from tools.train_models.train_restorer import HELD_OUT, source_of
 
 _GROUPS_PER_BATCH = 8
-_SHOWN = 4  # versions of a group in one batch
-_HARD = {"oversharp": 2.0, "ringing": 2.0}  # shown more often: they look sharper than the clean version
-_TOLERANCE = 0.003  # faulty versions whose LPIPS differ by less are not asked to be in order
-_CLEAN_FIRST = 3.0  # weight of the clean version's place, however small the other's fault
-_TEMPERATURE = 0.03  # of the logistic losses, in LPIPS
+_VERSIONS_PER_GROUP = 4  # versions per group in a batch
+_KIND_WEIGHTS = {
+    "oversharp": 2.0,
+    "ringing": 2.0,
+}  # shown more often, because they look sharper than the clean version
+_TOLERANCE = 0.003  # degraded versions with a smaller difference of LPIPS have no required order
+_CLEAN_ORDER_WEIGHT = 3.0  # weight of the order of the clean and another version, even if the two are close
+_TEMPERATURE = 0.03  # temperature of the logistic losses, in LPIPS
 
 
 class QualityNet(nn.Module):
-    """Predicts LPIPS-to-clean of sRGB images [N, 3, H, W] in [0, 1]; [N], at least 0.
+    """Network that predicts LPIPS to the clean version, [N], from sRGB images [N, 3, H, W] in [0, 1].
 
-    LPIPS compares feature vectors of unit length, so it hardly sees local brightness and contrast. Neither
-    does this network: it gets luminance normalised in a fine and a coarse window, chroma relative to the
-    local contrast, and that contrast's logarithm. Four strided convolutions follow; the mean and deviation of
-    every stage's channels go to a small perceptron.
+    LPIPS compares feature vectors of unit length, so local brightness and contrast have little effect on it.
+    The same holds for this network. Its inputs are luminance normalised in a fine and a coarse window, chroma
+    relative to the local contrast, and the logarithm of that contrast. Four strided convolutions follow. A
+    small perceptron gets the mean and deviation of each stage's channels.
     """
 
     colour: Tensor
@@ -71,14 +73,14 @@ class QualityNet(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.judge(self.statistics(images))
+        return self.distance(self.statistics(images))
 
-    def judge(self, statistics: Tensor) -> Tensor:
-        """The prediction [N] from the statistics of an image [N, F]."""
+    def distance(self, statistics: Tensor) -> Tensor:
+        """Return predicted LPIPS [N], at least 0, from statistics [N, F]."""
         return functional.softplus(self.head(statistics)[:, 0] - 1.5)
 
     def statistics(self, images: Tensor) -> Tensor:
-        """Mean and deviation of every stage's channels. [N, F]"""
+        """Return mean and deviation of each stage's channels [N, F]."""
         x = self._normalised(images)
         statistics = []
         for stage in self.stages:
@@ -101,7 +103,7 @@ class QualityNet(nn.Module):
 
 
 class _Residual(nn.Module):
-    """Depthwise 3x3 and pointwise convolution beside the identity."""
+    """Depthwise 3x3 and pointwise convolution, added to the input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -116,7 +118,7 @@ class _Residual(nn.Module):
 
 
 def _box(x: Tensor, side: int) -> Tensor:
-    """The mean over a square window; in two passes, which costs a tenth of one for the coarse window."""
+    """Return the mean over a square window; two 1D passes take a tenth of the time for the coarse one."""
     rows = functional.avg_pool2d(x, (side, 1), stride=1, padding=(side // 2, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, side), stride=1, padding=(0, side // 2), count_include_pad=False)
 
@@ -136,12 +138,20 @@ def train(
     rate: float = 2e-3,
     head_only: bool = False,
 ) -> QualityNet:
-    """AdamW with a one-cycle rate; ends after ``epochs``, or earlier when ``seconds`` are over.
+    """Train with AdamW and a one-cycle learning rate.
 
-    ``start`` is a checkpoint of an earlier training to resume from (with a rate cycle of its own, which peaks
-    at ``rate``). ``head_only`` leaves the convolutions as they are.
-    Returns the running average of the weights, ready for inference; now and then it is saved to
-    ``checkpoint``.
+    Args:
+        pairs: Training pairs.
+        seconds: Time limit. The learning rate follows the time if it ends before ``epochs``.
+        epochs: Maximum number of epochs.
+        seed: Seed of initial weights and batches.
+        checkpoint: File to which the averaged weights are saved regularly.
+        start: Checkpoint with initial weights; its training starts a new cycle of the learning rate.
+        rate: Peak learning rate.
+        head_only: True to keep the convolutions unchanged.
+
+    Returns:
+        The network with averaged weights, in evaluation mode.
     """
     torch.manual_seed(seed)
     net = QualityNet()
@@ -182,12 +192,14 @@ def _loss(
     predicted: Tensor,  # [G, V]
     targets: Tensor,  # [G, V]
 ) -> Tensor:
-    """Smooth L1, a logistic loss on the order of every two versions of one content, and one on the order of
-    all images of the batch, by how far apart they should be.
+    """Return smooth L1 plus logistic losses on the order of pairs.
+
+    One covers pairs of versions of one content, the other all pairs of the batch, weighted by the difference
+    of their targets.
     """
     regression = functional.smooth_l1_loss(predicted, targets, beta=0.05)
     within = (targets[:, :, None] - targets[:, None, :] > _TOLERANCE).float()
-    within[:, 1:, 0] = _CLEAN_FIRST
+    within[:, 1:, 0] = _CLEAN_ORDER_WEIGHT
     across = (targets.reshape(-1, 1) - targets.reshape(1, -1)).clamp_min(0.0)
     return (
         4.0 * regression + 0.5 * _disorder(predicted, within) + 2.0 * _disorder(predicted.flatten(), across)
@@ -196,27 +208,27 @@ def _loss(
 
 def _disorder(
     predicted: Tensor,  # [..., V]
-    weights: Tensor,  # [..., V, V] how much it matters that the first lies above the second
+    weights: Tensor,  # [..., V, V] importance that the first is above the second
 ) -> Tensor:
     gap = predicted[..., :, None] - predicted[..., None, :]
     return (functional.softplus(-gap / _TEMPERATURE) * weights).sum() / weights.sum().clamp_min(1e-6)
 
 
 def _batches(pairs: Pairs, epochs: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Groups in random order and orientation; of each the clean version and a few of the others."""
+    """Yield batches of groups in random order and orientation: the clean version and some others of each."""
     versions = pairs.targets.shape[1]
-    weights = np.array([_HARD.get(name, 1.0) for name in KIND_NAMES])
+    weights = np.array([_KIND_WEIGHTS.get(name, 1.0) for name in KIND_NAMES])
     for epoch in range(epochs):
         rng = np.random.default_rng([seed, epoch])
         order = rng.permutation(len(pairs.images))
         for start in range(0, len(order) - _GROUPS_PER_BATCH + 1, _GROUPS_PER_BATCH):
             chosen = order[start : start + _GROUPS_PER_BATCH, None]
-            # The hard kinds are shown first (exponential races with their weights as rates).
+            # Hard kinds are drawn more often (exponential races with weights as rates).
             races = (
                 rng.exponential(size=(_GROUPS_PER_BATCH, versions - 1))
                 / weights[pairs.kinds[chosen[:, 0], 1:]]
             )
-            shown = np.argsort(races, axis=1)[:, : _SHOWN - 1] + 1
+            shown = np.argsort(races, axis=1)[:, : _VERSIONS_PER_GROUP - 1] + 1
             shown = np.concatenate([np.zeros_like(shown[:, :1]), shown], axis=1)
             images = torch.from_numpy(pairs.images[chosen, shown]).permute(0, 1, 4, 2, 3).float() / 255.0
             if rng.random() < 0.5:
@@ -238,7 +250,7 @@ def _update_average(average: nn.Module, net: nn.Module, decay: float) -> None:
 
 
 def predict(net: QualityNet, pairs: Pairs) -> NDArray[np.float32]:
-    """The predicted LPIPS of every version. [G, V]"""
+    """Return the predicted LPIPS of every version [G, V]."""
     with torch.inference_mode():
         rows = [
             net(torch.from_numpy(np.array(g)).permute(0, 3, 1, 2).float() / 255.0).numpy()
@@ -248,7 +260,7 @@ def predict(net: QualityNet, pairs: Pairs) -> NDArray[np.float32]:
 
 
 def report(predicted: NDArray[np.float32], pairs: Pairs) -> list[str]:
-    """Lines of a Markdown table: rank agreement with LPIPS, and how often the clean version wins, by kind.
+    """Return a Markdown table by kind: rank agreement with LPIPS, share of correctly ranked clean versions.
 
     ``predicted`` [G, V] is lower for better versions.
     """
@@ -272,12 +284,12 @@ def report(predicted: NDArray[np.float32], pairs: Pairs) -> list[str]:
 
 
 def spearman(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Rank correlation of all elements."""
+    """Return Spearman's rank correlation of all elements."""
     return float(spearmanr(a.ravel(), b.ravel()).statistic)
 
 
 class _Score(nn.Module):
-    """The scale of the tables: 100 - 100 x predicted LPIPS."""
+    """The network with its output scaled as in tables: 100 - 100 x predicted LPIPS."""
 
     def __init__(self, net: QualityNet) -> None:
         super().__init__()
@@ -289,7 +301,7 @@ class _Score(nn.Module):
 
 
 def export(net: QualityNet, path: Path) -> None:
-    """ONNX: input `image` [N, 3, H, W] sRGB in [0, 1], output `score` [N]; N and H, W >= 32 are free."""
+    """Write the scorer as ONNX: input `image` [N, 3, H, W] sRGB in [0, 1], output `score` [N]; H, W >= 32."""
     torch.onnx.export(
         _Score(net).eval(),
         (torch.rand(2, 3, PATCH, PATCH + 32),),
@@ -309,25 +321,28 @@ def export(net: QualityNet, path: Path) -> None:
 )
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
 @click.option(
-    "--hold-out", multiple=True, default=HELD_OUT, show_default=True, help="Photo sources (file prefixes)."
+    "--hold-out",
+    multiple=True,
+    default=HELD_OUT,
+    show_default=True,
+    help="Held-out photo sources (file prefixes).",
 )
-@click.option("--contents", default=16, show_default=True, help="Patches a training photo.")
-@click.option("--versions", default=8, show_default=True, help="Versions of each, the clean one included.")
+@click.option("--contents", default=16, show_default=True, help="Patches per training photo.")
+@click.option("--versions", default=8, show_default=True, help="Versions per patch, the clean one included.")
 @click.option(
-    "--start", type=click.Path(exists=True, path_type=Path), default=None, help="Checkpoint to resume from."
+    "--start",
+    type=click.Path(exists=True, path_type=Path),
+    default=None,
+    help="Checkpoint with initial weights.",
 )
 @click.option("--rate", default=2e-3, show_default=True, help="Peak learning rate.")
-@click.option("--head-only", is_flag=True, help="Leave the convolutions as they are.")
-@click.option(
-    "--graphics", default=0.25, show_default=True, help="Share of contents drawn instead of photographed."
-)
+@click.option("--head-only", is_flag=True, help="Train only the perceptron.")
+@click.option("--graphics", default=0.25, show_default=True, help="Share of drawn images among the contents.")
 @click.option("--epochs", default=6, show_default=True)
-@click.option("--minutes", default=60.0, show_default=True, help="Training ends after so long at the latest.")
+@click.option("--minutes", default=60.0, show_default=True, help="Time limit of the training.")
 @click.option("--threads", default=1, show_default=True)
 @click.option("--seed", default=1, show_default=True)
-@click.option(
-    "--models", type=click.Path(path_type=Path), default=None, help="Model folder with the LPIPS weights."
-)
+@click.option("--models", type=click.Path(path_type=Path), default=None, help="Folder of installed models.")
 def main(
     photos: Path,
     work: Path,
@@ -345,7 +360,7 @@ def main(
     seed: int,
     models: Path | None,
 ) -> None:
-    """Make the pairs, train, report on the held-out photo sources, export."""
+    """Make the pairs, train, print a report on the held-out photo sources, and export."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(1)
     lpips = load_lpips("alex", models)

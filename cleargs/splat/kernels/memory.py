@@ -1,4 +1,4 @@
-"""How much memory is left for buffers."""
+"""Memory that is left for buffers."""
 
 from __future__ import annotations
 
@@ -9,22 +9,24 @@ from pathlib import Path
 
 
 def available_memory(root: Path = Path("/")) -> int:
-    """Bytes that this process may still take without swapping or being killed for it.
+    """Return the number of bytes that this process can allocate without swapping or being killed.
 
-    On Linux what the kernel calls MemAvailable, or less where a control group (a container, a batch job)
-    leaves less; elsewhere all that the machine has; more than any scene needs where nothing tells.
-    ``root`` is where ``proc`` and ``sys`` are looked for.
+    On Linux this is the kernel's MemAvailable, or less if a control group (a container, a batch job) has less
+    left. On other systems it is the memory of the machine, or 2^62 if that is unknown.
+
+    Args:
+        root: Folder that contains ``proc`` and ``sys``.
     """
     machine = 2**62
-    with suppress(AttributeError, OSError, ValueError):  # no sysconf (Windows), or none of these names
+    with suppress(AttributeError, OSError, ValueError):  # Windows has no sysconf, others may lack the names
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if "MemAvailable:" in (fields := _fields(root / "proc/meminfo")):  # kB
         machine = fields["MemAvailable:"] * 1024
-    return min([machine, *_left_in_groups(root)])
+    return min([machine, *_cgroup_headroom(root)])
 
 
-def _left_in_groups(root: Path) -> Iterator[int]:
-    """What is left to each limited memory control group that this process is in, version 1 or 2."""
+def _cgroup_headroom(root: Path) -> Iterator[int]:
+    """Yield the bytes left in each limited memory control group (version 1 or 2) of this process."""
     for line in _read(root / "proc/self/cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers == "":
@@ -33,26 +35,26 @@ def _left_in_groups(root: Path) -> Iterator[int]:
             mount, limit, usage = root / "sys/fs/cgroup/memory", "limit_in_bytes", "usage_in_bytes"
         else:
             continue
-        # A container may see its own group as the mount point, and still be told the path outside.
+        # A container may see its own group as the mount point, while the path is the one outside.
         own = Path(path.lstrip("/"))
         for group in (own, *own.parents):
             allowed, used = (_read(mount / group / f"memory.{name}").strip() for name in (limit, usage))
-            if allowed.isdigit() and used.isdigit():  # "max" where there is no limit
-                # Pages of files count as used but are given back on demand; those of tmpfs are not.
+            if allowed.isdigit() and used.isdigit():  # "max" means no limit
+                # Cached pages of files count as used, but can be freed on demand. Pages of tmpfs cannot.
                 statistics = _fields(mount / group / "memory.stat")
                 cache = statistics.get("file", statistics.get("total_cache", 0))  # version 2, version 1
-                kept = statistics.get("total_shmem", statistics.get("shmem", 0))
-                yield int(allowed) - int(used) + cache - kept
+                tmpfs = statistics.get("total_shmem", statistics.get("shmem", 0))
+                yield int(allowed) - int(used) + cache - tmpfs
 
 
 def _fields(file: Path) -> dict[str, int]:
-    """The lines "name number ..." of a file."""
+    """Return the lines "name number" of a file as a dictionary."""
     rows = (line.split() for line in _read(file).splitlines())
     return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdigit()}
 
 
 def _read(file: Path) -> str:
-    """The text of a file; nothing where there is none that can be read."""
+    """Return the text of a file, or an empty string if it cannot be read."""
     try:
         return file.read_text(encoding="ascii", errors="replace")
     except OSError:

@@ -1,4 +1,4 @@
-"""What the rasterisers of both back ends share: interface, reusable buffers, limit on memory."""
+"""Base of the rasterisers of both back ends: interface, reusable buffers, memory limit."""
 
 from __future__ import annotations
 
@@ -21,33 +21,39 @@ from cleargs.splat.scene import Scene
 from cleargs.splat.types import Render
 
 UNCHECKED_BYTES = 2**28
-"""Bytes that are taken without asking how many are left, which takes about a millisecond."""
+"""Bytes that are allocated without a check of the free memory, which takes about a millisecond."""
 
 
 def sh_count(gaussians: Gaussians, sh_degree: int | None) -> int:
-    """Number of SH coefficients that a degree uses; None means all that are stored.
+    """Return the number of SH coefficients per channel that a degree uses.
+
+    Args:
+        gaussians: Gaussians with 1, 4, 9 or 16 coefficients.
+        sh_degree: SH degree from 0 to 3; None for the stored one.
 
     Raises:
-        InputError: when the degree is negative or above what is stored.
+        InputError: If the degree is negative or above the stored one.
     """
     if sh_degree is None:
         return int(gaussians.sh.shape[1])
     if not 0 <= sh_degree <= gaussians.sh_degree:
         raise InputError(
-            f"SH degree {sh_degree} is asked for, the Gaussians store degree {gaussians.sh_degree}",
+            f"SH degree {sh_degree} is not available: the Gaussians store degree {gaussians.sh_degree}",
             hint=f"use a degree from 0 to {gaussians.sh_degree}",
         )
     return next(count for count, degree in SH_DEGREES.items() if degree == sh_degree)
 
 
 def tiles_of(camera: Camera) -> int:
-    """Number of tiles of an image."""
+    """Return the number of tiles of an image."""
     return -(-camera.width // TILE) * -(-camera.height // TILE)
 
 
 def view_numbers(camera: Camera) -> list[float]:
-    """A camera as the kernels read it: rotation rows and translation from the world to it, centre,
-    intrinsics, and gsplat's bounds of x/z and y/z in the Jacobian (left, right, top, bottom).
+    """Return a camera as the 23 numbers that the kernels read.
+
+    They are the rows of the world-to-camera rotation, its translation, the camera's centre in the world, fx,
+    fy, cx and cy in px, and the bounds of x/z and y/z in the Jacobian (left, right, top, bottom; gsplat's).
     """
     pose = camera.world_to_camera
     beyond_x = VIEW_CLAMP * 0.5 * camera.width / camera.fx
@@ -66,21 +72,21 @@ def view_numbers(camera: Camera) -> list[float]:
 
 
 class Buffers:
-    """Named memory on a device that grows and is used again; contents are undefined when taken."""
+    """Named memory on a device that is reused and grows. Its contents are undefined when it is taken."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.memory: dict[str, Tensor] = {}
 
     def take(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        """A contiguous tensor of this shape in the memory called ``name``."""
+        """Return a contiguous tensor of this shape in the memory called ``name``."""
         size = 1
         for side in shape:
             size *= side
         memory = self.memory.get(name)
         if memory is None or memory.numel() < size or memory.dtype != dtype:
-            # A quarter more than asked for, so that slow growth does not allocate at every step. What was
-            # there is given back first: it need not fit beside what replaces it.
+            # A quarter more than needed, so that slow growth does not allocate at every step. The old memory
+            # is freed first, so that both need not fit at once.
             grows = memory is not None
             self.memory.pop(name, None)
             del memory
@@ -88,14 +94,14 @@ class Buffers:
             self.memory[name] = memory
         return memory[:size].view(shape)
 
-    def held(self, names: Iterable[str]) -> int:
-        """Bytes of the memory called so."""
+    def allocated_bytes(self, names: Iterable[str]) -> int:
+        """Return the size of the memory with these names."""
         return sum(self.memory[name].nbytes for name in names if name in self.memory)
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardPass:
-    """What the backward pass needs of one forward pass; each back end adds its own."""
+    """State of a forward pass that the backward pass needs; each back end adds its own."""
 
     gaussians: Gaussians
     camera: Camera
@@ -104,26 +110,26 @@ class ForwardPass:
 
 
 class Rasteriser(ABC):
-    """Renders float32 Gaussians and differentiates the picture, with buffers kept from call to call.
+    """Renderer of float32 Gaussians with gradients, which reuses its buffers.
 
-    Everything returned is a view into these buffers and valid until the next call of the same method.
+    Returned tensors are views into these buffers: they are valid until the next call of the same method.
     Results are bitwise the same for any number of threads, and from run to run on one GPU.
     """
 
     pair_buffers: ClassVar[tuple[str, ...]]
-    """The buffers that grow with the (tile, splat) pairs."""
+    """Names of the buffers that grow with the number of (tile, splat) pairs."""
     pair_bytes: ClassVar[int]
-    """What a pair takes in them, and for a while beside them."""
+    """Bytes per pair in these buffers and in temporary memory."""
 
     def __init__(self, device: torch.device) -> None:
         self._buffers = Buffers(device)
         self._state: Any = None
         self.radii: Tensor = torch.empty(0, device=device)
-        """[N] px, 0 = not visible; of the last forward pass."""
+        """Radius of each splat in the last view, [N] px; 0 = not visible."""
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool: the Gaussians that reach alpha 1/255 at a pixel's tile in the last view."""
+        """Gaussians that reach alpha 1/255 in a tile of the last view, [N] bool."""
         return self.radii > 0
 
     def forward(
@@ -136,18 +142,30 @@ class Rasteriser(ABC):
         antialias: bool = False,
         depth: bool = False,
     ) -> Render:
-        """Render a view; ``depth`` is None unless asked for. The arguments are those of ``render``.
+        """Render a view.
 
         The parameters are read in place: do not change them between ``forward`` and ``backward``.
 
+        Args:
+            gaussians: Float32 Gaussians on the rasteriser's device.
+            camera: Camera of the view.
+            sh_degree: Largest SH degree in use; None for the stored one.
+            background: Colour behind the Gaussians, sRGB.
+            antialias: Apply the opacity compensation of Mip-Splatting.
+            depth: Render the accumulated depth, too.
+
+        Returns:
+            Image, alpha and depth as `cleargs.splat.render.render` returns them; the depth is None without
+            ``depth``.
+
         Raises:
-            InputError: when the parameters are not float32 or the SH degree is not stored.
-            StageError: when there are more (tile, splat) pairs than 2^31 - 1, or than fit in memory.
+            InputError: If the parameters are not float32 or the SH degree is not stored.
+            StageError: If there are more than 2^31 - 1 (tile, splat) pairs, or more than fit in memory.
         """
         if gaussians.means.dtype != torch.float32:
             raise InputError(
-                f"the kernels take float32 parameters, not {gaussians.means.dtype}",
-                hint="convert each of the five with .float()",
+                f"the kernels need float32 parameters, but these are {gaussians.means.dtype}",
+                hint="convert each of the five parameters with .float()",
             )
         inputs = ForwardPass(gaussians.detach(), camera, sh_count(gaussians, sh_degree), antialias)
         with self._launching():
@@ -157,7 +175,7 @@ class Rasteriser(ABC):
     def view(
         self, scene: Scene, camera: Camera, *, depth: bool = False, sh_degree: int | None = None
     ) -> Render:
-        """Render a view as the scene is meant to be rendered; see `forward`."""
+        """Render a view with the background and anti-aliasing of the scene; see `forward`."""
         return self.forward(
             scene.gaussians,
             camera,
@@ -173,12 +191,21 @@ class Rasteriser(ABC):
         grad_alpha: Tensor | None = None,  # [H, W]
         grad_depth: Tensor | None = None,  # [H, W]
     ) -> Gaussians:
-        """Gradients of the five parameters of the last ``forward``.
+        """Return the gradients of the five parameters of the last ``forward``.
 
         Gaussians that are not visible, and SH coefficients above the degree in use, get exactly 0.
+
+        Args:
+            grad_image: Gradient of the loss with respect to the image.
+            grad_alpha: The same for alpha; None for zeros.
+            grad_depth: The same for the accumulated depth; None for zeros.
+
+        Raises:
+            RuntimeError: If there was no ``forward`` before.
+            ValueError: If ``grad_image`` does not have the shape of the image.
         """
         if self._state is None:
-            raise RuntimeError("backward() needs a forward() before it")
+            raise RuntimeError("backward() needs a call of forward() before it")
         camera: Camera = self._state.camera
         expected = (camera.height, camera.width, 3)
         if tuple(grad_image.shape) != expected:
@@ -193,7 +220,7 @@ class Rasteriser(ABC):
 
     @abstractmethod
     def _launching(self) -> AbstractContextManager[Any]:
-        """What surrounds the kernels of a pass."""
+        """Return the context in which the kernels of a pass run."""
 
     @abstractmethod
     def _bin(self, inputs: ForwardPass, background: tuple[float, float, float], depth: bool) -> ForwardPass:
@@ -207,19 +234,19 @@ class Rasteriser(ABC):
     def _differentiate(
         self, state: Any, grad_image: Tensor, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> Gaussians:
-        """Gradients of the parameters, from contiguous ones of what was rendered."""
+        """Return the gradients of the parameters; those of the outputs are contiguous."""
 
     def _require_memory(self, pairs: int, camera: Camera) -> None:
-        """Raise StageError when this many pairs cannot be numbered, or their buffers would not fit."""
-        missing = pairs * self.pair_bytes - self._buffers.held(self.pair_buffers)
+        """Raise StageError if there are too many pairs to number, or if their buffers would not fit."""
+        missing = pairs * self.pair_bytes - self._buffers.allocated_bytes(self.pair_buffers)
         if pairs > MAX_PAIRS:
-            excess = f"more than {MAX_PAIRS:.2e}"
+            excess = f"more than the limit of {MAX_PAIRS:.2e}"
         elif missing > UNCHECKED_BYTES and missing > available_memory(self._buffers.device):
             excess = f"more than fit: they need another {missing / 1e9:.1f} GB of the device's memory"
         else:
             return
         raise StageError(
-            f"{int(self.visible.sum())} Gaussians touch {pairs:.2e} (tile, splat) pairs at "
+            f"{int(self.visible.sum())} Gaussians give {pairs:.2e} (tile, splat) pairs at "
             f"{camera.width}x{camera.height}, {excess}",
             hint="lower the resolution or the number of Gaussians, or check for exploded scales",
         )

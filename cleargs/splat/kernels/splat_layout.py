@@ -5,8 +5,8 @@ projected covariance Σ and d = pixel centre - projected mean,
 
     ½ dᵀ Σ⁻¹ d = ½ [ a (dx - k dy)² + e dy² ],   a = Σyy / det Σ,   k = Σxy / Σyy,   e = 1 / Σyy,
 
-a sum of two non-negative terms, so float32 does not cancel on needles as it does in the usual
-A dx² + 2 B dx dy + C dy². The logarithm of alpha, to base 2, is then
+a sum of two non-negative terms. In float32, the usual A dx² + 2 B dx dy + C dy² loses its digits to
+cancellation on needles; this sum does not. The logarithm of alpha, to base 2, is then
 
     log2 alpha = LOG2_OPACITY - BEND_X (dx - SKEW dy)² - BEND_Y dy²,
 
@@ -19,7 +19,7 @@ from __future__ import annotations
 MEAN_X = 0  # px
 MEAN_Y = 1  # px
 BEND_X = 2  # px⁻²
-SKEW = 3  # horizontal shift of the ellipse's ridge per row
+SKEW = 3  # horizontal shift per row of the ellipse's ridge, where alpha is largest
 BEND_Y = 4  # px⁻²
 LOG2_OPACITY = 5  # anti-aliasing compensation included
 RED = 6
@@ -27,7 +27,7 @@ GREEN = 7
 BLUE = 8
 DEPTH = 9  # camera z
 EXTENT_X = 10  # px, half width of the ellipse alpha = 1/255
-EXTENT_Y = 11  # px, half height of it
+EXTENT_Y = 11  # px, half height of this ellipse
 EXTENT_X_AT = 12  # px, dy of its rightmost point
 SPLAT_COLUMNS = 16
 
@@ -38,15 +38,15 @@ SUM_VY = 2
 SUM_VUU = 3
 SUM_VUY = 4
 SUM_VYY = 5
-SUM_RED = 6  # of w dL/d(red of the pixel)
+SUM_RED = 6  # w dL/d(red of the pixel)
 SUM_GREEN = 7
 SUM_BLUE = 8
 SUM_DEPTH = 9
 PAIR_COLUMNS = 10
 
 TILE = 16
-"""Width and height of a tile, px; a power of two."""
+"""Width and height of a tile in px, a power of two."""
 TILE_PIXELS = TILE * TILE
 
 MAX_PAIRS = 2**31 - 1
-"""(tile, splat) pairs are numbered with 32 bits."""
+"""Largest number of (tile, splat) pairs: they are numbered with signed 32-bit integers."""

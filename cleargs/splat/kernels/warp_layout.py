@@ -1,4 +1,4 @@
-"""What both back ends' frame warps agree on: images, fields, curves, and a frame's motion in numbers."""
+"""Data layouts of both back ends' frame warps: images, fields, curves and the motion of a frame."""
 
 from __future__ import annotations
 
@@ -7,36 +7,36 @@ from typing import NamedTuple
 from torch import Tensor
 
 CHANNELS = 4
-"""Of an image in linear light: RGB and one of padding, so that a pixel is read at once."""
+"""Channels of an image in linear light: RGB and one of padding, so that one load reads a pixel."""
 
 CURVE_LAST = 2.0
 CURVE_STEPS = 8192
 CURVE_DENSITY = CURVE_STEPS / CURVE_LAST
-"""The curves between sRGB and linear light are tables of so many steps from 0 to `CURVE_LAST`, with straight
-lines between them and beyond: within 2e-5 of the formulas, and their derivative is exact."""
+"""The curves between sRGB and linear light are tables of `CURVE_STEPS` steps from 0 to `CURVE_LAST`, with
+straight lines between and beyond. They are within 2e-5 of the formulas, and their derivative is exact."""
 
 MIN_COVERED = 0.5
-"""Alpha from which a pixel has a depth."""
+"""A pixel has a depth if its alpha is above this."""
 MAX_NEARNESS = 4.0
-"""Of a pixel, as a multiple of the median one: what floats before the lens would move by whole images."""
+"""Largest nearness (median depth / depth) of a pixel: floaters near the lens would move by whole images."""
 
-# A frame's motion as the kernels read it: a row of float32, lengths in pixels of the photograph.
+# A frame's motion as the kernels read it: a row of float32, lengths in pixels of the observed image.
 FX = 0
 FY = 1
 CX = 2
 CY = 3
-MEDIAN = 4  # depth
-DISC = 5  # radius per unit of nearness
-FOCUS = 6  # nearness
-TWISTS = 7  # pose, blur and skew, six numbers each
+MEDIAN = 4  # median depth, scene units
+DISC = 5  # radius of the defocus disc per unit of nearness
+FOCUS = 6  # nearness that is in focus
+TWISTS = 7  # pose, blur and skew: translation and rotation, six numbers each
 MOTION_COLUMNS = 25
 
 
 class DisplacementFields(NamedTuple):
-    """Where the pixels of a photograph look while they are exposed, in px, x before y: see the kernels."""
+    """Displacements of an observed image's pixels in px, x before y; ``frame_warp`` has the formula."""
 
-    offset: Tensor  # [2, H, W]
-    sweep: Tensor  # [2, H, W]
-    radius: Tensor  # [H, W]
+    offset: Tensor  # [2, H, W] at the middle of the exposure
+    sweep: Tensor  # [2, H, W] over the exposure
+    radius: Tensor  # [H, W] of the defocus disc
     reach: float | None = None
-    """Farthest that a pixel looks up or down; None where it is not known."""
+    """Largest vertical displacement, px; None if it is unknown."""

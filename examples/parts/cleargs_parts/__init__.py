@@ -1,1 +1,1 @@
-"""Parts that ClearGS finds through the entry points in pyproject.toml: a file a part."""
+"""Plugins that ClearGS finds through the entry points in pyproject.toml, one per file."""

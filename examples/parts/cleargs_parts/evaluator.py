@@ -1,4 +1,4 @@
-"""An evaluator: rva.evaluator=contrast judges sharpness and motion blur by the contrast of fine detail."""
+"""An evaluator: rva.evaluator=contrast rates sharpness and motion blur by the contrast of fine detail."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from cleargs.rva.tables import CUE_COLUMNS
 
 
 class ContrastEvaluator:
-    """Made anew for a run. ``cache`` is a folder for what was found out about single frames, or None."""
+    """Created once per run. ``cache`` is a folder for results of single frames, or None."""
 
     name, version = "contrast", 1
 
@@ -26,7 +26,7 @@ class ContrastEvaluator:
         detail = np.array([self._detail(view) for view in views])
         sharp = detail / max(detail.max(initial=0.0), 1e-9)
         good = [name.startswith("r_") for name in CUE_COLUMNS]
-        cues = np.tile(np.where(good, 1.0, 0.0), (len(views), 1))  # what is not judged is flawless
+        cues = np.tile(np.where(good, 1.0, 0.0), (len(views), 1))  # other cues get the best value
         cues[:, CUE_COLUMNS.index("r_sharpness")] = sharp
         cues[:, CUE_COLUMNS.index("b_motion_blur")] = 1.0 - sharp
         return cues

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 
 class UnsharpMask:
-    """Made for a device, "cpu" or "cuda"."""
+    """Created for a device, "cpu" or "cuda"."""
 
     name, digest = "unsharp", "1"
 
@@ -14,7 +14,7 @@ class UnsharpMask:
 
     def restore(
         self,
-        image: NDArray[np.float32],  # [H, W, 3] sRGB in [0, 1], as is what is returned
+        image: NDArray[np.float32],  # [H, W, 3] sRGB in [0, 1], like the result
         *,
         threads: int = 1,
     ) -> NDArray[np.float32]:

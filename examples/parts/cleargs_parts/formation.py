@@ -1,6 +1,6 @@
-"""A formation model: what a camera does to a sharp image, here a vignette whose strength is learned.
+"""A model of image formation: a vignette whose strength is learned.
 
-It is given to a training: cg.train(scene, views, config, formation=Vignette()). No setting names it.
+Pass it to a training: cg.train(scene, views, config, formation=Vignette()). No setting selects it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from cleargs.splat.views import TrainingView
 
 
 class Vignette:
-    """Fulfils `cleargs.splat.formation.Formation`: the photograph is (1 - strength r²) times the render."""
+    """A `cleargs.splat.formation.Formation`: the observed image is (1 - strength r²) times the render."""
 
     def __init__(self, strength: float = 0.0, rate: float = 0.05) -> None:
         self.strength, self.rate = strength, rate
@@ -41,12 +41,12 @@ class Vignette:
         self.strength = float(state["strength"])
 
     def fault(self) -> str | None:
-        return None if abs(self.strength) < 1.0 else "the vignette has run away"
+        return None if abs(self.strength) < 1.0 else "the strength of the vignette diverged"
 
 
 @dataclass
 class VignettedView:
-    """Fulfils `cleargs.splat.formation.Formed`: one step on one view."""
+    """A `cleargs.splat.formation.Formed`: one training step on one view."""
 
     vignette: Vignette
     camera: Camera
@@ -60,7 +60,7 @@ class VignettedView:
         return render.image * (1.0 - self.vignette.strength * self._far)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        # A sum that a parameter depends on: in float64 on one thread, by NumPy, the same for any threads.
+        # NumPy sums in float64 on one thread, so the result does not depend on the number of threads.
         product = (gradient * self._image * self._far).numpy().astype("float64")
         self._slope = -float(product.sum())
         return gradient * (1.0 - self.vignette.strength * self._far)

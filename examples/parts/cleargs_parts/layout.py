@@ -1,4 +1,4 @@
-"""An input layout: ingest.layout=listed takes the images that list.txt in the input names, a name a line."""
+"""An input layout: ingest.layout=listed reads the images that list.txt in the input names, one per line."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,12 +10,12 @@ from cleargs.errors import InputError
 
 
 def externals(source: Path, config: CaptureConfig) -> Mapping[str, External]:
-    """All files that are read: their content is in the key of the stage."""
+    """Return all files that are read; the key of the stage depends on their content."""
     return {"list": source / "list.txt", "images": {name: source / name for name in _names(source)}}
 
 
 def open_capture(source: Path, config: CaptureConfig) -> Capture:
-    """Frames without cameras and poses, which SfM then finds; a SourceFrame may bring both."""
+    """Return frames without cameras and poses, which SfM then estimates; a SourceFrame may have both."""
     names = _names(source)
     frames = tuple(SourceFrame(name, source / name) for name in spread(names, config.max_frames))
     return Capture("listed", frames, len(names))

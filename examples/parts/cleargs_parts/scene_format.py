@@ -1,4 +1,4 @@
-"""An export format: `cleargs export RUN -o room.csv` writes the places of the Gaussians as text."""
+"""An export format: `cleargs export RUN -o room.csv` writes the positions of the Gaussians as text."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from cleargs.splat.scene import Scene
 
 
 def write_csv(path: Path, scene: Scene) -> None:
-    """Called with the scene turned to the axes of the format; the file is to appear whole."""
+    """Write a scene that was rotated to the axes of the format; the file must appear in one step."""
     rows = (",".join(f"{value:.6g}" for value in row) for row in scene.gaussians.means.tolist())
     write_bytes(path, "\n".join(["x,y,z", *rows, ""]).encode())
 

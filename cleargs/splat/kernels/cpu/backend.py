@@ -1,4 +1,7 @@
-"""The CPU's part of `cleargs.splat.backend.Backend`: tensors in, Numba kernels inside."""
+"""CPU implementation of `cleargs.splat.backend.Backend`: torch tensors in and out, Numba kernels inside.
+
+`Backend` documents the functions.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from cleargs.splat.types import Moments, Rate
 from cleargs.types import AnyArray, ArrayF32
 
 ADAM_BLOCK = 4096
-"""Elements per work item, about."""
+"""Approximate number of elements per work item."""
 
 
 def rasteriser(device: torch.device) -> CpuRasteriser:
@@ -43,7 +46,7 @@ def loss_sums(
 ) -> Tensor:
     shape = (image.shape[0], loss.padded_length(image.shape[1]))
     padded, padded_target, counted = (np.empty(shape, np.float32) for _ in range(3))
-    # The kernels read maps between the padding only, so what is there need not be set.
+    # No kernel reads the padding of the maps, so it need not be set.
     maps = np.empty((3, *shape), np.float32)
     row_sums = np.empty((shape[0], 3), np.float64)
     window = loss.ssim_window()
@@ -254,6 +257,7 @@ def misfit(
     samples: ArrayF32,  # [K, 3]
     limit: float,
 ) -> float:
+    """Return the sum over all rows of `frame_warp.misfits`; ``fields`` are offset, sweep and radius in px."""
     rows = np.empty(len(image))
     with LAUNCHING:
         frame_warp.misfits(image, observed, weight, *fields, samples, limit, rows)
@@ -266,12 +270,13 @@ def normal_equations(
     weight: ArrayF32,  # [H, W]
     basis: ArrayF32,  # [6, 2, H, W]
     down: ArrayF32,  # [H]
-    offset: ArrayF32,
-    sweep: ArrayF32,
+    offset: ArrayF32,  # [2, H, W]
+    sweep: ArrayF32,  # [2, H, W]
     times: ArrayF32,  # [K]
     outlier: float,
     active: npt.NDArray[np.int64],  # [A]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return the matrix [A, A] and right side [A] of the equations of `frame_warp.normal_equations`."""
     height, count = len(observed), len(active)
     matrices, sides = np.empty((height, count, count)), np.empty((height, count))
     with LAUNCHING:
@@ -285,14 +290,15 @@ def normal_equations(
 # -- compiling ahead of use ------------------------------------------------------------------------------
 
 SIZE = 16
-"""Of the tiny images on which `warm_up` runs the kernels."""
+"""Width and height of the tiny images on which `warm_up` runs the kernels."""
 
 
 def warm_up() -> None:
-    """Run every kernel with the types that a training has, in the order of its steps; the backward pass with
-    and without alpha and depth.
+    """Run every kernel with the types of a training, in the order of its steps.
+
+    The backward pass runs with and without alpha and depth, because Numba compiles each case separately.
     """
-    scene = Gaussians(  # one that is grey, in front of the camera
+    scene = Gaussians(  # one grey Gaussian in front of the camera
         means=torch.tensor([[0.0, 0.0, 2.0]]),
         log_scales=torch.full((1, 3), -2.0),
         rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -321,7 +327,7 @@ def warm_up() -> None:
 
 
 def _warm_up_formation() -> None:
-    """What a moving camera makes of an image, and the search for its motion."""
+    """Run the kernels of image formation and of the search for a frame's motion."""
     plane, colours = torch.ones(SIZE, SIZE), torch.zeros(SIZE, SIZE, CHANNELS)
     curve, still = torch.zeros(CURVE_STEPS + 1), torch.ones(MOTION_COLUMNS)
     _, slope = through_curve(colours, curve, CHANNELS)

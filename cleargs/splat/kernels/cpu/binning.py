@@ -1,12 +1,12 @@
-"""Which splats touch which tile, in depth order.
+"""List the splats that touch each tile, in depth order.
 
-Depths are sorted once (radix sort, stable, so ties go by index); a stable two-pass counting sort by tile
-then leaves every tile's splats in depth order. No sort over pairs is needed and the result does not
+Depths are sorted once, by a stable radix sort (ties go by index). A stable two-pass counting sort by tile
+then leaves the splats of every tile in depth order. Pairs are not sorted by depth, and the result does not
 depend on how the work is split.
 
-Pairs are numbered twice: *Gaussian-major* (all pairs of Gaussian 0, of Gaussian 1, ...), where the
-backward pass leaves its sums, and *tile-major*, the order of rasterisation. ``pair_slots`` leads from
-the second to the first.
+Pairs are numbered in two orders. The backward pass stores its sums in *Gaussian-major* order: all pairs of
+Gaussian 0, of Gaussian 1, ... Rasterisation uses *tile-major* order. ``pair_slots`` maps the second to the
+first.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from cleargs.splat.kernels.cpu.jit import exact, kernel, serial_kernel
 from cleargs.types import AnyArray, ArrayF32
 
 REACH_MARGIN = 2e-3
-"""Ellipses are taken larger by this much in log2(alpha); the rasteriser decides pixel by pixel."""
+"""Enlargement of the ellipses in log2(alpha); the rasteriser makes the final decision per pixel."""
 
 LOG2_ALPHA_CUT = constants.LOG2_ALPHA_CUT - REACH_MARGIN
 PIXEL_CENTRE = constants.PIXEL_CENTRE
 BLOCK = 256
+"""Gaussians per work item."""
 RADIX_BITS = 11
 RADIX = 1 << RADIX_BITS
 RADIX_PASSES = 3
@@ -34,8 +35,8 @@ RADIX_PASSES = 3
 
 @exact
 def tile_range(low: float, high: float, tiles: int) -> tuple[int, int]:
-    """Tiles [begin, end) that hold a pixel centre of the interval [low, high] px; empty when begin == end."""
-    # Bounded as floats first: the conversion of huge numbers to integers is undefined.
+    """Return the tiles [begin, end) with a pixel centre in [low, high] px; none if begin == end."""
+    # Clamped as floats first: the conversion of huge numbers to integers is undefined.
     limit = np.float64(tiles * layout.TILE)
     first = min(max(np.ceil(low - PIXEL_CENTRE), 0.0), limit)
     last = min(max(np.floor(high - PIXEL_CENTRE), -1.0), limit - 1.0)
@@ -46,7 +47,7 @@ def tile_range(low: float, high: float, tiles: int) -> tuple[int, int]:
 
 @exact
 def tile_rows(splat: ArrayF32, height: int) -> tuple[int, int]:
-    """Rows of tiles that the ellipse alpha >= 1/255 may touch."""
+    """Return the rows of tiles [begin, end) that the ellipse alpha >= 1/255 may touch."""
     mean = np.float64(splat[layout.MEAN_Y])
     extent = np.float64(splat[layout.EXTENT_Y]) * 1.001 + 0.001
     return tile_range(mean - extent, mean + extent, (height + layout.TILE - 1) // layout.TILE)
@@ -54,11 +55,11 @@ def tile_rows(splat: ArrayF32, height: int) -> tuple[int, int]:
 
 @exact
 def tile_columns(splat: ArrayF32, row: int, width: int) -> tuple[int, int]:
-    """Tiles of one row of tiles that the ellipse alpha >= 1/255 touches.
+    """Return the tiles [begin, end) of one row of tiles that the ellipse alpha >= 1/255 touches.
 
-    Within the band of pixel centres the right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave, so
-    it is largest at the ellipse's rightmost point, or at the band's nearest line to it; the left edge
-    is its mirror image.
+    The right edge x(dy) = k dy + sqrt((t - e dy²) / a) is concave. Within the row's band of pixel centres it
+    is therefore largest at the ellipse's rightmost point, or at the line of the band nearest to it. The left
+    edge is its mirror image.
     """
     extent = np.float64(splat[layout.EXTENT_Y]) * 1.001 + 0.001
     at = np.float64(splat[layout.EXTENT_X_AT])
@@ -78,7 +79,7 @@ def tile_columns(splat: ArrayF32, row: int, width: int) -> tuple[int, int]:
 
 @exact
 def count_tiles(splat: ArrayF32, width: int, height: int) -> int:
-    """Number of tiles that a splat touches; must agree with ``list_pairs``."""
+    """Return the number of tiles that a splat touches; must agree with ``list_pairs``."""
     count = 0
     top, bottom = tile_rows(splat, height)
     for row in range(top, bottom):
@@ -89,7 +90,7 @@ def count_tiles(splat: ArrayF32, width: int, height: int) -> int:
 
 @serial_kernel
 def pair_ranges(tile_counts: AnyArray, pair_offsets: AnyArray) -> int:
-    """Prefix sum of the tile counts [N] into Gaussian-major offsets [N + 1]; returns how many are visible."""
+    """Write prefix sums of the tile counts [N] as offsets [N + 1]; return the number of visible Gaussians."""
     total = 0
     visible = 0
     for g in range(tile_counts.shape[0]):
@@ -102,10 +103,10 @@ def pair_ranges(tile_counts: AnyArray, pair_offsets: AnyArray) -> int:
 
 @serial_kernel
 def depth_order(splats: ArrayF32, tile_counts: AnyArray, keys: AnyArray, ids: AnyArray) -> int:
-    """Visible Gaussians by ascending depth, ties by index.
+    """Sort the visible Gaussians by ascending depth, ties by index.
 
     Positive floats sort like their bit patterns, so three passes of 11 bits are a full sort.
-    ``keys`` and ``ids`` are [2, visible] uint32 scratch; returns which row of ``ids`` holds the order.
+    ``keys`` and ``ids`` are [2, visible] uint32 scratch. Returns the row of ``ids`` that holds the order.
     """
     histogram = np.zeros((RADIX_PASSES, RADIX), np.int64)
     mask = np.uint32(RADIX - 1)
@@ -142,7 +143,7 @@ def depth_order(splats: ArrayF32, tile_counts: AnyArray, keys: AnyArray, ids: An
 def list_pairs(
     splats: ArrayF32, pair_offsets: AnyArray, width: int, height: int, pair_tiles: AnyArray
 ) -> None:
-    """The tile of every pair [P], Gaussian-major, row by row."""
+    """Write the tile of every pair [P] in Gaussian-major order, row by row."""
     n = splats.shape[0]
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -160,19 +161,18 @@ def list_pairs(
 
 @kernel
 def sort_pairs_by_tile(
-    order: AnyArray,
-    pair_offsets: AnyArray,
-    pair_tiles: AnyArray,
-    counts: AnyArray,
-    tile_offsets: AnyArray,
-    pair_ids: AnyArray,
-    pair_slots: AnyArray,
+    order: AnyArray,  # [visible] Gaussians by depth
+    pair_offsets: AnyArray,  # [N + 1]
+    pair_tiles: AnyArray,  # [P]
+    counts: AnyArray,  # [chunks, tiles] scratch
+    tile_offsets: AnyArray,  # [tiles + 1], written
+    pair_ids: AnyArray,  # [P], written: Gaussian of each pair
+    pair_slots: AnyArray,  # [P], written: Gaussian-major number of each pair
 ) -> None:
-    """Stable counting sort of the pairs, visited in depth order, by tile.
+    """Sort the pairs by tile with a stable counting sort that visits them in depth order.
 
-    ``counts`` is [chunks, tiles] scratch; each chunk takes an equal part of ``order``, and the result
-    does not depend on how many there are. Tile ``t`` owns ``tile_offsets[t]`` to ``[t + 1]`` of
-    ``pair_ids`` (the Gaussian) and ``pair_slots`` (the pair's Gaussian-major number).
+    Each chunk of ``counts`` handles an equal part of ``order``; the result does not depend on their number.
+    The pairs of tile ``t`` are ``tile_offsets[t]`` to ``tile_offsets[t + 1]`` of the last two arrays.
     """
     chunks, tiles = counts.shape
     n = order.shape[0]

@@ -1,7 +1,7 @@
-"""Kernels of one pass over numbers, pixels or Gaussians: Adam, affine colour, noise on the means.
+"""Kernels that visit each number, pixel or Gaussian once: Adam, affine colour, noise on the means.
 
-The draws of the noise come from a counter (SplitMix64, Steele et al. 2014) and not from a stream, so that
-they depend on no number of threads.
+Random numbers come from a counter (SplitMix64, Steele et al. 2014) instead of a stream, so that they do not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from cleargs.types import AnyArray, ArrayF32
 ONE = np.float32(1)
 BLOCK = 256
 """Gaussians per work item."""
+# The constants of SplitMix64.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _UNIT = 2.0**-32
@@ -35,11 +36,11 @@ def adam(
     epsilon: np.float32,
     root_correction: np.float32,
 ) -> None:
-    """Update ``parameter`` [n] and its moments [n] in place.
+    """Update ``parameter`` [n] and its moments [n] in place by a step of Adam (Kingma and Ba 2015).
 
-    ``rates`` holds the step sizes of one block, already divided by 1 - beta1^t, and is used again for
-    every block of that length; ``root_correction`` is sqrt(1 - beta2^t). The block is the unit of work,
-    so that the arithmetic of an element does not depend on the number of threads.
+    ``rates`` are the step sizes of one block, divided by 1 - beta1^t; they are the same for every block.
+    ``root_correction`` is sqrt(1 - beta2^t). The block is the work item, so that the arithmetic of an element
+    does not depend on the number of threads.
     """
     n, block = parameter.shape[0], rates.shape[0]
     for index in prange((n + block - 1) // block):
@@ -56,7 +57,7 @@ def adam(
 
 @kernel
 def apply_affine(image: ArrayF32, affine: ArrayF32, output: ArrayF32) -> None:
-    """output = affine[:, :3] image + affine[:, 3] for every pixel; images [H, W, 3], affine [3, 4]."""
+    """Write affine[:, :3] image + affine[:, 3] for every pixel; images [H, W, 3], affine [3, 4]."""
     height, width, _ = image.shape
     for y in prange(height):
         for x in range(width):
@@ -70,7 +71,7 @@ def apply_affine(image: ArrayF32, affine: ArrayF32, output: ArrayF32) -> None:
 def affine_backward(
     image: ArrayF32, affine: ArrayF32, grad_output: ArrayF32, grad_image: ArrayF32, row_sums: AnyArray
 ) -> None:
-    """grad_image = affine[:, :3]ᵀ grad_output, and each row's share of dL/d(affine) [H, 3, 4] float64."""
+    """Write affine[:, :3]ᵀ grad_output, and each row's share of dL/d(affine), [H, 3, 4] float64."""
     height, width, _ = image.shape
     for y in prange(height):
         row_sums[y] = 0.0
@@ -89,7 +90,7 @@ def affine_backward(
 
 @device
 def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
-    """64 random bits: number ``count`` of the sequence that ``key`` names."""
+    """Return 64 random bits: number ``count`` of the sequence with this key."""
     bits = key + (count + np.uint64(1)) * _GOLDEN
     bits = (bits ^ (bits >> np.uint64(30))) * _FIRST
     bits = (bits ^ (bits >> np.uint64(27))) * _SECOND
@@ -98,7 +99,7 @@ def random_bits(key: np.uint64, count: np.uint64) -> np.uint64:
 
 @device
 def normal_pair(key: np.uint64, count: np.uint64) -> tuple[float, float]:
-    """Two independent normal draws (Box and Muller 1958), at most 6.8 standard deviations."""
+    """Return two independent normal numbers (Box and Muller 1958), at most 6.8 standard deviations."""
     bits = random_bits(key, count)
     length = math.sqrt(-2.0 * math.log((np.float64(bits >> np.uint64(32)) + 0.5) * _UNIT))
     turn = 2.0 * math.pi * _UNIT * np.float64(bits & np.uint64(0xFFFFFFFF))
@@ -116,10 +117,10 @@ def add_noise(
     cut: float,
     key: np.uint64,
 ) -> None:
-    """Add ``amount`` times the covariance times a normal draw to the means [N, 3].
+    """Add ``amount`` times the covariance times a normal vector to the means [N, 3].
 
-    Faded out by a sigmoid around ``min_opacity`` (gsplat, inject_noise_to_position); from opacity ``cut`` on
-    there is none.
+    A sigmoid around the opacity ``min_opacity`` fades the noise out (gsplat's ``inject_noise_to_position``).
+    Gaussians with an opacity of ``cut`` or more get none.
     """
     n = means.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):

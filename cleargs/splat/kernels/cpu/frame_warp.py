@@ -1,21 +1,20 @@
-"""What a camera does to a sharp image while it takes it: blur, rolling shutter and defocus as one warp.
+"""Warp a sharp image as a moving camera records it: blur, rolling shutter and defocus in one operation.
 
-A pixel of the photograph sees the still image at
+A pixel x of the observed image is the mean of the sharp image at
 
     x + offset(x) + t sweep(x) + radius(x) (u, v)
 
-for ``samples`` (t, u, v): times t from -1/2 to 1/2 of its exposure, points (u, v) of the unit disc. Fields
-are in pixels, [2, H, W] with x before y. The image is larger than the photograph by ``margin`` pixels on
-every side; beyond its border the border pixels go on.
+over ``samples`` (t, u, v): times t from -1/2 to 1/2 of the exposure, and points (u, v) of the unit disc.
+Fields are in pixels, [2, H, W] with x before y. The sharp image is larger than the observed image by
+``margin`` pixels on every side. Beyond its border, the border pixels are repeated.
 
-Between pixels the image is interpolated by lines, and by cubics where one sample is all (a rolling shutter
-without blur): lines would blur what such a frame shows sharp.
+Interpolation between pixels is linear. With a single sample (a rolling shutter without blur) it is cubic,
+because linear interpolation would blur a sharp frame.
 
-Pixels whose samples all lie within the image, nearly all of them, need no care for its border: their path is
-the fast one.
+Almost all pixels have all their samples inside the image. They take a fast path without border checks.
 
-A row's arithmetic does not depend on other rows, and the transpose adds up bands of rows of a fixed height in
-their order: results do not depend on the number of threads.
+The arithmetic of a row does not depend on other rows, and the transpose adds bands of a fixed height in their
+order. Results therefore do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from cleargs.splat.kernels.warp_layout import CHANNELS
 from cleargs.types import AnyArray, ArrayF32
 
 BAND = 32
-"""Rows of the photograph whose light one work item of the transpose sends back."""
+"""Rows of the observed image per work item of the transpose."""
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _HALF = np.float32(0.5)
@@ -52,7 +51,7 @@ _HALF = np.float32(0.5)
 
 @inlined
 def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, float32
-    """The first of the two pixels that ``position`` lies between, and the share of the second."""
+    """Return the first of the two pixels around ``position``, and the weight of the second."""
     inside = min(max(position, _ZERO), last)
     first = np.int32(min(inside, max(last - _ONE, _ZERO)))
     return first, inside - np.float32(first)
@@ -60,9 +59,9 @@ def _between(position: Any, last: Any) -> tuple[Any, Any]:  # float32 -> int32, 
 
 @inlined
 def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> bool
-    """Whether all samples of a pixel lie within the image, not near its border; false for NaN.
+    """Return True if all samples of a pixel are inside the image and not near its border; False for NaN.
 
-    A sample's point of the disc may lie a tenth beyond its rim.
+    The point of a sample may be outside the unit disc by up to a tenth of its radius.
     """
     far = _HALF * abs(sweep) + np.float32(1.1) * wide + _ONE
     return place - far >= _ZERO and place + far <= last
@@ -70,15 +69,15 @@ def _inside(place: Any, sweep: Any, wide: Any, last: Any) -> Any:  # float32 -> 
 
 @inlined
 def _seen_from(start: Any, along: Any, wide: Any, samples: Any, k: Any) -> Any:
-    """The place that the ``k``-th sample of a pixel comes from."""
+    """Return the position in the sharp image of the ``k``-th sample of a pixel."""
     return start + along * samples[k, 0] + place_of(samples[k, 1], samples[k, 2]) * wide
 
 
 @inlined
 def _cubic(a: Any) -> tuple[Any, Any, Any, Any]:  # float32 -> 4 float32
-    """Shares of the four pixels about a place that lies ``a`` behind the second of them.
+    """Return the weights of the four pixels around a position, which is ``a`` pixels after the second.
 
-    Source: Keys, "Cubic convolution interpolation for digital image processing" (1981), with -1/2.
+    Source: Keys, "Cubic convolution interpolation for digital image processing" (1981), parameter -1/2.
     """
     b = _ONE - a
     outer, inner = -_HALF * a * b, _HALF * a * b
@@ -87,14 +86,14 @@ def _cubic(a: Any) -> tuple[Any, Any, Any, Any]:  # float32 -> 4 float32
 
 @inlined
 def _neighbours(first: Any, count: Any) -> tuple[Any, Any, Any, Any]:  # int32, int64 -> 4 int64
-    """Indices of the four pixels about a place behind ``first``; beyond the border those at the border."""
+    """Return the indices of the four pixels around a position after ``first``, clamped to the image."""
     at, last = np.int64(first), np.int64(count - 1)
     return max(at - 1, 0), at, min(at + 1, last), min(at + 2, last)
 
 
 @inlined
 def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float32 -> float32, float32
-    """The curve at ``value`` and its slope there."""
+    """Return the curve and its slope at ``value``."""
     steps = np.float32(layout.CURVE_DENSITY)
     place = value * steps
     index = np.int32(min(max(place, _ZERO), np.float32(layout.CURVE_STEPS - 1)))
@@ -105,15 +104,17 @@ def _on_curve(curve: Any, value: Any) -> tuple[Any, Any]:  # [STEPS + 1], float3
 @kernel
 def displacements(
     depth: ArrayF32,  # [H + 2 margin, W + 2 margin] accumulated
-    alpha: ArrayF32,  # likewise
+    alpha: ArrayF32,  # [H + 2 margin, W + 2 margin]
     margin: int,
     motion: ArrayF32,  # [25]: see `warp_layout`
     offset: ArrayF32,  # [2, H, W] written
     sweep: ArrayF32,  # [2, H, W] written
     radius: ArrayF32,  # [H, W] written
-    reach: AnyArray,  # [H] float64, written: farthest that a pixel of the row looks up or down
+    reach: AnyArray,  # [H] float64, written: largest vertical displacement of a sample per row, px
 ) -> None:
-    """The fields of a frame's motion and defocus. Nearness is the median depth over the pixel's own.
+    """Compute the displacement fields of a frame's motion and defocus.
+
+    Translations and defocus depend on the nearness of a pixel: the median depth divided by its depth.
 
     Source: Longuet-Higgins & Prazdny, "The interpretation of a moving retinal image" (1980).
     """
@@ -132,7 +133,7 @@ def displacements(
             if covered > np.float32(layout.MIN_COVERED) and behind > _ZERO:  # false for NaN
                 near = min(motion[layout.MEDIAN] * covered / behind, np.float32(layout.MAX_NEARNESS))
             for part in range(2):
-                # Pose and skew displace, blur sweeps.
+                # Pose and skew give the offset, blur gives the sweep.
                 tx, ty, tz = twists[part, 0], twists[part, 1], twists[part, 2]
                 rx, ry, rz = twists[part, 3], twists[part, 4], twists[part, 5]
                 if part == 0:
@@ -151,7 +152,7 @@ def displacements(
 
 @kernel
 def apply_curve(image: ArrayF32, curve: ArrayF32, out: ArrayF32, slope: ArrayF32) -> None:
-    """The three colours of every pixel through a curve, and the curve's slope there.
+    """Apply a curve to the three colours of every pixel, and write the curve's slopes there.
 
     Images are [H, W, 3] or [H, W, 4]; ``slope`` is [H, W, 3].
     """
@@ -169,13 +170,13 @@ def apply_curve(image: ArrayF32, curve: ArrayF32, out: ArrayF32, slope: ArrayF32
 def expose(
     image: ArrayF32,  # [H + 2 margin, W + 2 margin, 4] linear light
     margin: int,
-    offset: ArrayF32,
-    sweep: ArrayF32,
-    radius: ArrayF32,
-    samples: ArrayF32,  # [K, 3]
+    offset: ArrayF32,  # [2, H, W]
+    sweep: ArrayF32,  # [2, H, W]
+    radius: ArrayF32,  # [H, W]
+    samples: ArrayF32,  # [K, 3] t, u, v
     out: ArrayF32,  # [H, W, 4] linear light, written
 ) -> None:
-    """What the sensor gathers of a still image."""
+    """Compute the light that each pixel of the sensor collects from a sharp image."""
     height, width, _ = out.shape
     rows, columns, _ = image.shape
     right, bottom = np.float32(columns - 1), np.float32(rows - 1)
@@ -223,16 +224,17 @@ def spread(
     light: ArrayF32,  # [H, W, 4]
     margin: int,
     reach: int,
-    offset: ArrayF32,
-    sweep: ArrayF32,
-    radius: ArrayF32,
-    samples: ArrayF32,  # [K, 3]
+    offset: ArrayF32,  # [2, H, W]
+    sweep: ArrayF32,  # [2, H, W]
+    radius: ArrayF32,  # [H, W]
+    samples: ArrayF32,  # [K, 3] t, u, v
     bands: ArrayF32,  # [bands, BAND + 2 reach, W + 2 margin, 4], written
     rows: int,
 ) -> None:
-    """The transpose of `expose`, before `gather`: what every pixel saw goes back to where it came from.
+    """Add the light of every observed pixel to the pixels that it sampled, one band per work item.
 
-    ``rows`` are those of the image; no pixel looks up or down by more than ``reach`` - 3 pixels.
+    With `gather`, this is the transpose of `expose`. ``rows`` is the height of the sharp image. No vertical
+    displacement is above ``reach`` - 3 pixels.
     """
     height, width, _ = light.shape
     columns = bands.shape[2]
@@ -286,7 +288,7 @@ def _add(image: Any, offset: Any, light: Any, share: Any) -> None:
 
 @kernel
 def gather(bands: ArrayF32, margin: int, reach: int, out: ArrayF32) -> None:
-    """The sum of the bands in their order, [H + 2 margin, W + 2 margin, 4]."""
+    """Add the bands in their order into an image [H + 2 margin, W + 2 margin, 4]."""
     height, width, _ = out.shape
     for y in prange(height):
         out[y] = _ZERO
@@ -300,7 +302,7 @@ def gather(bands: ArrayF32, margin: int, reach: int, out: ArrayF32) -> None:
 
 @kernel
 def multiply(light: ArrayF32, slope: ArrayF32, out: ArrayF32) -> None:
-    """light * slope for three colours: ``slope`` is [H, W, 3], the others have three channels or four."""
+    """Multiply three colours by ``slope`` [H, W, 3]; the images have three or four channels."""
     height, width, _ = slope.shape
     padded = out.shape[2] > 3
     for y in prange(height):
@@ -316,22 +318,22 @@ def misfits(
     image: ArrayF32,  # [H, W]
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
-    offset: ArrayF32,
-    sweep: ArrayF32,
-    radius: ArrayF32,
-    samples: ArrayF32,  # [K, 3]
+    offset: ArrayF32,  # [2, H, W]
+    sweep: ArrayF32,  # [2, H, W]
+    radius: ArrayF32,  # [H, W]
+    samples: ArrayF32,  # [K, 3] t, u, v
     limit: float,
     rows: AnyArray,  # [H] float64, written
 ) -> None:
-    """Each row's sum of weight * min(|observed - photographed image|, limit); images without a margin.
+    """Write each row's sum of weight * min(|observed - warped image|, limit); images have no margin.
 
-    Pixels of no weight are not looked at.
+    Pixels with weight 0 are skipped.
     """
     height, width = image.shape
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     share = _ONE / np.float32(len(samples))
     for y in prange(height):
-        # Those that count, side by side, so that the inner loop can be vectorised.
+        # Pixels that count are packed without gaps, so that the inner loop can be vectorised.
         place, along = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
         wide, exposed = np.empty(width, np.float32), np.zeros(width, np.float32)
         count = 0
@@ -362,17 +364,17 @@ def normal_equations(
     stack: ArrayF32,  # [H, W, 3]: image, its derivatives by x and y
     observed: ArrayF32,  # [H, W]
     weight: ArrayF32,  # [H, W]
-    basis: ArrayF32,  # [6, 2, H, W]: flow by each component of a twist
-    down: ArrayF32,  # [H]: -1/2 at the first row of the photograph, 1/2 at its last
-    offset: ArrayF32,
-    sweep: ArrayF32,
+    basis: ArrayF32,  # [6, 2, H, W]: image motion per component of a twist, px
+    down: ArrayF32,  # [H]: -1/2 at the first row of the frame, 1/2 at its last
+    offset: ArrayF32,  # [2, H, W]
+    sweep: ArrayF32,  # [2, H, W]
     times: ArrayF32,  # [K]
     outlier: float,
-    active: AnyArray,  # [A] int64: which of the 18 numbers of pose, blur and skew are sought
+    active: AnyArray,  # [A] int64: unknowns, of the 18 numbers of pose, blur and skew
     matrices: AnyArray,  # [H, A, A] float64, written (lower triangles)
     sides: AnyArray,  # [H, A] float64, written
 ) -> None:
-    """Each row's share of the Gauss-Newton equations of the twists of pose, blur and skew.
+    """Write each row's share of the Gauss-Newton equations for the twists of pose, blur and skew.
 
     Differences beyond ``outlier`` count linearly (Huber's weights).
     """

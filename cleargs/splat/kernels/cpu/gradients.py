@@ -1,6 +1,6 @@
-"""From the rasteriser's pixel sums back to gradients of the raw parameters.
+"""Compute the gradients of the raw parameters from the rasteriser's pixel sums.
 
-The chain rule of ``projection`` written out; the symbols are those of its docstring.
+This is the chain rule of ``projection``, written out with the symbols of its docstring.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from cleargs.types import AnyArray, ArrayF32
 
 @device
 def plus(u: Vector, a: float, v: Vector) -> Vector:
-    """u + a v."""
+    """Return u + a v."""
     return (u[0] + a * v[0], u[1] + a * v[1], u[2] + a * v[2])
 
 
@@ -44,7 +44,7 @@ def plus(u: Vector, a: float, v: Vector) -> Vector:
 def quaternion_gradient(
     w: float, x: float, y: float, z: float, c0: Vector, c1: Vector, c2: Vector
 ) -> tuple[float, float, float, float]:
-    """dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
+    """Return dL/d(unit quaternion) from the gradients c0, c1, c2 of the rotation matrix's columns."""
     return (
         2 * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
         2 * (w * (c1[2] - c2[1]) + y * (c0[1] + c1[0]) + z * (c0[2] + c2[0]) - 2 * x * (c1[1] + c2[2])),
@@ -62,10 +62,10 @@ def colour_gradient(
     direction: Vector,
     sums: AnyArray,
     grad_sh: ArrayF32,
-    basis: ArrayF32,
-    weights: ArrayF32,
+    basis: ArrayF32,  # [16] scratch
+    weights: ArrayF32,  # [16] scratch
 ) -> Vector:
-    """Write dL/dSH of one Gaussian and return dL/d(direction). No gradient where the colour is clamped."""
+    """Write dL/dSH of one Gaussian and return dL/d(direction); a clamped channel has no gradient."""
     red = np.float32(sums[layout.SUM_RED]) if splat[layout.RED] > ZERO else ZERO
     green = np.float32(sums[layout.SUM_GREEN]) if splat[layout.GREEN] > ZERO else ZERO
     blue = np.float32(sums[layout.SUM_BLUE]) if splat[layout.BLUE] > ZERO else ZERO
@@ -92,12 +92,12 @@ def backpropagate_one(
     view: ProjectionView,
     antialias: bool,
     splats: ArrayF32,
-    sums: AnyArray,
+    sums: AnyArray,  # [10] float64, columns splat_layout.SUM_*
     outputs: Parameters,
-    basis: ArrayF32,
-    weights: ArrayF32,
+    basis: ArrayF32,  # [16] scratch
+    weights: ArrayF32,  # [16] scratch
 ) -> None:
-    """The chain rule of ``project_one`` from the pixel sums of one Gaussian (see splat_layout.SUM_*)."""
+    """Apply the chain rule of ``project_one`` to the pixel sums of Gaussian ``g``."""
     means, log_scales, rotations, logits, sh = parameters
     grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     x, y, z = camera_position(means[g], view)
@@ -152,7 +152,7 @@ def backpropagate_one(
     grad_rotations[g, 2] = (gy - along * qy) / norm
     grad_rotations[g, 3] = (gz - along * qz) / norm
 
-    # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 alike
+    # row0 = jx W0 + jxz W2 with jx = fx/z, jxz = -fx cx/z, cx = clamp(x/z); row1 is analogous
     r0 = plus(mixed(v0[0], axis0, v0[1], axis1), v0[2], axis2)
     r1 = plus(mixed(v1[0], axis0, v1[1], axis1), v1[2], axis2)
     grad_jx = r0[0] * view.w00 + r0[1] * view.w01 + r0[2] * view.w02
@@ -183,7 +183,7 @@ def backpropagate_one(
 
 @device
 def clear_gradients(g: int, outputs: Parameters) -> None:
-    """Zero gradient for a Gaussian that touches no tile."""
+    """Set the gradients of a Gaussian that touches no tile to zero."""
     grad_means, grad_log_scales, grad_rotations, grad_logits, grad_sh = outputs
     grad_means[g, :] = ZERO
     grad_log_scales[g, :] = ZERO
@@ -198,15 +198,15 @@ def backpropagate(
     sh_count: int,
     view: ProjectionView,
     antialias: bool,
-    splats: ArrayF32,
-    pair_offsets: AnyArray,
-    pair_sums: ArrayF32,
-    outputs: Parameters,
+    splats: ArrayF32,  # [N, 16]
+    pair_offsets: AnyArray,  # [N + 1]
+    pair_sums: ArrayF32,  # [P, 9 or 10]
+    outputs: Parameters,  # written
 ) -> None:
-    """Gradients of the five parameters from the (tile, splat) sums of the rasteriser's backward pass.
+    """Write the gradients of the five parameters, from the pair sums of the rasteriser's backward pass.
 
-    The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``;
-    they are added in their order in float64, so nothing races and nothing depends on the threads.
+    The rows ``pair_offsets[g]`` to ``pair_offsets[g + 1]`` of ``pair_sums`` belong to Gaussian ``g``. They
+    are added in order and in float64, so there are no races and the result does not depend on the threads.
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3 and the gradient with respect to the direction."""
+"""Real spherical harmonics (SH) up to degree 3 and their gradient with respect to the direction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TWO, THREE, FOUR, SIX, EIGHT = (np.float32(n) for n in (2, 3, 4, 6, 8))
 
 @device
 def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: ArrayF32) -> None:
-    """The first ``count`` (1, 4, 9 or 16) basis functions at the unit direction (x, y, z)."""
+    """Write the first ``count`` (1, 4, 9 or 16) basis functions at the unit direction (x, y, z)."""
     basis[0] = C0
     if count > 1:
         basis[1] = -C1 * y
@@ -43,7 +43,7 @@ def sh_basis(count: int, x: np.float32, y: np.float32, z: np.float32, basis: Arr
 def sh_direction_gradient(
     count: int, x: np.float32, y: np.float32, z: np.float32, h: ArrayF32
 ) -> tuple[np.float32, np.float32, np.float32]:
-    """Σ_k h[k] ∂basis[k]/∂(x, y, z), the direction taken as three free numbers."""
+    """Return Σ_k h[k] ∂basis[k]/∂(x, y, z), with x, y and z as independent variables."""
     gx = gy = gz = np.float32(0)
     if count > 1:
         gx = -C1 * h[3]

@@ -1,11 +1,12 @@
-"""How the CPU kernels are compiled.
+"""Decorators that compile the CPU kernels, and the name of their cache.
 
-The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working, and
-``reassoc``: Numba compiles the body of a parallel loop twice, alone for the process at hand and as a part of
-the kernel for the cache, and with it the two round differently. A training resumed by another process would
-then end in other bits than one that was not interrupted.
-Every kernel walks over items or blocks of a fixed size, and an item's arithmetic does not depend on
-its neighbours in the loop, which makes results bitwise independent of the number of threads.
+The fast-math flags leave out ``nnan`` and ``ninf``, so comparisons with NaN and infinity keep working. They
+also leave out ``reassoc``. Numba compiles the body of a parallel loop twice: alone for the current process,
+and as a part of the kernel for the cache. With ``reassoc`` the two round differently, and a training that
+another process resumes would end with other bits than an uninterrupted one.
+
+Every kernel loops over items or blocks of a fixed size, and the arithmetic of an item does not depend on its
+neighbours in the loop. Results are therefore bitwise independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ F = TypeVar("F", bound=Callable[..., Any])
 FAST = frozenset({"contract", "nsz", "arcp"})
 
 LAUNCHING = threading.RLock()
-"""Held around a group of kernels. The threads are one resource of the process: Numba's work queue, the layer
-where OpenMP is missing, aborts when two Python threads launch kernels at once."""
+"""Lock to hold around a group of kernels. Without OpenMP, Numba uses its ``workqueue`` layer, which aborts if
+two Python threads launch kernels at once."""
 
 
 def kernel_digest() -> str:
-    """Digest of every source file that ends up in compiled kernels.
+    """Return a digest of every source file that is compiled into kernels.
 
-    Numba's own cache is keyed by the file of the kernel itself and misses changes in functions that it
-    calls from other files; a folder named by this digest does not.
+    Numba keys its cache by the file of the kernel and misses changes in functions that the kernel calls from
+    other files. A cache folder that is named by this digest does not miss them.
     """
     folder = Path(__file__).parent
     digest = hashlib.sha256()
     for source in (
         folder.parents[1] / "constants.py",
-        *sorted(folder.parent.glob("*_layout.py")),  # their numbers are compiled in
+        *sorted(folder.parent.glob("*_layout.py")),  # their constants are compiled in
         *sorted(folder.glob("*.py")),
     ):
         digest.update(source.name.encode())
@@ -49,32 +50,32 @@ def kernel_digest() -> str:
 
 
 def configure_numba() -> None:
-    """Give the kernels a folder of the cache and a threading layer; to be called before one is defined."""
+    """Set the cache folder and the threading layer of the kernels; call it before one is defined."""
     kernel_cache.configure_numba(f"kernels-{kernel_digest()}")
 
 
 def kernel(function: F) -> F:
-    """A parallel entry point: called from Python, cached on disk, runs without the GIL."""
+    """Compile a parallel entry point: called from Python, cached on disk, runs without the GIL."""
     return cast(
         F, njit(cache=True, parallel=True, nogil=True, fastmath=set(FAST), error_model="numpy")(function)
     )
 
 
 def serial_kernel(function: F) -> F:
-    """An entry point that runs on the calling thread alone."""
+    """Compile an entry point that runs on the calling thread only."""
     return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def device(function: F) -> F:
-    """A function that kernels call; compiled into them."""
+    """Compile a function that kernels call."""
     return cast(F, njit(fastmath=set(FAST), error_model="numpy")(function))
 
 
 def inlined(function: F) -> F:
-    """A small function that LLVM must inline, so that SIMD values stay in registers."""
+    """Compile a small function that LLVM must inline, so that SIMD values stay in registers."""
     return cast(F, njit(fastmath=set(FAST), error_model="numpy", forceinline=True)(function))
 
 
 def exact(function: F) -> F:
-    """Plain IEEE arithmetic: bitwise the same wherever it is compiled into."""
+    """Compile with plain IEEE arithmetic: the result is bitwise the same in every caller."""
     return cast(F, njit(error_model="numpy")(function))

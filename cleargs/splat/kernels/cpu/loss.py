@@ -1,7 +1,7 @@
 """L1 + D-SSIM and its gradient in two passes over the image, and squared errors.
 
-SSIM (Wang et al. 2004) as in the Inria code: 11 x 11 Gaussian window with sigma 1.5, zero padding,
-C1 = 0.01², C2 = 0.03², every channel on its own, the mean over all values. With the window means
+SSIM (Wang et al. 2004) as in the Inria code: 11 x 11 Gaussian window G with sigma 1.5, zero padding,
+C1 = 0.01², C2 = 0.03², channels treated separately, and the mean over all values. With the window means
 m = G*x, n = G*y, p = G*x², q = G*y², r = G*(xy),
 
     A1 = 2 m n + C1,   A2 = 2 (r - m n) + C2,   B1 = m² + n² + C1,   B2 = (p - m²) + (q - n²) + C2
@@ -10,14 +10,14 @@ m = G*x, n = G*y, p = G*x², q = G*y², r = G*(xy),
     d(sum of S)/dx = G*(dS/dm) + 2 x G*(dS/dp) + y G*(dS/dr)
 
 because G is symmetric. The window is separable: each output row needs eleven input rows, summed
-vertically into row buffers and then horizontally, so rows are independent work items and no
-intermediate image of the five means is stored.
+vertically into row buffers and then horizontally. Rows are thus independent work items, and no intermediate
+image of the five means is stored.
 
-Images are copied once into padded rows: 16 zeros, 3 W interleaved values, zeros to a multiple of `LANES` and
-16 more. Neighbouring pixels are then three floats apart and the zero padding comes for free. Masked pixels
-are zeroed in both images, so that they act like the padding outside the image.
+Images are copied once into padded rows: 16 zeros, 3 W interleaved values, zeros to a multiple of `LANES`, and
+16 more. Neighbouring pixels are then three floats apart, and windows need no border checks. Masked pixels are
+zero in both images, so that they act like the padding outside the image.
 
-Sums run in float64 within each row, and over the rows in their order.
+Sums are in float64, within each row and then over the rows in their order.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ C1, C2 = np.float32(constants.SSIM_C1), np.float32(constants.SSIM_C2)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 CHANNELS = 3
 PAD = 16
-"""Zeros on both sides of a padded row: at least RADIUS pixels of three channels."""
+"""Zeros at each end of a padded row: at least RADIUS pixels of three channels."""
 
-# Row buffers of window means, and the maps of derivatives.
+# Indices of the row buffers of window means, and of the derivative maps.
 MEAN_X, MEAN_Y, MEAN_XX, MEAN_YY, MEAN_XY = range(5)
 BY_MEAN, BY_SQUARE, BY_PRODUCT = range(3)
 
 
 def ssim_window() -> ArrayF32:
-    """The normalised one-dimensional window, [11]."""
+    """Return the normalised one-dimensional window, [11]."""
     weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * constants.SSIM_SIGMA**2))
     window: ArrayF32 = (weights / weights.sum()).astype(np.float32)
     return window
 
 
 def padded_length(width: int) -> int:
-    """Floats in a padded row."""
+    """Return the number of floats in a padded row."""
     return -(-CHANNELS * width // LANES) * LANES + 2 * PAD
 
 
@@ -64,7 +64,7 @@ def pad_images(
     padded_target: ArrayF32,
     counted: ArrayF32,
 ) -> None:
-    """Copy both images [H, W, 3] into padded rows; ``counted`` holds 1 for values that count, else 0."""
+    """Copy both images [H, W, 3] into padded rows; ``counted`` becomes 1 for values that count, else 0."""
     height, width, _ = image.shape
     for y in prange(height):
         padded_image[y, :] = ZERO
@@ -82,7 +82,7 @@ def pad_images(
 
 @device
 def vertical_means(y: int, image: ArrayF32, target: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
-    """The five window sums over the rows around ``y``, into the row buffers."""
+    """Write the five window sums over the rows around ``y`` into the row buffers."""
     height, length = image.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
     for i in range(PAD, length - PAD, LANES):
@@ -107,7 +107,7 @@ def vertical_means(y: int, image: ArrayF32, target: ArrayF32, window: ArrayF32, 
 
 @device
 def row_total(values: ArrayF32, length: int) -> float:
-    """Sum of a row buffer in float64."""
+    """Return the sum of a row buffer in float64, without the padding."""
     total = 0.0
     for i in range(PAD, length - PAD):
         total += np.float64(values[i])
@@ -125,7 +125,7 @@ def similarity_row(
     values: ArrayF32,
     maps: ArrayF32,
 ) -> None:
-    """SSIM of each value of a row into ``values`` and its derivatives into ``maps``."""
+    """Write the SSIM of each value of a row into ``values``, and its derivatives into ``maps``."""
     height, length = image.shape
     vertical_means(y, image, target, window, rows)
     for i in range(PAD, length - PAD, LANES):
@@ -164,9 +164,9 @@ def measure(
     maps: ArrayF32,
     row_sums: AnyArray,
 ) -> None:
-    """Sums of |x - y|, SSIM and counted values of each padded row, [H, 3] float64.
+    """Write the sums of |x - y|, of SSIM and of counted values in each padded row, [H, 3] float64.
 
-    ``maps`` [3, H, length] takes the derivatives of SSIM by the window means; its padding is not written.
+    ``maps`` [3, H, length] receives the derivatives of SSIM by the window means; its padding is not written.
     """
     height, length = image.shape
     for y in prange(height):
@@ -183,7 +183,7 @@ def measure(
 
 @device
 def vertical_maps(y: int, maps: ArrayF32, window: ArrayF32, rows: ArrayF32) -> None:
-    """Window sums of the three derivative maps over the rows around ``y``."""
+    """Write the window sums of the three derivative maps over the rows around ``y``."""
     _, height, length = maps.shape
     first, last = max(0, y - RADIUS), min(height - 1, y + RADIUS)
     for i in range(PAD, length - PAD, LANES):
@@ -209,7 +209,7 @@ def differentiate(
     ssim_scale: np.float32,
     gradient: ArrayF32,
 ) -> None:
-    """gradient [H, W, 3] = l1_scale sign(x - y) + ssim_scale d(sum of SSIM)/dx, zero where masked."""
+    """Write l1_scale sign(x - y) + ssim_scale d(sum of SSIM)/dx, [H, W, 3], zero in masked pixels."""
     height, length = image.shape
     width = gradient.shape[1]
     for y in prange(height):
@@ -237,7 +237,7 @@ def differentiate(
 
 @kernel
 def squared_errors(image: ArrayF32, target: ArrayF32, mask: AnyArray | None, row_sums: AnyArray) -> None:
-    """Sum of squared differences and number of values of each row, [H, 2] float64."""
+    """Write the sum of squared differences and the number of values in each row, [H, 2] float64."""
     height, width, channels = image.shape
     for y in prange(height):
         total = 0.0

@@ -20,34 +20,34 @@ from cleargs.splat.types import Render
 from cleargs.types import AnyArray, ArrayF32
 
 TILES_PER_CHUNK = 8
-"""Tiles handed to a thread at a time: real scenes are uneven, so the queue must be finer than the threads."""
+"""Tiles that a thread takes at a time. Tiles differ in cost, so each thread needs many small portions."""
 
 
 @dataclass(frozen=True, eq=False)
 class CpuForwardPass(rasteriser.ForwardPass):
-    """What the backward pass needs of one forward pass."""
+    """State of a forward pass that the backward pass needs."""
 
     view: projection.ProjectionView
     background: ArrayF32  # [3]
-    splats: ArrayF32  # [N, 16]
-    pair_offsets: AnyArray  # [N + 1]
-    tile_offsets: AnyArray  # [tiles + 1]
-    pair_ids: AnyArray  # [P]
-    pair_slots: AnyArray  # [P]
+    splats: ArrayF32  # [N, 16], columns of splat_layout
+    pair_offsets: AnyArray  # [N + 1], first pair of each Gaussian
+    tile_offsets: AnyArray  # [tiles + 1], first pair of each tile
+    pair_ids: AnyArray  # [P], Gaussian of each pair
+    pair_slots: AnyArray  # [P], row of each pair in the pair sums
     transmittance: ArrayF32  # [H, W]
-    last: ArrayF32  # [H, W]
+    last: ArrayF32  # [H, W], number of the last splat that contributed, from 1
 
 
 def read_parameters(gaussians: Gaussians) -> projection.Parameters:
-    """Views of the five parameters in the order in which the kernels take them."""
+    """Return views of the five parameters in the order of the kernels."""
     return tuple(tensor.detach().contiguous().numpy() for tensor in gaussians.tensors().values())
 
 
 class CpuRasteriser(rasteriser.Rasteriser):
-    """Forward and backward passes on the CPU."""
+    """The rasteriser on the CPU."""
 
     pair_buffers = ("pair_tiles", "pair_ids", "pair_slots", "pair_sums")
-    pair_bytes = 4 * (3 + SUM_DEPTH)  # its tile, Gaussian, slot and, when it is trained, its sums
+    pair_bytes = 4 * (3 + SUM_DEPTH)  # tile, Gaussian, slot and, in training, sums
 
     def __init__(self) -> None:
         super().__init__(torch.device("cpu"))

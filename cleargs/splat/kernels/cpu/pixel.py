@@ -1,8 +1,9 @@
-"""A pixel's four float32 numbers (RGB and one of padding) as one SIMD value, and a pair of pixels.
+"""SIMD types for a pixel (four float32 numbers: RGB and one of padding) and for a pair of pixels.
 
-Where every pixel reads from another place, `simd`'s lanes would have to be gathered; the channels of a pixel
-lie side by side, and so do two pixels of a row, between which a place lies. + - * / work as between lanes.
-Images are [H, W, 4]; offsets count elements of the whole array and are not checked.
+In a warp each pixel reads from another position, so the lanes of `simd` would need slow gather loads. The
+channels of a pixel are adjacent in memory, and so are the two pixels of a row around a position. Arithmetic
+(+ - * /) works as between lanes. Images are [H, W, 4]. Offsets count elements of the whole array; bounds are
+not checked.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ _WHOLE = ir.VectorType(_I32, CHANNELS)
 
 
 class _PixelType(types.Type):
-    """The type of four float32 numbers."""
+    """Numba type of a pixel."""
 
 
 class _PairType(types.Type):
-    """The type of a pixel and the one right of it."""
+    """Numba type of a pixel and its right neighbour."""
 
 
 pixel = _PixelType("pixel")
@@ -44,38 +45,38 @@ _register_type(_PairType, _PAIR)
 _register_arithmetic(pixel)
 _register_arithmetic(pair)
 
-# Numba's constructor is not annotated.
+# Numba's constructor has no type annotations.
 _new_tuple: Any = types.UniTuple
 _SHARES = _new_tuple(types.float32, 2)
 
 
 @_operation(pixel)
 def black(builder: Any) -> Any:
-    """A pixel of zeros."""
+    """Return a pixel of zeros."""
     return ir.Constant(_PIXEL, [0.0] * CHANNELS)
 
 
 @_operation(pair)
 def black_pair(builder: Any) -> Any:
-    """Two pixels of zeros."""
+    """Return two pixels of zeros."""
     return ir.Constant(_PAIR, [0.0] * 2 * CHANNELS)
 
 
 @_intrinsic
 def load_pixel(typing_context: Any, array: Any, offset: Any) -> Any:
-    """The pixel at ``offset``."""
+    """Load the pixel at ``offset``."""
     return pixel(array, offset), _load(_PIXEL)
 
 
 @_intrinsic
 def load_pair(typing_context: Any, array: Any, offset: Any) -> Any:
-    """The pixel at ``offset`` and the one right of it."""
+    """Load the pixel at ``offset`` and its right neighbour."""
     return pair(array, offset), _load(_PAIR)
 
 
 @_operation(pair, types.float32)
 def shares(builder: Any, second: Any) -> Any:
-    """How much each of a pair counts: 1 - ``second``, then ``second``, float32."""
+    """Return the weights of a pair: 1 - ``second`` for the first pixel, ``second`` for the other."""
     base = ir.Constant(_PAIR, [1.0] * CHANNELS + [0.0] * CHANNELS)
     rise = ir.Constant(_PAIR, [-1.0] * CHANNELS + [1.0] * CHANNELS)
     change = builder.fmul(rise, _broadcast_to(builder, second, _PAIR), flags=_FLAGS)
@@ -84,14 +85,14 @@ def shares(builder: Any, second: Any) -> Any:
 
 @_operation(pair, pixel)
 def both(builder: Any, value: Any) -> Any:
-    """A pixel, twice."""
+    """Return a pair that holds a pixel twice."""
     places = ir.Constant(ir.VectorType(_I32, 2 * CHANNELS), [*range(CHANNELS)] * 2)
     return builder.shuffle_vector(value, value, places)
 
 
 @_operation(pixel, pair)
 def sum_of(builder: Any, value: Any) -> Any:
-    """The two pixels of a pair, added."""
+    """Return the sum of the two pixels of a pair."""
     left, right = (
         builder.shuffle_vector(value, value, ir.Constant(_WHOLE, [*range(start, start + CHANNELS)]))
         for start in (0, CHANNELS)
@@ -99,12 +100,12 @@ def sum_of(builder: Any, value: Any) -> Any:
     return builder.fadd(left, right, flags=_FLAGS)
 
 
-# -- places in an image, x and y in the first two of a pixel's numbers ---------------------------------------
+# -- positions in an image: x and y are the first two numbers of a pixel -------------------------------------
 
 
 @_operation(pixel, types.float32, types.float32)
 def place_of(builder: Any, x: Any, y: Any) -> Any:
-    """The place (x, y), float32, in pixels."""
+    """Return the position (x, y) in pixels, float32."""
     place = ir.Constant(_PIXEL, [0.0] * CHANNELS)
     for lane, number in enumerate((x, y)):
         place = builder.insert_element(place, number, ir.Constant(_I32, lane))
@@ -113,9 +114,9 @@ def place_of(builder: Any, x: Any, y: Any) -> Any:
 
 @_operation(types.int64, pixel, types.int64)
 def offset_of(builder: Any, place: Any, columns: Any) -> Any:
-    """Where the pixel left of and above ``place`` begins in an image of so many ``columns``, int64.
+    """Return the offset (int64) of the pixel left of and above ``place`` in an image of width ``columns``.
 
-    Places are not negative.
+    Positions must not be negative.
     """
     whole = builder.fptosi(place, _WHOLE)
     x, y = (builder.sext(builder.extract_element(whole, ir.Constant(_I32, n)), _I64) for n in (0, 1))
@@ -124,7 +125,7 @@ def offset_of(builder: Any, place: Any, columns: Any) -> Any:
 
 @_intrinsic
 def fractions_of(typing_context: Any, place: Any) -> Any:
-    """How far ``place`` lies right of and below the pixel of `offset_of`: two float32 from 0 to 1."""
+    """Return the distances, two float32, from the pixel of `offset_of` right and down to ``place``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole = builder.sitofp(builder.fptosi(args[0], _WHOLE), _PIXEL)

@@ -1,4 +1,4 @@
-"""From raw Gaussian parameters to packed splats; ``gradients`` goes the way back.
+"""Project raw Gaussian parameters to packed splats; ``gradients`` computes the backward pass.
 
 EWA splatting (Zwicker et al. 2001) as in 3DGS and gsplat. With W the camera rotation, R the
 Gaussian's, s its scales and J the 2 x 3 Jacobian of the pinhole projection,
@@ -6,15 +6,15 @@ Gaussian's, s its scales and J the 2 x 3 Jacobian of the pinhole projection,
     U = J W R diag(s)          [2, 3], rows u0 and u1
     Σ = U Uᵀ + 0.3 I
 
-The ellipse is wanted as in ``splat_layout``: e = 1 / Σyy, k = Σxy / Σyy and a = Σyy / det Σ = 1 / s, where
-s is the variance of x at fixed y. It is the least of |u0 - k u1|² + 0.3 (1 + k²) over all k, so
-with w = u0 - k u1
+The ellipse is stored as in ``splat_layout``: e = 1 / Σyy, k = Σxy / Σyy and a = Σyy / det Σ = 1 / s, where
+s is the variance of x at fixed y. s is the minimum of |u0 - k u1|² + 0.3 (1 + k²) over all k, so with
+w = u0 - k u1
 
     s = |w|² + 0.3 (1 + k²),      det Σ = s Σyy,      ds = 2 w · (du0 - k du1).
 
-Nothing here cancels: however thin a needle, the determinant cannot round to zero or below, and the
-derivative (k is at the minimum, so dk drops out) has no large terms that annihilate. Geometry is
-computed in float64, colours in float32.
+No step loses digits to cancellation. The determinant of the thinnest needle cannot round to zero or below.
+The derivative has no large terms of opposite sign: k is at the minimum, so dk drops out. Geometry is computed
+in float64, colours in float32.
 
 Anti-aliasing (Mip-Splatting, Yu et al. 2024, eq. 9 with gsplat's constant) multiplies the opacity by
 rho = sqrt(det(U Uᵀ) / det Σ), where det(U Uᵀ) = |w x u1|².
@@ -49,14 +49,14 @@ BLOCK = 128
 ZERO = np.float32(0)
 
 Parameters = tuple[ArrayF32, ...]
-"""Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or the gradients by them."""
+"""Means, log scales, rotations, logits of the opacities and SH of all Gaussians, or their gradients."""
 
 
 Vector = tuple[float, float, float]
 
 
 class ProjectionView(NamedTuple):
-    """A camera as the kernels read it: world-to-camera rotation rows, translation, intrinsics, bounds."""
+    """A camera as the kernels read it; see `cleargs.splat.kernels.rasteriser.view_numbers`."""
 
     w00: float
     w01: float
@@ -95,26 +95,26 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 @device
 def mixed(a: float, u: Vector, b: float, v: Vector) -> Vector:
-    """a u + b v."""
+    """Return a u + b v."""
     return (a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2])
 
 
 @device
 def residual(u0: Vector, u1: Vector, skew: float) -> Vector:
-    """w = u0 - k u1: what is left of x's variation when y is known."""
+    """Return w = u0 - k u1, the variation of x at fixed y."""
     return (u0[0] - skew * u1[0], u0[1] - skew * u1[1], u0[2] - skew * u1[2])
 
 
 @device
 def is_finite(x: Any) -> bool:
-    """Within the range of float32, into which the float64 is going to be stored."""
+    """Return True if a float64 is in the range of float32, in which it is stored; False for NaN."""
     finite: bool = abs(x) <= FLOAT32_MAX
     return finite
 
 
 @device
 def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
-    """The Gaussian's centre in camera coordinates."""
+    """Return the Gaussian's centre in camera coordinates."""
     x, y, z = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
         view.w00 * x + view.w01 * y + view.w02 * z + view.tx,
@@ -125,7 +125,7 @@ def camera_position(mean: AnyArray, view: ProjectionView) -> Vector:
 
 @device
 def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
-    """The unit vector from the camera to the Gaussian's centre, in the world, and their distance."""
+    """Return the unit vector in the world from the camera to the Gaussian's centre, and their distance."""
     x, y = np.float64(mean[0]) - view.centre_x, np.float64(mean[1]) - view.centre_y
     z = np.float64(mean[2]) - view.centre_z
     distance = math.sqrt(x * x + y * y + z * z)
@@ -134,7 +134,7 @@ def direction_to(mean: AnyArray, view: ProjectionView) -> tuple[Vector, float]:
 
 @device
 def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, float]:
-    """The normalised quaternion w x y z and the norm it was divided by."""
+    """Return the normalised quaternion w x y z and the norm that it was divided by."""
     w, x = np.float64(rotation[0]), np.float64(rotation[1])
     y, z = np.float64(rotation[2]), np.float64(rotation[3])
     norm = max(math.sqrt(w * w + x * x + y * y + z * z), QUATERNION_EPSILON)
@@ -145,7 +145,7 @@ def unit_quaternion(rotation: AnyArray) -> tuple[float, float, float, float, flo
 def scaled_axes(
     w: float, x: float, y: float, z: float, sx: float, sy: float, sz: float
 ) -> tuple[Vector, Vector, Vector]:
-    """The columns of R diag(s): the Gaussian's axes in the world, one standard deviation long."""
+    """Return the columns of R diag(s): the Gaussian's axes in the world, one standard deviation long."""
     return (
         (sx * (1 - 2 * (y * y + z * z)), sx * 2 * (x * y + w * z), sx * 2 * (x * z - w * y)),
         (sy * 2 * (x * y - w * z), sy * (1 - 2 * (x * x + z * z)), sy * 2 * (y * z + w * x)),
@@ -155,7 +155,7 @@ def scaled_axes(
 
 @device
 def projection_rows(x: float, y: float, z: float, view: ProjectionView) -> tuple[Vector, Vector]:
-    """The rows of J W. x/z and y/z are clamped, which keeps the linearisation near the image."""
+    """Return the rows of J W. The clamps of x/z and y/z keep the linearisation near the image."""
     jx, jy = view.fx / z, view.fy / z
     jxz = -jx * min(max(x / z, view.left), view.right)
     jyz = -jy * min(max(y / z, view.top), view.bottom)
@@ -175,10 +175,10 @@ def project_one(
     splats: ArrayF32,
     basis: ArrayF32,
 ) -> bool:
-    """Write the packed splat of Gaussian ``g``; False when it is culled (behind, too faint, not finite)."""
+    """Write the packed splat of Gaussian ``g``. Return False if it is behind, too faint or not finite."""
     means, log_scales, rotations, logits, sh = parameters
     x, y, z = camera_position(means[g], view)
-    if not NEAR <= z <= FLOAT32_MAX:  # also when z is NaN
+    if not NEAR <= z <= FLOAT32_MAX:  # also if z is NaN
         return False
     qw, qx, qy, qz, _ = unit_quaternion(rotations[g])
     sx, sy, sz = math.exp(log_scales[g, 0]), math.exp(log_scales[g, 1]), math.exp(log_scales[g, 2])
@@ -236,13 +236,13 @@ def project(
     antialias: bool,
     width: int,
     height: int,
-    splats: ArrayF32,
-    tile_counts: AnyArray,
-    radii: ArrayF32,
+    splats: ArrayF32,  # [N, 16], written
+    tile_counts: AnyArray,  # [N], written
+    radii: ArrayF32,  # [N] px, written
 ) -> None:
-    """Packed splats [N, 16], the number of tiles that each touches [N] and its radius in px [N].
+    """Write the packed splats, the number of tiles that each touches, and their radii.
 
-    Culled Gaussians have no tile and radius 0; their rows of ``splats`` are left as they were.
+    Culled Gaussians get no tile and radius 0; their rows of ``splats`` are not written.
     """
     n = splats.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):

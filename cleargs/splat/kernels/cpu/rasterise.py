@@ -1,28 +1,30 @@
 """Tile rasterisation, forward and backward.
 
-Per pixel, over the tile's splats from near to far, with T the transmittance so far (T = 1 at first):
+The forward pass visits the tile's splats from near to far. For each pixel, with the transmittance T, which
+is 1 initially, it computes
 
     alpha = min(2^(log2 alpha), 0.999), skipped below 1/255
-    stop for good where T (1 - alpha) < 1e-4
+    stop if T (1 - alpha) < 1e-4
     colour += alpha T c,   depth += alpha T z,   T *= 1 - alpha
 
-and in the end image = colour + T background. Backward, from far to near, with g = dL/d(pixel), w = alpha T
-and S what g · pixel would be if only what lies behind the splat were there, seen through nothing,
+and finally image = colour + T background. The backward pass goes from far to near. With g = dL/d(pixel),
+w = alpha T, and S = g · b, where b is the colour of all that is behind the splat, with nothing before it,
 
     v = dL/d(ln alpha) = w (g · c - S),   0 where alpha is clamped,      S += alpha (g · c - S).
 
-Only the sums of v times 1, u, dy, u², u dy, dy² and of w g are needed of a (tile, splat) pair
-(splat_layout.SUM_*); gradients.backpropagate turns them into gradients once per Gaussian. Each pair owns a
-row of scratch, so there are no atomics, no races and no dependence on the number of threads.
+For each (tile, splat) pair, the gradients need only the sums of v, v u, v dy, v u², v u dy, v dy² and w g
+(``splat_layout.SUM_*``). ``gradients.backpropagate`` turns them into gradients once per Gaussian. Each pair
+has its own row of scratch, so there are no atomics, no races and no dependence on the number of threads.
 
-A tile's pixels live in a small buffer, cut into pieces: the LANES pixels of a row that make a vector. Piece
-16 h + r is row r of the tile's h-th block of LANES columns (there is one block where a vector holds a whole
-row, else two). Only the pieces that the ellipse touches are visited, found for all at once.
+The pixels of a tile are stored in a small buffer, divided into pieces: the LANES pixels of a row that form a
+vector. Piece 16 h + r is row r of the tile's h-th block of LANES columns. There is one block if a vector
+holds a whole row, else two. Only the pieces that the ellipse touches are visited; one pass finds them all.
 
-A splat's geometry in the tile is computed for a batch of splats before any of them is blended: the loads of
-many splats then wait for memory together, and the loop over a splat's pieces knows early where it ends. What
-the next batch needs is fetched meanwhile.
-Depth is an optional fourth channel: the array is None where it is not wanted, and Numba drops the code.
+The geometry of a batch of splats is computed before any of them is blended. The loads of many splats then
+wait for memory together, and the pieces of a splat are known before the loop over them begins. Data of the
+next batch is prefetched meanwhile.
+
+Depth is an optional fourth channel. If its array is None, Numba compiles the kernel without it.
 """
 
 from __future__ import annotations
@@ -60,16 +62,16 @@ ALPHA_MAX = np.float32(constants.ALPHA_MAX)
 ALPHA_CUT = np.float32(constants.ALPHA_CUT)
 TRANSMITTANCE_STOP = np.float32(constants.TRANSMITTANCE_STOP)
 TOUCH_CUT = np.float32(constants.LOG2_ALPHA_CUT - 2e-3)
-"""log2(alpha) from which a piece is visited; the decision itself is made per pixel."""
+"""A piece is visited if log2(alpha) reaches this; the final decision is made per pixel."""
 
 BATCH = 16
-"""So many splats are set up before they are blended. Then pieces with no live pixel are dropped."""
+"""Splats whose geometry is computed before they are blended. Pieces without a live pixel are then dropped."""
 
 PIECES = layout.TILE_PIXELS // LANES
 ALL_PIECES = np.int64(2**PIECES - 1)
 LAST_LANE = np.float32(LANES - 1)
 
-# Geometry of the batch's splats, behind the pixel buffers: one value per tile row or column of each.
+# Geometry of the batch's splats, stored after the pixel buffers: one value per tile row or column of each.
 ROW_LOG2 = 0  # log2 alpha on the ridge of each row, [16]
 ROW_RIDGE = 16  # dx of the ridge of each row, [16]
 ROW_DY = 32  # dy of each row, [16]
@@ -78,7 +80,7 @@ GEOMETRY_SIZE = 64
 
 # Pixel buffers of the forward pass. The sign of T marks finished pixels (and those outside the image).
 T_FORWARD = 0
-LAST_FORWARD = 256  # number, from 1, of the last splat that contributed; exact up to 2^24 splats a tile
+LAST_FORWARD = 256  # number, from 1, of the last splat that contributed; exact up to 2^24 splats per tile
 RED_FORWARD = 512
 GREEN_FORWARD = 768
 BLUE_FORWARD = 1024
@@ -100,10 +102,10 @@ BACKWARD_SIZE = GEOMETRY_BACKWARD + BATCH * GEOMETRY_SIZE
 
 
 def _exp2_coefficients() -> tuple[np.float32, ...]:
-    """Polynomial p of degree 5 with p(t)^8 = 2^t on [-9, 0.16].
+    """Return the coefficients of the polynomial p of degree 5 with p(t)^8 = 2^t on [-9, 0.16].
 
-    Fitted to 2^(t/8) by least squares of the relative error at Chebyshev nodes. In float32, powers
-    included, the relative error is 2e-6.
+    p is fitted to 2^(t/8) by least squares of the relative error at Chebyshev nodes. The relative error of
+    p(t)^8 in float32 is 2e-6.
     """
     y = 0.5725 * np.cos(np.linspace(0.0, np.pi, 400)) - 0.5525
     relative = np.vander(y, 6, increasing=True) / np.exp2(y)[:, None]
@@ -117,10 +119,10 @@ EXP2_MIN = np.float32(-9)
 
 @inlined
 def exp2(t: Any) -> Any:
-    """2^t for t <= 0; below -9 (alpha under 1/512) it returns 2^-9, which the cut removes."""
+    """Return 2^t for t <= 0. Below -9 (alpha under 1/512) it returns 2^-9, which the cut at 1/255 removes."""
     t = maximum(t, broadcast(EXP2_MIN))
     t2 = t * t
-    root = (P0 + t * P1) + t2 * ((P2 + t * P3) + t2 * (P4 + t * P5))  # Estrin: a short chain of operations
+    root = (P0 + t * P1) + t2 * ((P2 + t * P3) + t2 * (P4 + t * P5))  # Estrin's scheme, a short chain
     root = root * root
     root = root * root
     return root * root
@@ -144,7 +146,7 @@ def set_up_splat(
         store(buffer, geometry + ROW_DY + first, dy)
         store(buffer, geometry + COLUMN_DX + first, lane_numbers() + (dx + offset))
         for column in range(0, layout.TILE, LANES):
-            # Which of the rows reach alpha >= 1/255 between the centres of the block's outer pixels.
+            # Rows that reach alpha >= 1/255 between the centres of the block's outer pixels.
             outer = dx + np.float32(column)
             nearest = minimum(maximum(ridge, broadcast(outer)), broadcast(outer + LAST_LANE)) - ridge
             rows = mask_bits(row_log2 - nearest * nearest * bend_x >= TOUCH_CUT)
@@ -154,19 +156,19 @@ def set_up_splat(
 
 @inlined
 def row_of(piece: Any) -> Any:
-    """Row of the tile in which a piece lies."""
+    """Return the row of the tile that contains a piece."""
     return np.uint64(piece & (layout.TILE - 1))
 
 
 @inlined
 def first_column(piece: Any) -> Any:
-    """Column of the tile at which a piece starts."""
+    """Return the column of the tile at which a piece starts."""
     return np.uint64((piece // layout.TILE) * LANES)
 
 
 @inlined
 def splat_offset(pair_ids: AnyArray, pair: Any) -> Any:
-    """Place of a pair's splat in the array of splats."""
+    """Return the offset of a pair's splat in the array of splats."""
     return np.uint64(pair_ids[np.uint64(pair)]) * np.uint64(layout.SPLAT_COLUMNS)
 
 
@@ -179,10 +181,10 @@ def forward_tile(
     pair_ids: AnyArray,
     splats: ArrayF32,
     buffer: ArrayF32,
-    touches: AnyArray,
+    touches: AnyArray,  # [BATCH] int64 scratch
     depth: ArrayF32 | None,
 ) -> None:
-    """Blend the pairs ``begin`` to ``end`` into the pixel buffers. ``touches`` is int64 [BATCH] scratch."""
+    """Blend the pairs ``begin`` to ``end`` into the pixel buffers."""
     zero = broadcast(ZERO)
     alpha_max = broadcast(ALPHA_MAX)
     alive = ALL_PIECES
@@ -234,7 +236,7 @@ def forward_tile(
 
 @inlined
 def pixel_offset(row: int, column: int) -> Any:
-    """Place of a tile's pixel in a buffer."""
+    """Return the offset of a tile's pixel in a buffer."""
     return np.uint64((column // LANES) * (layout.TILE * LANES) + row * LANES + column % LANES)
 
 
@@ -242,16 +244,16 @@ def pixel_offset(row: int, column: int) -> Any:
 def forward(
     width: int,
     height: int,
-    tile_offsets: AnyArray,
-    pair_ids: AnyArray,
-    splats: ArrayF32,
-    background: ArrayF32,
-    image: ArrayF32,
-    transmittance: ArrayF32,
-    last: ArrayF32,
-    depth: ArrayF32 | None,
+    tile_offsets: AnyArray,  # [tiles + 1]
+    pair_ids: AnyArray,  # [P]
+    splats: ArrayF32,  # [N, 16]
+    background: ArrayF32,  # [3]
+    image: ArrayF32,  # [H, W, 3], written
+    transmittance: ArrayF32,  # [H, W], written
+    last: ArrayF32,  # [H, W], written
+    depth: ArrayF32 | None,  # [H, W], written
 ) -> None:
-    """Image [H, W, 3], final transmittance [H, W], last contributor [H, W], and depth [H, W] or None."""
+    """Render image, final transmittance, number of the last contributing splat and, if not None, depth."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     tiles_y = (height + layout.TILE - 1) // layout.TILE
     for tile in prange(tiles_x * tiles_y):
@@ -300,14 +302,11 @@ def backward_tile(
     pair_slots: AnyArray,
     splats: ArrayF32,
     buffer: ArrayF32,
-    touches: AnyArray,
+    touches: AnyArray,  # [BATCH] int64 scratch
     pair_sums: ArrayF32,
     grad_depth: ArrayF32 | None,
 ) -> None:
-    """Walk the pairs ``end`` - 1 down to ``begin`` and write each one's sums to its row of ``pair_sums``.
-
-    ``touches`` is int64 [BATCH] scratch.
-    """
+    """Visit the pairs from ``end`` - 1 down to ``begin`` and write the sums of each to ``pair_sums``."""
     zero = broadcast(ZERO)
     alpha_max = broadcast(ALPHA_MAX)
     nowhere = broadcast(EXP2_MIN)
@@ -397,19 +396,19 @@ def backward_tile(
 def backward(
     width: int,
     height: int,
-    tile_offsets: AnyArray,
-    pair_ids: AnyArray,
-    pair_slots: AnyArray,
-    splats: ArrayF32,
-    background: ArrayF32,
-    transmittance: ArrayF32,
-    last: ArrayF32,
-    grad_image: ArrayF32,
-    grad_alpha: ArrayF32 | None,
-    grad_depth: ArrayF32 | None,
-    pair_sums: ArrayF32,
+    tile_offsets: AnyArray,  # [tiles + 1]
+    pair_ids: AnyArray,  # [P]
+    pair_slots: AnyArray,  # [P]
+    splats: ArrayF32,  # [N, 16]
+    background: ArrayF32,  # [3]
+    transmittance: ArrayF32,  # [H, W]
+    last: ArrayF32,  # [H, W]
+    grad_image: ArrayF32,  # [H, W, 3]
+    grad_alpha: ArrayF32 | None,  # [H, W]
+    grad_depth: ArrayF32 | None,  # [H, W]
+    pair_sums: ArrayF32,  # [P, 10] with depth, else [P, 9]; written
 ) -> None:
-    """Sums of every (tile, splat) pair, Gaussian-major: [P, 10] with depth, else [P, 9]."""
+    """Write the sums of every (tile, splat) pair, in Gaussian-major order."""
     tiles_x = (width + layout.TILE - 1) // layout.TILE
     tiles_y = (height + layout.TILE - 1) // layout.TILE
     for tile in prange(tiles_x * tiles_y):

@@ -1,14 +1,15 @@
-"""Some float32 lanes as an explicit Numba type: sixteen where registers hold 512 bits, else eight.
+"""SIMD vectors of float32 lanes as a Numba type: sixteen lanes on AVX-512, else eight.
 
-LLVM does not vectorise the rasteriser's loops by itself (too many possible aliases, short trip counts),
-which costs a factor of three. ``lanes`` is an LLVM vector: one register of AVX or AVX-512, two of SSE or
-NEON. ``mask`` is the result of a comparison.
+LLVM does not vectorise the rasteriser's loops by itself (too many possible aliases, short trip counts), which
+would cost a factor of three. ``lanes`` is an LLVM vector: one register of AVX or AVX-512, two of SSE or NEON.
+``mask`` is the result of a comparison.
 
-Sixteen lanes are one row of a tile: half as many instructions as with eight where a splat reaches into both
-halves of a row. They are used on AVX-512 alone, since elsewhere two registers would work where one is enough.
+Sixteen lanes are one row of a tile. If a splat touches both halves of a row, this takes half as many
+instructions as eight lanes. Without AVX-512, sixteen lanes would need two registers, also for splats that
+touch one half.
 
-Arithmetic (+ - * /) and comparisons (< <= > >=) work between ``lanes`` values and with float32 scalars
-on either side. Loads and stores take an array and an element offset and check no bounds.
+Arithmetic (+ - * /) and comparisons (< <= > >=) work between ``lanes`` values, and with float32 scalars on
+either side. Loads and stores take an array and an element offset; bounds are not checked.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from numba.np import arrayobj
 
 
 def _register_lanes() -> int:
-    """float32 lanes of a vector on the machine that Numba compiles for."""
+    """Return the number of float32 lanes of a vector on the machine that Numba compiles for."""
     settings: Any = config
     if settings.CPU_NAME is None:
         return 16 if binding.get_host_cpu_features().get("avx512f", False) else 8
@@ -37,9 +38,9 @@ def _register_lanes() -> int:
 
 LANES = _register_lanes()
 SUMS = 8
-"""Vectors whose lane sums `store_lane_sums` takes at once."""
+"""Number of vectors whose lane sums `store_lane_sums` writes."""
 
-# Numba's functions for extensions are not annotated.
+# Numba's functions for extensions have no type annotations.
 _signature: Any = templates.signature
 _infer_global: Any = templates.infer_global
 _register_model: Any = register_model
@@ -48,9 +49,9 @@ _make_array: Any = arrayobj.make_array
 _initialise_storage: Any = models.PrimitiveModel.__init__
 _declare: Any = cgutils.get_or_insert_function
 
-# As in jit.FAST.
+# The flags of jit.FAST.
 _FLAGS = ("contract", "nsz", "arcp")
-# min and max of numbers that the caller knows not to be NaN.
+# For minimum and maximum, whose arguments are never NaN.
 _NO_NAN = ("nnan", "nsz")
 
 _I1, _I32, _I64 = ir.IntType(1), ir.IntType(32), ir.IntType(64)
@@ -63,11 +64,11 @@ _MASK = ir.VectorType(_I1, LANES)
 
 
 class _VectorType(types.Type):
-    """The type of LANES float32 lanes."""
+    """Numba type of LANES float32 lanes."""
 
 
 class _MaskType(types.Type):
-    """The type of LANES comparison results."""
+    """Numba type of LANES comparison results."""
 
 
 lanes = _VectorType(f"f32x{LANES}")
@@ -108,7 +109,7 @@ def _register_operator(
 
 
 def _register_arithmetic(kind: Any) -> None:
-    """Let + - * / work between values of ``kind``, and with float32 scalars on either side."""
+    """Define + - * / between values of ``kind``, and with float32 scalars on either side."""
     pairs = [(kind, kind), (kind, types.float32), (types.float32, kind)]
     operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
     for function, name in operators.items():
@@ -140,10 +141,10 @@ def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make an intrinsic of a function that emits the code for values of these kinds."""
+    """Return a decorator for a function that emits the code of an intrinsic for values of these kinds."""
 
     def decorate(emit: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(emit)  # with it, Numba sees the names of the arguments
+        @wraps(emit)  # so that Numba sees the names of the arguments
         def typed(typing_context: Any, *values: Any) -> Any:
             return result(*kinds), lambda context, builder, sig, args: emit(builder, *args)
 
@@ -153,7 +154,7 @@ def _operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Calla
 
 
 def _address(context: Any, builder: Any, sig: Any, args: Any, to: Any = _VECTOR) -> Any:
-    """Where element ``args[1]`` of the array ``args[0]`` lies, as an address of a ``to``."""
+    """Return the address of element ``args[1]`` of the array ``args[0]``, as a pointer to the type ``to``."""
     offset = context.cast(builder, args[1], sig.args[1], types.intp)
     data = _make_array(sig.args[0])(context, builder, args[0]).data
     return builder.bitcast(builder.gep(data, [offset]), to.as_pointer())
@@ -170,13 +171,13 @@ def _load(vector: Any) -> Callable[..., Any]:
 
 @_intrinsic
 def load(typing_context: Any, array: Any, offset: Any) -> Any:
-    """LANES consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
+    """Load LANES consecutive elements of a float32 array from ``offset`` (in elements of the whole array)."""
     return lanes(array, offset), _load(_VECTOR)
 
 
 @_intrinsic
 def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
-    """Write lanes (or what `pixel` has) to consecutive elements of a float32 array."""
+    """Write lanes, a pixel or a pair of pixels to consecutive elements of a float32 array."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         builder.store(args[2], _address(context, builder, sig, args, args[2].type)).align = 4
@@ -199,31 +200,31 @@ def _prefetch(write: int) -> Callable[..., Any]:
 
 @_intrinsic
 def prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
-    """Fetch an element's cache line, soon to be read."""
+    """Prefetch the cache line of an element that will be read."""
     return types.void(array, offset), _prefetch(0)
 
 
 @_intrinsic
 def prefetch_to_write(typing_context: Any, array: Any, offset: Any) -> Any:
-    """Fetch an element's cache line, soon to be written."""
+    """Prefetch the cache line of an element that will be written."""
     return types.void(array, offset), _prefetch(1)
 
 
 @_operation(lanes, types.float32)
 def broadcast(builder: Any, scalar: Any) -> Any:
-    """The same float32 in every lane."""
+    """Return a vector with the same float32 in every lane."""
     return _broadcast_to(builder, scalar, _VECTOR)
 
 
 @_operation(lanes)
 def lane_numbers(builder: Any) -> Any:
-    """0.0, 1.0, ... LANES - 1."""
+    """Return the lanes 0.0, 1.0, ... LANES - 1."""
     return ir.Constant(_VECTOR, [float(lane) for lane in range(LANES)])
 
 
 @_operation(lanes, mask, lanes, lanes)
 def select(builder: Any, where: Any, yes: Any, no: Any) -> Any:
-    """Lane by lane ``yes`` where the mask is set, else ``no``."""
+    """Return ``yes`` in lanes where the mask is set, and ``no`` in the others."""
     return builder.select(where, yes, no)
 
 
@@ -233,62 +234,62 @@ def _call(builder: Any, name: str, *args: Any, flags: tuple[str, ...] = ()) -> A
     return builder.call(function, args, fastmath=flags)
 
 
-# min and max call LLVM's functions because select(x < y, load p, y) followed by a store to p turns into
-# a masked store (vmaskmov), which is microcoded on AMD: it nearly doubled the forward pass.
+# minimum and maximum call LLVM's functions because select(x < y, load p, y) followed by a store to p turns
+# into a masked store (vmaskmov). It is microcoded on AMD and nearly doubled the time of the forward pass.
 @_operation(lanes, lanes, lanes)
 def minimum(builder: Any, x: Any, y: Any) -> Any:
-    """Lane-wise minimum; neither side may be NaN."""
+    """Return the lane-wise minimum; neither side may be NaN."""
     return _call(builder, "minnum", x, y, flags=_NO_NAN)
 
 
 @_operation(lanes, lanes, lanes)
 def maximum(builder: Any, x: Any, y: Any) -> Any:
-    """Lane-wise maximum; neither side may be NaN."""
+    """Return the lane-wise maximum; neither side may be NaN."""
     return _call(builder, "maxnum", x, y, flags=_NO_NAN)
 
 
 @_operation(lanes, lanes)
 def magnitude(builder: Any, x: Any) -> Any:
-    """|x|."""
+    """Return |x|."""
     return _call(builder, "fabs", x)
 
 
 @_operation(lanes, lanes)
 def negative_magnitude(builder: Any, x: Any) -> Any:
-    """-|x| by setting the sign bit."""
+    """Return -|x| by setting the sign bit."""
     bits = builder.bitcast(x, _INT_VECTOR)
     return builder.bitcast(builder.or_(bits, ir.Constant(_INT_VECTOR, [-(2**31)] * LANES)), _VECTOR)
 
 
 @_operation(types.boolean, mask)
 def any_lane(builder: Any, where: Any) -> Any:
-    """True when a lane is set."""
+    """Return True if any lane is set."""
     return builder.icmp_unsigned("!=", builder.bitcast(where, _BITS), ir.Constant(_BITS, 0))
 
 
 @_operation(types.int64, mask)
 def mask_bits(builder: Any, where: Any) -> Any:
-    """The mask as an int64, lane 0 in bit 0."""
+    """Return the mask as an int64, lane 0 in bit 0."""
     return builder.zext(builder.bitcast(where, _BITS), _I64)
 
 
 @_operation(types.int64, types.int64)
 def lowest_bit(builder: Any, bits: Any) -> Any:
-    """Position of the lowest set bit of a non-zero int64."""
+    """Return the position of the lowest set bit of a non-zero int64."""
     return builder.cttz(bits, ir.Constant(_I1, 1))
 
 
 @_operation(types.float32, lanes)
 def lane_sum(builder: Any, x: Any) -> Any:
-    """Sum of all lanes."""
+    """Return the sum of all lanes."""
     function_type = ir.FunctionType(_F32, [_F32, _VECTOR])
     function = _declare(builder.module, function_type, f"llvm.vector.reduce.fadd.v{LANES}f32")
-    # Without reassoc the lanes would be added one after the other; here no code around it can change it.
+    # Without reassoc the lanes would be added one by one. No code around this call can change their order.
     return builder.call(function, [ir.Constant(_F32, 0.0), x], fastmath=(*_FLAGS, "reassoc"))
 
 
 def _add_picked(builder: Any, x: Any, y: Any, left: list[int], right: list[int]) -> Any:
-    """Lanes ``left`` of x and y taken as one vector, plus their lanes ``right``."""
+    """Join x and y to one vector, and add its lanes ``right`` to its lanes ``left``."""
 
     def pick(numbers: list[int]) -> Any:
         kind = ir.VectorType(_I32, len(numbers))
@@ -313,8 +314,8 @@ def store_lane_sums(
 ) -> Any:
     """Write the lane sums of eight vectors to consecutive elements of a float32 array.
 
-    Vectors are added in pairs, the halves of each onto one another: after three steps each of the eight has
-    an eighth of the lanes of one vector.
+    Each step combines pairs of vectors: in each vector, one half of its lanes is added to the other half.
+    After three steps, a single vector holds the partial sums of all eight, each in an eighth of its lanes.
     """
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
