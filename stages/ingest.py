@@ -68,7 +68,7 @@ _FEATURES_PER_MEGAPIXEL = 7000
 # Seconds of one core: start of COLMAP's process; per megapixel of a frame, to read and undistort it, and to
 # map it without and with a pose.
 _START_S = 1.0
-_FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 0.85, 0.2
+_FRAME_S, _MAPPING_S, _TRIANGULATION_S = 0.15, 1.3, 0.2
 
 
 def externals(config: IngestConfig, source: Path) -> Mapping[str, External]:

@@ -220,19 +220,17 @@ class _Sfm:
         placed: dict[str, str] = {}
         self._report(phase="adjusting poses and cameras", total=None)
         shared = len(self._job.names) >= SHARED_BY * len(self._job.cameras)
-        if (adjusted := adjuster.refine(start, cameras=shared)) is not None:
+        adjusted = adjuster.refine(start, cameras=shared) if len(start.points3D) else None
+        if adjusted is not None:
             models["adjusted"] = adjusted
             errors["adjusted"] = adjuster.median_error(adjusted)
-        convincing = _CONVINCING * errors["given"]
-        good = min(convincing, _EXPLAINED * adjuster.floor)
-        if (adjusted is None or errors["adjusted"] > good) and (
-            found := self._sfm_over(start, pairs, adjuster)
-        ) is not None:
+        explained = adjusted is not None and errors["adjusted"] <= _EXPLAINED * adjuster.floor
+        if not explained and (found := self._sfm_over(start, pairs, adjuster)) is not None:
             models["sfm"], placed = found
             errors["sfm"] = adjuster.median_error(models["sfm"])
         outcome = outcome.model_copy(update={"errors_px": errors})
         best = min(models, key=lambda method: errors[method], default="")
-        if not best or errors[best] > convincing:
+        if not best or not 0 < errors[best] <= _CONVINCING * errors["given"]:
             return start, outcome
         model = self._with_points(models[best], self._matched if best == "sfm" else self._database)
         update = {"method": best, "lens": lens_of(model), "placed": placed if best == "sfm" else {}}
