@@ -186,8 +186,8 @@ def test_a_run_without_held_out_frames(shell: Shell, tmp_path: Path) -> None:
 
 def test_not_a_splat(shell: Shell, truth: Path, tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    fails(shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "no scene of Gaussians")
-    fails(shell(truth / "images" / "000.png", "--reference", truth, *FAST), "no scene of Gaussians")
+    fails(shell(tmp_path / "mesh.ply", "--reference", truth, *FAST), "mesh.ply", "is not a scene of Gaussians")
+    fails(shell(truth / "images" / "000.png", "--reference", truth, *FAST), "is not a scene of Gaussians")
 
 
 def test_a_folder_that_is_no_reference(shell: Shell, run: Path, truth: Path, tmp_path: Path) -> None:
