@@ -21,7 +21,7 @@ from cleargs.capture.config import SfmConfig
 from cleargs.capture.matching import is_sound, remove_database
 from cleargs.capture.model import ModelImage, SparseModel, read_model
 from cleargs.capture.prepare import WorkFrame
-from cleargs.capture.sfm_worker import OUTCOME, OWN, Job, SfmOutcome
+from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import InputError, StageError
 from cleargs.files import remove, write_json
 from cleargs.media.image import lens_name

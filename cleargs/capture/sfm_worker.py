@@ -18,12 +18,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations, count
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from cleargs.base_model import FrozenModel
 from cleargs.capture.adjustment import (
     FIRST_LENS,
     SHARED_BY,
@@ -32,10 +29,9 @@ from cleargs.capture.adjustment import (
     lens_of,
     median_residual,
 )
-from cleargs.capture.cameras import Intrinsics, guessed_camera
+from cleargs.capture.cameras import guessed_camera
 from cleargs.capture.child import reports_to_parent
 from cleargs.capture.colmap import pycolmap
-from cleargs.capture.config import SfmConfig
 from cleargs.capture.judging import epipolar_errors, verified_matches
 from cleargs.capture.matching import (
     copy_without_features,
@@ -45,6 +41,7 @@ from cleargs.capture.matching import (
     sequential_pairs,
     why_missing,
 )
+from cleargs.capture.sfm_job import OUTCOME, OWN, Job, SfmOutcome
 from cleargs.errors import StageError
 from cleargs.files import make_folder, sync, sync_tree, write_json
 from cleargs.safe_io import read_json
@@ -64,53 +61,6 @@ _FITS_PX, _FITS = 2.0, 0.5
 """Poses fit the images where at least this share of the matches is within this
 many pixels of its epipolar line. Measured on a synthetic room: 0.99 with true poses, 0.21 with OpenCV's axes,
 0.13 with inverted matrices."""
-
-OWN = "own"
-"""Convention of an input's poses: the one of its layout."""
-
-OUTCOME = "outcome.json"
-"""In the folder of the model: its `SfmOutcome`."""
-
-
-class Job(FrozenModel):
-    """Input of COLMAP: working images, their cameras, the poses if they are known, and settings."""
-
-    folder: Path
-    images: Path
-    masks: Path | None
-    names: list[str]
-    cameras: list[Intrinsics]
-    camera_of: list[int]
-    """Number of the camera of each image."""
-    poses: dict[str, list[list[list[float]]]] | None
-    """Convention that the input may mean -> matrices 3x4, world to camera, of all images."""
-    exif_images: list[Path | None]
-    """Input image of each camera that may state its focal length."""
-    config: SfmConfig
-    seed: int
-    threads: int
-
-
-class SfmOutcome(FrozenModel):
-    """Origin of a model."""
-
-    placed: Mapping[str, str] = Field(default_factory=dict)
-    """Working image -> method by which its pose was found, or reason why there is none."""
-    missed_px: float | None = None
-    """Median reprojection error at the input's poses, px of the working images; None: it has no poses."""
-    convention: str = OWN
-    """The convention by which the input's poses fit the images."""
-    method: Literal["given", "adjusted", "sfm"] = "given"
-    """Origin of the poses: the input's, the input's after adjustment, or structure from motion."""
-    errors_px: Mapping[str, float] = Field(default_factory=dict)
-    """Method -> median distance from their epipolar lines of matches that were kept out, px."""
-    lens: str = ""
-    """COLMAP model of the cameras that were adjusted; empty: no camera was."""
-
-    @property
-    def refined(self) -> bool:
-        """Return True if the poses are not those of the input."""
-        return self.method != "given"
 
 
 @dataclass(frozen=True)
